@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
+from bidnerf_core.cli.camera_options import DatasetCamera, DatasetDepthUnit, RegisterDepth, depth_registration
 from bidnerf_core.cli.options import Device, Flag, MapFolder, option, parse
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.datasets import open_dataset
@@ -31,6 +31,7 @@ def bake(
     split: Annotated[str, option("NAME", "split of the dataset")] = "train",
     camera: DatasetCamera = None,
     register_depth: RegisterDepth = None,
+    depth_unit: DatasetDepthUnit = None,
     rendered_landmarks: Annotated[
         Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
     ] = False,
@@ -54,7 +55,9 @@ def bake(
     scene = load_map(map, device, baked=False)  # its baked parts may be damaged, and are replaced anyway
     photos = None
     if data is not None:
-        photos = open_dataset(data, scene.bounds.background, camera=camera, register_depth=registration)
+        photos = open_dataset(
+            data, scene.bounds.background, camera=camera, register_depth=registration, depth_unit=depth_unit
+        )
     with stopped_by_ctrl_c() as cancel, Display() as progress:
         scene.bake(
             photos,

@@ -53,6 +53,13 @@ RegisterDepth = Annotated[
     ),
 ]
 
+DatasetDepthUnit = Annotated[
+    float | None,
+    option(
+        "METRES", "metres per step of the depth images, such as 0.001 for millimetres", "as the format has it"
+    ),
+]
+
 DepthSensorName = Annotated[str, option("NAME", "what measured the depth: " + ", ".join(DEPTH_SENSORS))]
 
 

@@ -73,7 +73,11 @@ def run(arguments: list[str]) -> None:
         hfov: FieldOfView = None,
         depth_unit: Annotated[
             float | None,
-            option("METRES", "length of one unit of --depth", "0.001 for integers, 1 for floats"),
+            option(
+                "METRES",
+                "metres per step of depth images",
+                "0.001 for integers, 1 for floats; or as a dataset has it",
+            ),
         ] = None,
         register_depth: RegisterDepth = None,
         frame: Annotated[

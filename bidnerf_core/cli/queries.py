@@ -33,8 +33,7 @@ class PhotoOptions:
     @property
     def for_photos(self) -> list[str]:
         """The given options that do not apply to datasets, as written on the command line."""
-        values = {"--depth": self.depth or None, "--focal": self.camera.focal, "--hfov": self.camera.hfov,
-                  "--depth-unit": self.depth_unit}  # fmt: skip
+        values = {"--depth": self.depth or None, "--focal": self.camera.focal, "--hfov": self.camera.hfov}
         return [option for option, value in values.items() if value is not None]
 
     def check_depth(self) -> None:
@@ -97,7 +96,11 @@ def _dataset(
             " photos, name the files"
         )
     dataset = open_dataset(
-        paths[0], background, camera=photos.camera.camera, register_depth=photos.registration
+        paths[0],
+        background,
+        camera=photos.camera.camera,
+        register_depth=photos.registration,
+        depth_unit=photos.depth_unit,
     )
     source = DatasetFrames(dataset, frames.split, frames.names, frames.window, points)
     _check_points(points, len(source.names), "frames; name one by --frame")

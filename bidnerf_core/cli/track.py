@@ -15,6 +15,7 @@ from rich.table import Table
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.camera_options import (
     CameraFile,
+    DatasetDepthUnit,
     DepthSensorName,
     FieldOfView,
     FocalLength,
@@ -72,6 +73,7 @@ def run(arguments: list[str]) -> None:
         focal: FocalLength = None,
         hfov: FieldOfView = None,
         register_depth: RegisterDepth = None,
+        depth_unit: DatasetDepthUnit = None,
         depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
         depth_sensor: DepthSensorName = "unknown",
         split: Annotated[
@@ -99,6 +101,8 @@ def run(arguments: list[str]) -> None:
         require("--every", every, 1)
         if follow and split is not None:
             raise UsageError("--split is for datasets, expected none with --follow")
+        if follow and depth_unit is not None:
+            raise UsageError("--depth-unit with --follow, expected depth_unit in each request")
         if out is None and not follow:
             raise UsageError("no --out, expected the name of a file of poses")
         inputs = (sequence, camera, start, register_depth)
@@ -129,7 +133,13 @@ def run(arguments: list[str]) -> None:
                     )
                 else:
                     frames = opened_for(
-                        stored, sequence, camera=camera, focal=focal, hfov=hfov, register_depth=registration
+                        stored,
+                        sequence,
+                        camera=camera,
+                        focal=focal,
+                        hfov=hfov,
+                        register_depth=registration,
+                        depth_unit=depth_unit,
                     )
                     frames = frames if split is None else _of_split(frames, split)
                     with counted("tracking", "frames", -(-len(frames) // every)) as report:

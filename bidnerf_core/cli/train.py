@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from bidnerf_core.backend import load_backend
 from bidnerf_core.captures.training_views import RefinementChoice
-from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
+from bidnerf_core.cli.camera_options import DatasetCamera, DatasetDepthUnit, RegisterDepth, depth_registration
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import (
     DEFAULT_BACKEND,
@@ -49,6 +49,7 @@ def run(arguments: list[str]) -> None:
         split: Annotated[str, option("NAME", "split of the dataset to train on")] = "train",
         camera: DatasetCamera = None,
         register_depth: RegisterDepth = None,
+        depth_unit: DatasetDepthUnit = None,
         background: Annotated[
             str | None,
             option("COLOUR", "colour behind images with alpha: white or black", "as the dataset has it"),
@@ -103,7 +104,13 @@ def run(arguments: list[str]) -> None:
                 began = f"--landmark-features {info.landmark_features}"
                 raise UsageError(f"{out}: was begun with {began}, got {landmark_features}; leave it out")
             begun = info.bounds.background if background is None else background
-        dataset = open_dataset(data, begun, camera=camera, register_depth=depth_registration(register_depth))
+        dataset = open_dataset(
+            data,
+            begun,
+            camera=camera,
+            register_depth=depth_registration(register_depth),
+            depth_unit=depth_unit,
+        )
         with stopped_by_ctrl_c() as cancel, Display() as progress:
             same: dict[str, Any] = {
                 "split": split, "bake": not no_bake, "device": device, "progress": progress, "cancel": cancel,

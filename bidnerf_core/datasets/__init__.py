@@ -14,6 +14,7 @@ from bidnerf_core.datasets.reader import (
     DepthRegistration,
     Reader,
     ReadOptions,
+    checked_unit,
     expected_files,
     find_reader,
     opened,
@@ -66,14 +67,17 @@ def open_dataset(
     readers: Sequence[Reader] | None = None,
     camera: Intrinsics | str | Path | None = None,
     register_depth: DepthRegistration | None = None,
+    depth_unit: float | None = None,
 ) -> Dataset:
     """Open the dataset in the folder ``path``. Descriptions are read and checked now, images when views are requested.
 
     ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. The default is
     white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. ``camera`` (intrinsics or
     a file of them) is for formats without a camera of their own, such as TUM RGB-D. ``register_depth`` determines whether
-    depth is moved to the colour camera, and from which sensor; the default depends on the format. Raises ``InputError`` where
-    there is no such folder, where no reader recognises it, and where a description is not usable.
+    depth is moved to the colour camera, and from which sensor; the default depends on the format. ``depth_unit`` (metres per
+    step of depth images) replaces the unit of the format. What a description lists and the folder lacks is left out, with an
+    ``InputWarning`` that counts it. Raises ``InputError`` where there is no such folder, where no reader recognises it, where
+    nothing is left, and where a description is not usable.
     """
     folder = Path(path)
     if not folder.exists():
@@ -83,7 +87,8 @@ def open_dataset(
     reader = _reader_of(folder, readers)
     if reader is None:
         raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
-    return opened(reader, folder, _options(reader, folder, CameraSource(camera), background, register_depth))
+    options = _options(reader, folder, CameraSource(camera), background, register_depth, depth_unit)
+    return opened(reader, folder, options)
 
 
 def open_sequence(
@@ -96,13 +101,15 @@ def open_sequence(
     background: Background | None = None,
     readers: Sequence[Reader] | None = None,
     register_depth: DepthRegistration | None = None,
+    depth_unit: float | None = None,
 ) -> FrameSequence:
     """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video. None is read yet.
 
     Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
     ``Frame.open``. Without them, images have that of their EXIF; images without a focal length, and videos, have one of the
     ``assumed`` cameras. Datasets have their own cameras, except those for which ``open_dataset`` accepts one.
-    ``register_depth`` is as in ``open_dataset``; depth in a folder of images is registered if a sensor is given. Raises
+    ``register_depth`` and ``depth_unit`` are as in ``open_dataset``; depth in a folder of images is registered if a sensor is
+    given, and in millimetres unless a unit is given. Raises
     ``InputError`` where nothing is found, where a description is not usable, and for a missing or superfluous camera.
     """
     place, given = Path(path), CameraSource(camera, focal, hfov, tuple(assumed))
@@ -119,8 +126,9 @@ def open_sequence(
     reader = _reader_of(place, readers)
     if reader is None:
         sensor = ReadOptions(register_depth=register_depth).sensor(place)
-        return open_images(place, given, sensor, background)
-    return opened_sequence(reader, place, _options(reader, place, given, background, register_depth))
+        return open_images(place, given, sensor, background, checked_unit(depth_unit))
+    options = _options(reader, place, given, background, register_depth, depth_unit)
+    return opened_sequence(reader, place, options)
 
 
 def _options(
@@ -129,6 +137,7 @@ def _options(
     camera: CameraSource,
     background: Background | None,
     register: DepthRegistration | None,
+    depth_unit: float | None,
 ) -> ReadOptions:
     """Return the options for a reader. Raises ``InputError`` for those that its format does not leave open."""
     if camera.is_given and "camera" not in reader.accepts:
@@ -139,8 +148,15 @@ def _options(
         raise InputError(
             f"{folder}: is a dataset whose depth belongs to its images, expected no registration; leave out register_depth"
         )
+    if depth_unit is not None and "depth_unit" not in reader.accepts:
+        raise InputError(
+            f"{folder}: is a dataset without depth images, or with depth of a fixed unit, expected no other; leave out"
+            " depth_unit"
+        )
     given = camera.camera
-    return ReadOptions(background, Path(given) if isinstance(given, str) else given, register)
+    return ReadOptions(
+        background, Path(given) if isinstance(given, str) else given, register, checked_unit(depth_unit)
+    )
 
 
 def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:

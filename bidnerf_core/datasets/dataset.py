@@ -68,10 +68,20 @@ def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
     for depth in range(2, max(map(len, paths), default=0) + 1):
         count = Counter(names)
         names = ["_".join(p[-depth:]) if count[n] > 1 else n for n, p in zip(names, paths, strict=True)]
-    name, times = Counter(names).most_common(1)[0] if names else ("", 0)
-    if times > 1:  # such as a/b.png and a_b.png
-        raise InputError(f"{times} images would be called {name!r}, expected names that differ")
-    return names
+    return _numbered(names)
+
+
+def _numbered(names: list[str]) -> list[str]:
+    """Return the names with "-2" and so on added to those that occur again, such as of a/b.png and a_b.png."""
+    used = set(names)
+    seen, found = set[str](), list[str]()
+    for name in names:
+        own, number = name, 2
+        while own in seen or (own != name and own in used):
+            own, number = f"{name}-{number}", number + 1
+        seen.add(own)
+        found.append(own)
+    return found
 
 
 def _not_there(name: str, names: Sequence[str], stems: Sequence[str]) -> str:

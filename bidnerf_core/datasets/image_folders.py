@@ -17,11 +17,15 @@ from bidnerf_core.io.images import Background
 
 
 def open_images(
-    folder: Path, camera: CameraSource, sensor: DepthCamera | None, background: Background | None = None
+    folder: Path,
+    camera: CameraSource,
+    sensor: DepthCamera | None,
+    background: Background | None = None,
+    depth_unit: float | None = None,
 ) -> FileSequence:
     """Return the images of a folder, by time if all names are times (``12.345.png``), else in the natural order of names.
 
-    ``NAME.depth.png`` (millimetres) next to ``NAME.png`` is its depth, as ``bidnerf render`` writes it. Images have the given
+    ``NAME.depth.png`` (``depth_unit``, by default millimetres) next to ``NAME.png`` is its depth, as ``bidnerf render`` writes it. Images have the given
     camera, or that of their EXIF, as in ``Frame.open``; depth is registered from ``sensor``, if there is one. Raises ``InputError`` where there is no image.
     """
     photos, _ = photos_in(folder)
@@ -31,7 +35,7 @@ def open_images(
 
     def read(photo: Path) -> tuple[Frame, None]:
         beside = photo.with_name(f"{photo.stem}{DEPTH_STEM}.png")
-        depth, unit = (beside, MILLIMETRE) if beside.is_file() else (None, None)
+        depth, unit = (beside, depth_unit or MILLIMETRE) if beside.is_file() else (None, None)
         behind: Background = "black" if background is None else background
         frame = Frame.read(photo, camera, depth=depth, depth_unit=unit, sensor=sensor, background=behind)
         return frame, None

@@ -11,6 +11,7 @@ from typing import Any, Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence, sequence_of
+from bidnerf_core.depth.images import FARTHEST
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, enumeration
 from bidnerf_core.io.images import Background
@@ -19,7 +20,7 @@ from bidnerf_core.registry import PluginError, Plugins, interface_defects
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
 """The registration of depth to colour images: from a sensor or a file of one, from the format's own (True), or none (False)."""
 Answer = TypeVar("Answer")
-OpenQuestion = Literal["camera", "register_depth"]
+OpenQuestion = Literal["camera", "register_depth", "depth_unit"]
 """An option of ``ReadOptions`` that a format may leave open."""
 
 
@@ -28,12 +29,14 @@ class ReadOptions:
     """The options with which a reader opens a folder.
 
     ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel; None is the format's
-    own. ``camera`` (intrinsics or a file of them) and ``register_depth`` reach only the readers that accept them.
+    own. ``camera`` (intrinsics or a file of them), ``register_depth`` and ``depth_unit`` (metres per step of depth images, in
+    place of the format's) reach only the readers that accept them.
     """
 
     background: Background | None = None
     camera: Intrinsics | Path | None = None
     register_depth: DepthRegistration | None = None
+    depth_unit: float | None = None
 
     def sensor(self, folder: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
         """Return the sensor from which depth is registered, or None where depth is used as it is; ``own`` is the format's.
@@ -54,13 +57,23 @@ class ReadOptions:
         return DepthCamera.read(Path(register))
 
 
+def checked_unit(depth_unit: float | None) -> float | None:
+    """Return a unit of depth as given. Raises ``InputError`` where it is not a positive number of metres per step."""
+    if depth_unit is not None and not 0 < depth_unit <= FARTHEST:
+        raise InputError(
+            f"depth_unit is {depth_unit:g}, expected a positive number of metres a step, such as 0.001"
+        )
+    return depth_unit
+
+
 @runtime_checkable
 class Reader(Protocol):
     """A reader of one dataset format. Subclasses inherit the attributes and methods that have a default here."""
 
     accepts: Collection[OpenQuestion] = ()
     """The options that the format leaves open: "camera" where its files have none, "register_depth" where its depth may not be
-    registered to its images. Others are refused before the reader is called."""
+    registered to its images, "depth_unit" where its depth images may be in another unit. Others are refused before the reader
+    is called."""
 
     @property
     def expected(self) -> str:

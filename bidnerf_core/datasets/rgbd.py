@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import Raster
 from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.depth.registration import DepthCamera
-from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.photos import fit_depth
 from bidnerf_core.io.images import read_header, read_image
 
 
@@ -36,20 +37,18 @@ def read_rgbd(
     """Read the image file ``image``, laid over ``background`` (rgb) where it has an alpha channel, and its depth.
 
     ``camera_of`` returns the camera of an image of a width and height, or raises ``InputError`` where that is not the size
-    expected; it is called before any pixel is decoded. Raises ``InputError`` for a file that is not readable, and for
-    registered depth of another size.
+    expected; it is called before any pixel is decoded. Registered depth may be of any size: each pixel has that of the nearest
+    measurement. Raises ``InputError`` for a file that is not readable, and for registered depth of another aspect ratio.
     """
     header = read_header(image)
     camera = camera_of(header.width, header.height)
     rgb, alpha = read_image(image, background)
     metres = None
     if depth is not None:
-        metres = depth.read(depth.path, depth.unit).metres
+        measured = depth.read(depth.path, depth.unit)
         if depth.sensor is not None:
-            metres = depth.sensor.registered(metres, camera, depth.path)
-        elif metres.shape != rgb.shape[:2]:
-            raise InputError(
-                f"{depth.path}: depth is {metres.shape[1]}x{metres.shape[0]}, expected {header.width}x{header.height} as its"
-                f" image {image.name}, to which it is registered"
-            )
+            metres = depth.sensor.registered(measured.metres, camera, depth.path)
+        else:
+            raster = Raster(rgb.shape[1], rgb.shape[0])
+            metres = fit_depth(measured, raster, raster.size, f"{depth.path}: depth")
     return Frame(name, rgb, camera, metres, alpha)

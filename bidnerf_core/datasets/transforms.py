@@ -7,9 +7,11 @@ captures; a single frame is both.
 
 These keys are read from a frame or, where it lacks them, from the file: ``camera_angle_x [camera_angle_y]`` or
 ``fl_x [fl_y]``, ``cx cy w h``, ``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres per unit, default
-0.001; as in nerfstudio it applies to ``.npy`` depth as well). These are read only from a frame: ``file_path`` (its extension
-may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_image`` for values that count as not
-measured). ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
+0.001; as in nerfstudio it applies to ``.npy`` depth as well) or instant-ngp's ``integer_depth_scale``. These are read only from
+a frame: ``file_path`` (its extension may be missing, its separators may be those of Windows, its upper and lower case may differ
+from the file's), ``transform_matrix``, ``depth_file_path`` or instant-ngp's ``depth_path`` (planar z of the image's aspect ratio
+and of any size; each pixel has the depth of the nearest measurement; see ``depth_image`` for values that count as not measured).
+Frames whose image is missing are left out, and missing depth images too, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
 not undone, so the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or
 by the number that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
 
@@ -23,7 +25,9 @@ from pathlib import Path
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
+from bidnerf_core.datasets.incomplete import present, remark
+from bidnerf_core.datasets.reader import OpenQuestion, Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits
@@ -32,35 +36,42 @@ from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import is_file
 from bidnerf_core.io.images import Background, background_colour, read_header
-
-TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
 
 class TransformsReader(Reader):
     """The reader of folders with ``transforms*.json``."""
 
+    accepts: tuple[OpenQuestion, ...] = ("depth_unit",)
     expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
 
     def recognises(self, path: Path) -> bool:
         return any((path / name).is_file() for name in ("transforms.json", *map(file_of, SPLITS)))
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        return TransformsDataset(path, read_splits(path), options.background)
+        return self._open(path, options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        return TransformsDataset(path, read_splits(path), options.background).sequence()
+        return self._open(path, options).sequence()
+
+    def _open(self, path: Path, options: ReadOptions) -> TransformsDataset:
+        return TransformsDataset(path, read_splits(path), options.background, options.depth_unit)
 
 
 class TransformsDataset(SplitDataset[FrameRecord]):
     """Views of a folder with ``transforms.json``; see ``Dataset``."""
 
     def __init__(
-        self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
+        self,
+        path: Path,
+        frames: dict[str, list[FrameRecord]],
+        background: Background | None = None,
+        depth_unit: float | None = None,
     ) -> None:
-        super().__init__(Splits(path, frames), background)
+        self._files = _Files(path, frames)
+        super().__init__(Splits(path, self._files.splits), background)
         self._read_depth = DepthReader()
+        self._depth_unit = depth_unit
         self._by_images = background is None
         self._first: tuple[str, int, int] | None = (
             None  # file, width and height of the first image whose camera has no size
@@ -76,12 +87,13 @@ class TransformsDataset(SplitDataset[FrameRecord]):
     def image_file(self, split: str, name: str) -> Path:
         """Return the image file of a frame. Raises ``InputError`` where there is none."""
         ((_, frame),) = self._frames.select(split, [name])
-        return self._image_file(frame)
+        return self._files.images[frame]
 
     def _frame(self, frame: FrameRecord, name: str) -> Frame:
-        path, depth = self._image_file(frame), None
-        if frame.depth_path is not None:
-            depth = DepthFile(self._depth_file(frame), frame.depth_unit, self._read_depth)
+        path, depth = self._files.images[frame], None
+        if frame in self._files.depth:
+            unit = frame.depth_unit if self._depth_unit is None else self._depth_unit
+            depth = DepthFile(self._files.depth[frame], unit, self._read_depth)
 
         def camera_of(width: int, height: int) -> Intrinsics:
             self._check_size(frame, path, width, height)
@@ -91,22 +103,6 @@ class TransformsDataset(SplitDataset[FrameRecord]):
 
     def _pose(self, frame: FrameRecord) -> SE3:
         return frame.T_world_camera
-
-    def _image_file(self, frame: FrameRecord) -> Path:
-        tried = [Path(f"{self.path / frame.file_path}{suffix}") for suffix in TRIED_SUFFIXES]
-        for path in tried:
-            if is_file(path):
-                return path
-        suffixes = ", ".join(suffix for suffix in TRIED_SUFFIXES if suffix)
-        raise frame.record.error(
-            f"no image {tried[0]}, expected that file (also tried with {suffixes} added)"
-        )
-
-    def _depth_file(self, frame: FrameRecord) -> Path:
-        path = self.path / str(frame.depth_path)
-        if not is_file(path):
-            raise frame.record.error(f"no depth image {path}, expected that file (depth_file_path)")
-        return path
 
     def _check_size(self, frame: FrameRecord, path: Path, width: int, height: int) -> None:
         """Compare with the camera's size or, where it has none, with the first such image, taken with the same lens."""
@@ -122,9 +118,52 @@ class TransformsDataset(SplitDataset[FrameRecord]):
 
     def _has_alpha(self, frame: FrameRecord) -> bool:
         try:
-            return read_header(self._image_file(frame)).has_alpha
+            return read_header(self._files.images[frame]).has_alpha
         except InputError:  # the error is raised again when that frame is read
             return False
+
+
+class _Files:
+    """The image and depth files of the frames; those that are missing are left out, and counted in a remark."""
+
+    def __init__(self, folder: Path, splits: dict[str, list[FrameRecord]]) -> None:
+        self._folder, self._names = folder, FileNames(folder)
+        frames = list({id(frame): frame for group in splits.values() for frame in group}.values())
+        images = {frame: self._names.find(frame.file_path, IMAGE_ENDINGS) for frame in frames}
+        self.images = {frame: path for frame, path in images.items() if path is not None}
+        there = set(
+            present(frames, self.images.__contains__, folder, lambda frame: frame.file_path, self._no_image)
+        )
+        kept = {split: [frame for frame in group if frame in there] for split, group in splits.items()}
+        self.splits = {split: group for split, group in kept.items() if group}
+        measured = [frame for frame in frames if frame in there and frame.depth_path is not None]
+        depth = {frame: self._names.find(frame.depth_path) for frame in measured if frame.depth_path}
+        self.depth = {frame: path for frame, path in depth.items() if path is not None}
+        present(
+            measured,
+            self.depth.__contains__,
+            folder,
+            lambda frame: frame.depth_path,
+            noun="depth image",
+        )
+        self._remark_names()
+
+    def _no_image(self, frame: FrameRecord) -> InputError:
+        tried = self._folder / frame.file_path
+        return frame.record.error(
+            f"no image {tried}, expected that file (also tried with the extension of an image added, in any case)"
+        )
+
+    def _remark_names(self) -> None:
+        """Report names that differ from those of the files by more than an added extension."""
+        for frame, path in self.images.items():
+            written = frame.record.text("file_path") or ""
+            if not str(path).startswith(str(self._folder / written)):
+                remark(
+                    self._folder,
+                    f"file_path {written!r} is taken for {path.relative_to(self._folder)}, and others likewise",
+                )
+                return
 
 
 reader = TransformsReader()

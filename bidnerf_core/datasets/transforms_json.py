@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from bidnerf_core.camera.files import CameraRecord, camera_record
+from bidnerf_core.datasets.file_names import posix_name
+from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.pose_rows import pose
+from bidnerf_core.geometry.pose_rows import pose_and_scale
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import IMAGE_SUFFIXES
 from bidnerf_core.io.json import Record, read_record
 
 SPLITS = ("train", "val", "test")
 METRES_PER_DEPTH_UNIT = 0.001
+DEPTH_KEYS = ("depth_file_path", "depth_path")
+"""The keys of a depth image: nerfstudio's, and that of instant-ngp and NeRFCapture."""
+UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
+"""The keys of the metres per step of its values, in the same order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +33,8 @@ class FrameRecord:
     file_path: PurePosixPath  # as in the file, without a leading "./"
     camera: CameraRecord
     T_world_camera: SE3
-    depth_path: str | None
+    scale: float  # that was removed from its matrix; 1 where that was rigid
+    depth_path: PurePosixPath | None
     depth_unit: float  # metres
     time: float | None  # seconds
 
@@ -62,7 +70,24 @@ def read_frames(file: Record) -> list[FrameRecord]:
         first = seen.setdefault(frame.parts, number)
         if first != number:
             raise frame.record.error(f"the image of frame {first} again, expected each image once")
+    _remark_scales(file, frames)
+    if file.value("enable_depth_loading") is False and any(
+        "depth_path" in frame.record.values for frame in frames
+    ):
+        remark(file.where, "enable_depth_loading is false, so the images of depth_path are not read")
     return frames
+
+
+def _remark_scales(file: Record, frames: list[FrameRecord]) -> None:
+    scaled = [frame for frame in frames if frame.scale != 1.0]
+    if scaled:
+        whose = "all" if len(scaled) == len(frames) else f"{len(scaled)} of"
+        first = scaled[0]
+        remark(
+            file.where,
+            f"{whose} {len(frames)} matrices have a scale (frame {first.file_path}: {first.scale:.6g}), which is removed; the"
+            " positions of the cameras are those of the matrices",
+        )
 
 
 def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[FrameRecord]]:
@@ -71,18 +96,34 @@ def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[Fram
     if not any(lists.values()):
         return hold_out(frames)
     by_path = {frame.file_path: frame for frame in frames}
-    splits = {}
-    for split, listed in lists.items():
-        if listed:
-            splits[split] = [_listed(file, by_path, f"{split}_filenames", entry) for entry in listed]
+    found = {
+        split: _listed(file, by_path, f"{split}_filenames", listed)
+        for split, listed in lists.items()
+        if listed
+    }
+    splits = {split: listed for split, listed in found.items() if listed}
+    if not splits:
+        (key, listed), *_ = ((f"{split}_filenames", listed) for split, listed in lists.items() if listed)
+        raise file.error(
+            f"{key} lists {listed[0]!r}, expected the file_path of one of its {len(by_path)} frames"
+        )
     return splits
 
 
-def _listed(file: Record, by_path: dict[PurePosixPath, FrameRecord], key: str, entry: object) -> FrameRecord:
-    found = by_path.get(PurePosixPath(entry)) if isinstance(entry, str) else None
-    if found is None:
-        raise file.error(f"{key} lists {entry!r}, expected the file_path of one of its {len(by_path)} frames")
-    return found
+def _listed(
+    file: Record, by_path: dict[PurePosixPath, FrameRecord], key: str, entries: Iterable[object]
+) -> list[FrameRecord]:
+    """Return the frames that a list names. A remark counts the names that no frame has."""
+    given = list(entries)
+    found = [by_path.get(posix_name(entry)) if isinstance(entry, str) else None for entry in given]
+    strange = [entry for entry, frame in zip(given, found, strict=True) if frame is None]
+    if strange and len(strange) < len(given):
+        remark(
+            file.where,
+            f"{key} lists {strange[0]!r}{f' and {len(strange) - 1} more' if len(strange) > 1 else ''}, which no frame has; the"
+            f" other {len(given) - len(strange)} are used",
+        )
+    return [frame for frame in found if frame is not None]
 
 
 def _frame(file: Record, number: int, entry: object) -> FrameRecord:
@@ -94,18 +135,33 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
     if not path:
         raise own.error("no file_path, expected the name of its image")
     record = Record(f"{where} ({path})", entry, file)
-    unit = record.number("depth_unit_scale_factor")
-    if unit is not None and unit <= 0:
-        raise record.error(f"depth_unit_scale_factor is {unit:g}, expected a positive number of metres")
+    T_world_camera, scale = pose_and_scale(Record(record.where, entry))
+    depth, unit = _depth(record, own)
     return FrameRecord(
-        record,
-        PurePosixPath(path),
-        camera_record(record),
-        pose(Record(record.where, entry)),
-        own.text("depth_file_path"),
-        METRES_PER_DEPTH_UNIT if unit is None else unit,
-        _time(own),
+        record, posix_name(path), camera_record(record), T_world_camera, scale, depth, unit, _time(own)
     )
+
+
+def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
+    """Return the depth image of a frame, or None, and the metres per step of its values.
+
+    nerfstudio and instant-ngp have keys of their own for both; ``enable_depth_loading`` switches instant-ngp's off.
+    """
+    for key, unit_key in zip(DEPTH_KEYS, UNIT_KEYS, strict=True):
+        path = own.text(key)
+        if path and not (key == "depth_path" and record.value("enable_depth_loading") is False):
+            return posix_name(path), _unit(record, (unit_key, *UNIT_KEYS))
+    return None, _unit(record, UNIT_KEYS)
+
+
+def _unit(record: Record, keys: Iterable[str]) -> float:
+    for key in keys:
+        unit = record.number(key)
+        if unit is not None and unit <= 0:
+            raise record.error(f"{key} is {unit:g}, expected a positive number of metres")
+        if unit is not None:
+            return unit
+    return METRES_PER_DEPTH_UNIT
 
 
 def _time(own: Record) -> float | None:

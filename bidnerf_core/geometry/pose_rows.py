@@ -23,19 +23,32 @@ RIGID_TO = 5e-3
 """Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
 
 
-def pose(record: Record) -> SE3:
-    """Return ``T_world_camera`` (OpenCV axes, float64) from ``transform_matrix`` (3x4 or 4x4, OpenGL axes).
+def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, float]:
+    """Return ``T_world_camera`` (OpenCV axes, float64) from a matrix (3x4 or 4x4, OpenGL axes), and the scale removed from it.
 
-    A rotation that is orthonormal up to rounding is orthonormalized. Raises ``InputError`` for any other matrix.
+    A rotation that is orthonormal up to rounding is orthonormalized. A homogeneous matrix whose last entry is not 1 is divided
+    by it, and a rotation of uniform scale is normalized; the position of the camera is that of the matrix. The scale is 1
+    where there was neither. Raises ``InputError`` for any other matrix.
     """
-    return pose_of_rows(record, "transform_matrix", record.items("transform_matrix"))
+    matrix, scale = _homogeneous(record, key, record.items(key))
+    size = float(torch.linalg.det(matrix[:, :3]).abs()) ** (1 / 3)
+    if size > 0 and abs(size - 1) > RIGID_TO / 2:
+        matrix = torch.cat([matrix[:, :3] / size, matrix[:, 3:]], dim=1)
+        scale *= size
+    return _rigid(record, key, _opencv(matrix)), scale
 
 
 def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
-    """Return ``T_world_camera`` as ``pose`` does; ``key`` is the key of ``rows`` in ``record``, for messages."""
-    matrix = _matrix(record, key, rows)
-    matrix[:, 1:3] *= -1  # y up becomes y down, z backward becomes z forward
-    return _rigid(record, key, matrix)
+    """Return ``T_world_camera`` (OpenCV axes, float64) of the rows (3x4 or 4x4, OpenGL axes) of a rigid transform.
+
+    ``key`` is the key of ``rows`` in ``record``, for messages. Raises ``InputError`` for any other matrix.
+    """
+    return _rigid(record, key, _opencv(_matrix(record, key, rows)))
+
+
+def _opencv(matrix: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+    """Return a pose with OpenCV axes instead of OpenGL's: y up becomes y down, z backward becomes z forward."""
+    return matrix * matrix.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
 def rigid_of_rows(record: Record, key: str, rows: list[Any]) -> SE3:
@@ -65,16 +78,26 @@ def rigid_pose(matrix: Float[Tensor, "3 4"]) -> SE3:
     return given.normalized()
 
 
-def _matrix(record: Record, key: str, rows: list[Any] | None) -> Tensor:
+def _matrix(record: Record, key: str, rows: list[Any] | None) -> Float[Tensor, "3 4"]:
     """Return the first three of three or four rows of finite numbers; a fourth row must be 0 0 0 1."""
+    matrix, scale = _homogeneous(record, key, rows)
+    if scale != 1.0:
+        raise record.error(f"the last row of {key} is [0, 0, 0, {scale:g}], expected [0, 0, 0, 1]")
+    return matrix
+
+
+def _homogeneous(record: Record, key: str, rows: list[Any] | None) -> tuple[Float[Tensor, "3 4"], float]:
+    """Return the first three rows, divided by the last entry of a fourth row 0 0 0 w, and w (1 up to rounding)."""
     if rows is None:
         raise record.error(f"no {key}, expected a 4x4 camera-to-world matrix")
     if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
         raise record.error(f"{key} is not 3x4 or 4x4, expected a 4x4 matrix")
     numbers = [[record.checked_number(x, f"a number of {key}") for x in row] for row in rows]
-    if len(numbers) == 4 and max(abs(x - y) for x, y in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6:
-        raise record.error(f"the last row of {key} is {numbers[3]}, expected [0, 0, 0, 1]")
-    return torch.tensor(numbers[:3], dtype=torch.float64)
+    last = numbers[3] if len(numbers) == 4 else [0.0, 0.0, 0.0, 1.0]
+    if not last[3] > 0 or max(map(abs, last[:3])) > 1e-6 * last[3]:
+        raise record.error(f"the last row of {key} is {last}, expected [0, 0, 0, 1]")
+    scale = last[3] if abs(last[3] - 1) > 1e-6 else 1.0
+    return torch.tensor(numbers[:3], dtype=torch.float64) / scale, scale
 
 
 def read_pose_matrix(path: Path) -> SE3:

@@ -1,0 +1,71 @@
+"""Files that a description names, where the name was written on another system.
+
+Descriptions come with Windows separators, in other upper and lower case than the files, without the extension of an image, or
+with the absolute path that a file had on another machine. The file is found anyway where only one can be meant.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from bidnerf_core.io.files import is_file
+from bidnerf_core.io.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
+
+IMAGE_ENDINGS = ("", *IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+
+
+def posix_name(name: str) -> PurePosixPath:
+    """Return a name with the separators of this library; backslashes are those of Windows."""
+    return PurePosixPath(PureWindowsPath(name).as_posix() if "\\" in name else name)
+
+
+class FileNames:
+    """The files below a folder, found by the names in a description; each folder is listed at most once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._listed: dict[Path, dict[str, str]] = {}
+
+    def find(self, name: PurePosixPath, endings: tuple[str, ...] = ("",)) -> Path | None:
+        """Return the file that is called ``name``, with one of the ``endings`` added, or None.
+
+        The exact name is tried first, then names in other upper and lower case, then the last parts of an absolute path.
+        """
+        for ending in endings:
+            exact = self._folder / f"{name}{ending}"
+            if is_file(exact):
+                return exact
+        for parts in self._tails(name):
+            for ending in endings:
+                found = self._ignoring_case((*parts[:-1], f"{parts[-1]}{ending}"))
+                if found is not None:
+                    return found
+        return None
+
+    def _tails(self, name: PurePosixPath) -> list[tuple[str, ...]]:
+        """Return the parts of a relative name; of an absolute one, those below any of its folders, longest first."""
+        if not name.parts:
+            return []
+        if not (name.is_absolute() or name.parts[0].endswith(":")):
+            return [name.parts]
+        return [name.parts[first:] for first in range(1, len(name.parts))]
+
+    def _ignoring_case(self, parts: tuple[str, ...]) -> Path | None:
+        place = self._folder
+        for part in parts:
+            if part != "..":
+                part = self._entries(place).get(part.lower(), part)
+            place = place / part
+        return place if is_file(place) else None
+
+    def _entries(self, folder: Path) -> dict[str, str]:
+        """Return the names in a folder by their lower-case form; names that differ by case alone stand for themselves."""
+        if folder not in self._listed:
+            try:
+                names = [child.name for child in folder.iterdir()]
+            except OSError:
+                names = []
+            count = Counter(name.lower() for name in names)
+            self._listed[folder] = {name.lower(): name for name in names if count[name.lower()] == 1}
+        return self._listed[folder]
