@@ -238,7 +238,7 @@ def test_the_principal_point_of_a_part_of_an_image_is_estimated(cut: int, given:
     assert error.translation < 0.03
 
 
-@pytest.mark.parametrize(("cut", "cameras"), [(30, (PINHOLE,)), (40, ())])
+@pytest.mark.parametrize(("cut", "cameras"), [(35, (PINHOLE,)), (40, ())])
 def test_a_probable_part_of_an_image_is_not_taken_for_a_whole_one_of_the_map(
     cut: int, cameras: tuple[Intrinsics, ...]
 ) -> None:

@@ -31,8 +31,10 @@ def linear(seed: int = 0, parameters: int = 3) -> tuple[np.ndarray, np.ndarray, 
     design = random.normal(size=(20, 6 + parameters))
     seen = random.normal(size=20) + design[:, 6:] @ random.normal(size=parameters)
     gradient, hessian = -design.T @ seen, design.T @ design
-    zero = np.zeros_like(hessian)
-    return design, seen, RobustEquations(0.5 * float(seen @ seen), gradient, hessian, hessian, zero, 1.0)
+    equations = RobustEquations(
+        0.5 * float(seen @ seen), gradient, hessian, hessian, 1.0, design, 1.0, 20, 0 * hessian
+    )
+    return design, seen, equations
 
 
 def test_the_evidence_is_the_marginal_density_of_the_observations() -> None:

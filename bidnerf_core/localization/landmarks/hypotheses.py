@@ -159,7 +159,7 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
             log_odds - math.log(len(of_map)),
             FIXED,
             camera.correction,
-            camera.deviations,
+            torch.maximum(camera.deviations, RIGHT.deviations),
             camera.intrinsics,
         )
         for number, (camera, log_odds) in enumerate(of_map)

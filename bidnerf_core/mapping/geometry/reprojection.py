@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -34,13 +34,17 @@ class RobustEquations:
     gradient: Array  # (p,)
     hessian: Array  # (p, p)
     curvature: Array  # (p, p) of the robust cost itself; the Hessian is that of the reweighted squares
-    scatter: Array  # (p, p) of the gradients of single observations and priors
     spread: float  # robust standard deviation of the normalized residuals: 1 where the noise is right
+    single: Array  # (m, p) gradients of the cost of single observations
+    excess: float  # variance of a residual's gradient over its curvature: 1 for a Gaussian likelihood
+    count: float  # of residuals, those with correlated errors counted as one
+    prior: Array  # (p, p) information of priors
 
     def weighted(self, share: float) -> RobustEquations:
-        return RobustEquations(
-            share * self.cost, share * self.gradient, share * self.hessian, share * self.curvature,
-            share * self.scatter, self.spread,
+        """Return the equations of observations of which one counts as ``share``, because their errors are correlated."""
+        return replace(
+            self, cost=share * self.cost, gradient=share * self.gradient, hessian=share * self.hessian,
+            curvature=share * self.curvature, count=share * self.count,
         )  # fmt: skip
 
     def with_prior(self, value: Array, deviations: Array) -> RobustEquations:
@@ -51,17 +55,25 @@ class RobustEquations:
         information[first:, first:] = np.diag(precision)
         gradient[first:] += precision * value
         cost = self.cost + 0.5 * float((precision * value**2).sum())
-        hessian, curvature, scatter = (
-            part + information for part in (self.hessian, self.curvature, self.scatter)
+        hessian, curvature, prior = (
+            part + information for part in (self.hessian, self.curvature, self.prior)
         )
-        return RobustEquations(cost, gradient, hessian, curvature, scatter, self.spread)
+        return replace(self, cost=cost, gradient=gradient, hessian=hessian, curvature=curvature, prior=prior)
 
     @cached_property
     def covariance(self) -> Array:
-        """The covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3)."""
-        inverse = self.inverse_curvature
+        """The covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3).
+
+        The scatter of few gradients is much too small in some direction. It is drawn towards that of residuals with the same
+        distribution, the more so the fewer residuals there are for its entries (Ledoit and Wolf 2004). The
+        residuals have as many fewer degrees of freedom as there are unknowns.
+        """
+        inverse, unknowns = self.inverse_curvature, len(self.gradient)
+        alike = unknowns**2 / (unknowns**2 + self.count)
+        excess = alike * self.excess * self.count / max(1.0, self.count - unknowns)
+        single = (1 - alike) * self.count / (2 * len(self.single)) * self.single.T @ self.single
         with np.errstate(over="ignore", invalid="ignore"):
-            found: Array = inverse @ self.scatter @ inverse
+            found: Array = inverse @ (single + (1 - excess) * self.prior) @ inverse + excess * inverse
             return (found + found.T) / 2
 
     def covariance_by_last(self, first: int) -> Array:
@@ -197,10 +209,14 @@ class ReprojectionErrors:
         jacobian = here.jacobian / deviation[..., None]
         single = ((weight[:, None] * residual)[:, None] @ jacobian)[:, 0]
         weighted = (jacobian * np.sqrt(weight)[:, None, None]).reshape(-1, jacobian.shape[-1])
-        hessian, scatter = weighted.T @ weighted, single.T @ single
+        hessian = weighted.T @ weighted
         cost = cauchy_loss(squared, SCALE)
         # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
-        curvature = hessian - 2 / SCALE**2 * scatter
+        curvature = hessian - 2 / SCALE**2 * single.T @ single
         spare = max(1.0, residual.size - jacobian.shape[-1]) / residual.size
         spread = mad_deviation(residual) / spare**0.5
-        return RobustEquations(cost, single.sum(0), hessian, curvature, scatter, spread)
+        gradients = weight**2 * squared  # along both axes together
+        excess = 0.5 * float(gradients.mean() / max(0.1, (weight - gradients / SCALE**2).mean()))
+        return RobustEquations(
+            cost, single.sum(0), hessian, curvature, spread, single, excess, residual.size, 0 * hessian
+        )
