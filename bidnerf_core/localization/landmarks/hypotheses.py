@@ -43,7 +43,7 @@ from bidnerf_core.mapping.geometry.eliminated_pose import TIED, Conditional, Eli
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.projection import Array
 from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
-from bidnerf_core.mapping.geometry.resection import minimized
+from bidnerf_core.mapping.geometry.resection import RESECTION_STEPS, minimized
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 CROPS_BESIDE_APPROXIMATE = 0.1
@@ -353,12 +353,14 @@ def posterior(
     calibration: Calibration,
     scatter: Float[Tensor, "4"],
     share: float = 0.0,
+    steps: int = RESECTION_STEPS,
 ) -> Posterior:
     """Return the probabilities of hypotheses given observations with the stated intrinsics, and the pose under each of them.
 
     ``start`` and ``calibration`` are where the fit starts, ``noise`` (pixels) is a first guess, ``correlation`` the number of
     observations that count as one, and ``share`` the prior probability of a motion between rows; 0 for a camera at rest.
     ``scatter``: standard deviations of the corrections that images of the map seem to need although their intrinsics are right.
+    ``steps`` are taken at most to fit the observations; where the start is near, few leave the rest to the linear algebra.
     """
     mean, deviations = (
         torch.stack([getattr(each, name) for each in which]).numpy() for name in ("mean", "deviations")
@@ -376,7 +378,7 @@ def posterior(
         ways[still] = (Motion.STILL, Motion.MOVING)
         ways[still.exposed_at(data.transposed_exposure_times)] = (Motion.TRANSPOSED,)
     state = State.of(start, calibration)
-    fits = [(errors, *minimized(errors, state, wide, noise, correlation)) for errors in ways]
+    fits = [(errors, *minimized(errors, state, wide, noise, correlation, steps=steps)) for errors in ways]
     least = min(fitted for *_, fitted in fits)
     shares = {
         Motion.STILL: 1 - share,

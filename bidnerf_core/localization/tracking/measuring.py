@@ -26,7 +26,14 @@ from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import ByColourConfig, TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
+from bidnerf_core.localization.tracking.points import (
+    CAMERAS,
+    FRESH,
+    FollowedPoints,
+    PointFit,
+    fit_pose,
+    with_motion,
+)
 from bidnerf_core.localization.tracking.recognition import (
     Evidence,
     LandmarkDetector,
@@ -105,7 +112,7 @@ class ByLandmarks:
             points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation, state.moves
         )
         if found is not None:
-            found = with_motion(found, self.detector.landmarks)
+            found = with_motion(found, self.detector.landmarks, CAMERAS[:1])
             state = replace(state, moves=found.moves)
         judged = measured = None
         state = replace(state, age=state.age + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_tim
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.hypotheses import (
+    Hypothesis,
     Motion,
     Posterior,
     camera_hypotheses,
@@ -34,6 +36,10 @@ INLIER = 3.0
 """Largest reprojection error of an inlier, in standard deviations along both axes together."""
 MAJORITY = 0.7
 """Share of inliers below which the robust fit is not relied upon, and a sample consensus is tried."""
+TRACKED_STEPS = 1
+"""Steps of the fits that judge a motion in a tracked frame: they start so close by that linear algebra does the rest."""
+CAMERAS = camera_hypotheses([])
+"""Hypotheses about the camera of an image; ``CAMERAS[:1]`` is that its intrinsics are right."""
 FRESH = -1
 """Landmark number of points that are not landmarks."""
 
@@ -161,15 +167,18 @@ def fit_pose(
     return other if other.within(threshold) > found.within(threshold) else found
 
 
-def with_motion(found: PointFit, landmarks: LandmarkMap) -> PointFit:
-    """Return a fit with the more probable of a motion while the rows were exposed and none, and with what is left of doubt."""
+def with_motion(found: PointFit, landmarks: LandmarkMap, which: Sequence[Hypothesis] = CAMERAS) -> PointFit:
+    """Return a fit with the more probable of a motion while the rows were exposed and none, and with what is left of doubt.
+
+    ``which``: the hypotheses about the camera that are judged along with the motion.
+    """
     inliers = found.data[found.inliers]
     if not len(inliers):
         return found
     correlation = landmarks.correlation_of(len(inliers))
     judged = posterior(
-        inliers, found.T_world_camera, found.fit.noise, camera_hypotheses([]), correlation, GIVEN,
-        landmarks.calibration_scatter, share_moving(landmarks),
+        inliers, found.T_world_camera, found.fit.noise, which, correlation, GIVEN,
+        landmarks.calibration_scatter, share_moving(landmarks), TRACKED_STEPS,
     ).with_stated  # fmt: skip
     moved = judged.best.motion is Motion.MOVING
     if moved != found.moves:

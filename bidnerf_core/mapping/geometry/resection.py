@@ -145,11 +145,13 @@ def minimized(
     noise: float,
     correlation: float = 1.0,
     known_noise: bool = False,
+    steps: int = RESECTION_STEPS,
 ) -> tuple[LinearizedErrors, RobustEquations, float]:
     """Minimize the robust cost with a prior about zero on the parameters of the camera.
 
     Returns the errors at the minimum, the equations there with the prior, and the noise (pixels). ``deviations`` (11,): those of
     the prior; parameters with 0 stay where ``start`` has them. Unless the noise is known, it is estimated too, as in ``resect``.
+    ``steps``: how many are taken at most.
     """
     free = deviations.nonzero()[0]
 
@@ -159,7 +161,7 @@ def minimized(
 
     here = errors.linearized(start, free)
     system, damping = equations(here, noise), 1e-6
-    for _ in range(RESECTION_STEPS):
+    for _ in range(steps):
         step = -damped_solution(system.hessian, damping, system.gradient)
         moved = errors.linearized(here.state.retracted(step, free), free)
         tried = equations(moved, noise)
