@@ -36,6 +36,8 @@ BRIGHTNESS_ROUNDS = 20
 """Rounds of alternation between the brightness of landmarks and the exposure of photos."""
 NEIGHBOURS = 8
 """Number of photos from nearby places with which a photo is compared."""
+LEAST_SHOWN = 0.02
+"""Least share of a photo's pixels, away from what is hidden, by which its sharpness is measured."""
 LEAST_BLUR = 0.5
 """Least lack of fine detail, in octaves of its energy, of a photo that counts as blurred."""
 OUTLYING = 4.0
@@ -63,7 +65,7 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
 
     It is 1 for all photos but those that stand out as blurred.
     """
-    sharpness = torch.tensor([_sharpness(_clean(view.frame.rgb).mean(-1)) for view in views])
+    sharpness = torch.tensor([_sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
     lacking = -above_neighbours(sharpness, nearby(views))
     return torch.where(standing_out(lacking, LEAST_BLUR), torch.exp2(-lacking), 1.0)
 
@@ -76,10 +78,11 @@ def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
 def _measured(frame: Frame) -> tuple[float, float, float, float]:
     image = _clean(frame.rgb)
     inside = np.ones(image.shape[:2], bool) if frame.alpha is None else frame.alpha.cpu().numpy() > 0.5
+    inside &= True if frame.hidden is None else ~frame.hidden.cpu().numpy()
     shown = image[inside] if inside.any() else image.reshape(-1, 3)
     brightest = shown.max(-1)
     light = float(np.median(log_light(shown.mean(-1))))
-    return _sharpness(image.mean(-1)), light, float((brightest >= OVEREXPOSED).mean()), float(
+    return _sharpness(image.mean(-1), frame.hidden), light, float((brightest >= OVEREXPOSED).mean()), float(
         (brightest <= UNDEREXPOSED).mean()
     )  # fmt: skip
 
@@ -89,26 +92,44 @@ def log_light(values: np.ndarray) -> np.ndarray:
     return GAMMA * np.log2(np.maximum(values, DARKEST))
 
 
-def _sharpness(grey: np.ndarray) -> float:
-    """Return log2 of the ratio of fine to coarse energy, where contrast cancels; the least of four directions."""
+def _sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
+    """Return log2 of the ratio of fine to coarse energy, where contrast cancels; the least of four directions.
+
+    Pixels that hidden ones influence do not count, unless no others are left.
+    """
+    shown: np.ndarray | None = None if hidden is None else (~hidden.cpu().numpy()).astype(np.float32)
     factor = LARGEST / max(grey.shape)
     if factor < 1:
         size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        shown = None if shown is None else cv2.resize(shown, size, interpolation=cv2.INTER_AREA)
+    counted = None if shown is None else _away_from_hidden(shown)
     fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (FINE, COARSE))
     ratios = [
-        _energy(fine, step, 1) / max(_energy(coarse, step, int(COARSE)), 1e-12) for step in SHARPNESS_STEPS
+        _energy(fine, step, 1, counted) / max(_energy(coarse, step, int(COARSE), counted), 1e-12)
+        for step in SHARPNESS_STEPS
     ]
     return float(np.log2(max(min(ratios), 1e-12)))
 
 
-def _energy(image: np.ndarray, direction: tuple[int, int], step: int) -> float:
-    """Return the mean squared second difference along a direction."""
+def _away_from_hidden(shown: np.ndarray) -> np.ndarray | None:
+    """Return which pixels no hidden one influences, by the share of each that is visible; None if these are too few."""
+    reach = 2 * int(2 * COARSE + COARSE) + 1  # of the blur, to both sides, and of the differences
+    away: np.ndarray = cv2.erode((shown >= 1).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+    return away if away.mean() >= LEAST_SHOWN else None
+
+
+def _energy(image: np.ndarray, direction: tuple[int, int], step: int, counted: np.ndarray | None) -> float:
+    """Return the mean squared second difference along a direction, over the pixels that are ``counted``; None: all."""
     rows, columns = direction[0] * step, direction[1] * step
     ahead = np.roll(image, (-rows, -columns), (0, 1))
     behind = np.roll(image, (rows, columns), (0, 1))
     inner = (ahead + behind - 2 * image)[step:-step, step:-step]
-    return float(np.square(inner).mean()) if inner.size else 0.0
+    if not inner.size:
+        return 0.0
+    if counted is not None and (some := counted[step:-step, step:-step]).any():
+        inner = inner[some]
+    return float(np.square(inner).mean())
 
 
 def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:

@@ -87,6 +87,8 @@ def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
         free = frame.depth.float() * (1 - tolerance)
     if frame.alpha is not None:  # a pixel on an edge covers two depths but has one measurement
         free = torch.where(frame.alpha >= 1, free, torch.where(frame.alpha <= 0, torch.inf, 0.0))
+    if frame.hidden is not None:
+        free = torch.where(frame.hidden, 0.0, free)
     return free
 
 

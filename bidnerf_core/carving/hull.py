@@ -23,7 +23,10 @@ RAYS_OF_VIEW = 500
 
 def has_outline(view: View) -> bool:
     """Return whether the image shows background; alpha that is 1 everywhere carries no information."""
-    return view.frame.alpha is not None and bool((view.frame.alpha <= 0).any())
+    frame = view.frame
+    return frame.alpha is not None and bool(
+        (frame.alpha if frame.hidden is None else frame.alpha[~frame.hidden]).amin() <= 0
+    )
 
 
 def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
@@ -51,8 +54,10 @@ def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[
     """Return the origins and directions (world) of rays through a sample of the pixels whose alpha is over a half."""
     origins, directions = [], []
     for view in views:
-        assert view.frame.alpha is not None  # it has an outline
-        ray = rays_of(view, view.frame.alpha > 0.5, RAYS_OF_VIEW)[0]
+        alpha, hidden = view.frame.alpha, view.frame.hidden
+        assert alpha is not None  # it has an outline
+        matter = alpha > 0.5 if hidden is None else (alpha > 0.5) & ~hidden
+        ray = rays_of(view, matter, RAYS_OF_VIEW)[0]
         directions.append(view.T_ref_camera.to(torch.float64).rotate(ray))
         origins.append(view.T_ref_camera.translation.double().expand_as(ray))
     return torch.cat(origins), torch.cat(directions)
@@ -64,7 +69,8 @@ def _votes(views: Sequence[View], points: Float[Tensor, "n 3"]) -> Int[Tensor, "
 
 
 def _shows_something(view: View, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    camera, alpha = view.frame.intrinsics, view.frame.alpha
+    camera, alpha, hidden = view.frame.intrinsics, view.frame.alpha, view.frame.hidden
     seen = view.T_ref_camera.to(torch.float64).inverse().apply(points).float()
     row, column, inside = camera.cells(seen)
+    inside = inside if hidden is None else inside & ~hidden[row, column]
     return inside if alpha is None else inside & (alpha[row, column] > 0)

@@ -5,7 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from bidnerf_core.cli.camera_options import DatasetCamera, DatasetDepthUnit, RegisterDepth, depth_registration
+from bidnerf_core.cli.camera_options import (
+    DatasetCamera,
+    DatasetDepthUnit,
+    MaskHides,
+    Masks,
+    RegisterDepth,
+    depth_registration,
+    mask_folder,
+)
 from bidnerf_core.cli.options import Device, Flag, MapFolder, option, parse
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.datasets import open_dataset
@@ -32,6 +40,8 @@ def bake(
     camera: DatasetCamera = None,
     register_depth: RegisterDepth = None,
     depth_unit: DatasetDepthUnit = None,
+    masks: Masks = None,
+    mask_hides: MaskHides = "black",
     rendered_landmarks: Annotated[
         Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
     ] = False,
@@ -51,12 +61,19 @@ def bake(
     """
     if rendered_landmarks and data is not None:
         raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
-    registration = depth_registration(register_depth)
+    if masks is not None and data is None:
+        raise UsageError("--masks was given without --data, expected the dataset that they belong to")
+    registration, hiding = depth_registration(register_depth), mask_folder(masks, mask_hides)
     scene = load_map(map, device, baked=False)  # its baked parts may be damaged, and are replaced anyway
     photos = None
     if data is not None:
         photos = open_dataset(
-            data, scene.bounds.background, camera=camera, register_depth=registration, depth_unit=depth_unit
+            data,
+            scene.bounds.background,
+            camera=camera,
+            register_depth=registration,
+            depth_unit=depth_unit,
+            masks=hiding,
         )
     with stopped_by_ctrl_c() as cancel, Display() as progress:
         scene.bake(

@@ -10,6 +10,8 @@ import tyro
 from bidnerf_core.cli.options import option
 from bidnerf_core.datasets import DepthRegistration
 from bidnerf_core.depth.sensors import DEPTH_SENSORS
+from bidnerf_core.errors import UsageError
+from bidnerf_core.frames.masks import HiddenColour, MaskFolder
 
 NO = "no"
 """The value of ``--register-depth`` for which depth is used as it is."""
@@ -60,7 +62,23 @@ DatasetDepthUnit = Annotated[
     ),
 ]
 
+Masks = Annotated[
+    Path | None,
+    option(
+        "DIR",
+        "masks of the images, called as they are: what is black (--mask-hides) is not used, such as people or the robot itself",
+        "",
+    ),
+]
+MaskHides = Annotated[HiddenColour, option("COLOUR", "colour in --masks of what is not used: black or white")]
 DepthSensorName = Annotated[str, option("NAME", "what measured the depth: " + ", ".join(DEPTH_SENSORS))]
+
+
+def mask_folder(masks: Path | None, hides: HiddenColour) -> MaskFolder | None:
+    """Return the folder of masks that ``--masks`` and ``--mask-hides`` name. Raises ``UsageError`` for the second alone."""
+    if masks is None and hides != "black":
+        raise UsageError(f"--mask-hides {hides} was given without --masks, expected the folder of masks")
+    return None if masks is None else MaskFolder(masks, hides)
 
 
 def depth_registration(given: str | None) -> DepthRegistration | None:

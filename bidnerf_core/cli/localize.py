@@ -16,8 +16,11 @@ from bidnerf_core.cli.camera_options import (
     CameraFile,
     FieldOfView,
     FocalLength,
+    MaskHides,
+    Masks,
     RegisterDepth,
     depth_registration,
+    mask_folder,
 )
 from bidnerf_core.cli.folders import check_output, check_pose_file, make_folder
 from bidnerf_core.cli.interruptions import uninterrupted
@@ -80,6 +83,8 @@ def run(arguments: list[str]) -> None:
             ),
         ] = None,
         register_depth: RegisterDepth = None,
+        masks: Masks = None,
+        mask_hides: MaskHides = "black",
         frame: Annotated[
             Names,
             option("NAME...", "frames of a dataset, together as a rig", "each of the split, on its own"),
@@ -136,8 +141,9 @@ def run(arguments: list[str]) -> None:
         if frame and not any(frame):
             raise UsageError("--frame names no frame, expected the stem of an image file")
         photos = PhotoOptions(
-            depth, CameraSource(camera, focal, hfov), depth_unit, depth_registration(register_depth)
-        )
+            depth, CameraSource(camera, focal, hfov), depth_unit, depth_registration(register_depth),
+            mask_folder(masks, mask_hides),
+        )  # fmt: skip
         frames = FrameOptions(split, tuple(name for group in frame for name in group), window)
         begin = StartSpec(None if start is None else read_pose(start), perturb)
         for part in (frames, begin):

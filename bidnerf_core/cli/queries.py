@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.options import require, require_different
-from bidnerf_core.datasets import DepthRegistration, ReadOptions, open_dataset
+from bidnerf_core.datasets import DepthRegistration, MaskFolder, ReadOptions, open_dataset
 from bidnerf_core.datasets.queries import (
     DatasetFrames,
     DepthPoints,
@@ -29,6 +29,7 @@ class PhotoOptions:
     camera: CameraSource = CameraSource()
     depth_unit: float | None = None  # metres per step
     registration: DepthRegistration | None = None
+    masks: MaskFolder | None = None
 
     @property
     def for_photos(self) -> list[str]:
@@ -81,7 +82,7 @@ def open_queries(
     depth = depth_files(files, photos.depth)
     photos.check_depth()
     sensor = ReadOptions(register_depth=photos.registration).sensor("--register-depth")
-    return Photos(files, photos.camera, depth, photos.depth_unit, sensor, background, points)
+    return Photos(files, photos.camera, depth, photos.depth_unit, sensor, background, points, photos.masks)
 
 
 def _dataset(
@@ -101,6 +102,7 @@ def _dataset(
         camera=photos.camera.camera,
         register_depth=photos.registration,
         depth_unit=photos.depth_unit,
+        masks=photos.masks,
     )
     source = DatasetFrames(dataset, frames.split, frames.names, frames.window, points)
     _check_points(points, len(source.names), "frames; name one by --frame")

@@ -19,8 +19,11 @@ from bidnerf_core.cli.camera_options import (
     DepthSensorName,
     FieldOfView,
     FocalLength,
+    MaskHides,
+    Masks,
     RegisterDepth,
     depth_registration,
+    mask_folder,
 )
 from bidnerf_core.cli.folders import check_output, check_plot, check_pose_file
 from bidnerf_core.cli.interruptions import uninterrupted
@@ -74,6 +77,8 @@ def run(arguments: list[str]) -> None:
         hfov: FieldOfView = None,
         register_depth: RegisterDepth = None,
         depth_unit: DatasetDepthUnit = None,
+        masks: Masks = None,
+        mask_hides: MaskHides = "black",
         depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
         depth_sensor: DepthSensorName = "unknown",
         split: Annotated[
@@ -103,6 +108,10 @@ def run(arguments: list[str]) -> None:
             raise UsageError("--split is for datasets, expected none with --follow")
         if follow and depth_unit is not None:
             raise UsageError("--depth-unit with --follow, expected depth_unit in each request")
+        if follow and masks is not None:
+            raise UsageError(
+                '--masks names images that are there already; with --follow, lines of stdin may name a "mask"'
+            )
         if out is None and not follow:
             raise UsageError("no --out, expected the name of a file of poses")
         inputs = (sequence, camera, start, register_depth)
@@ -114,7 +123,7 @@ def run(arguments: list[str]) -> None:
         if video is not None:
             check_video(video)
             check_output(video, inputs)
-        registration = depth_registration(register_depth)
+        registration, hiding = depth_registration(register_depth), mask_folder(masks, mask_hides)
         sensor = ReadOptions(register_depth=registration).sensor(sequence) if follow else None
         begin, settings = (
             None if start is None else read_pose(start),
@@ -140,6 +149,7 @@ def run(arguments: list[str]) -> None:
                         hfov=hfov,
                         register_depth=registration,
                         depth_unit=depth_unit,
+                        masks=hiding,
                     )
                     frames = frames if split is None else _of_split(frames, split)
                     with counted("tracking", "frames", -(-len(frames) // every)) as report:

@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 from bidnerf_core.backend import load_backend
 from bidnerf_core.captures.training_views import RefinementChoice
-from bidnerf_core.cli.camera_options import DatasetCamera, DatasetDepthUnit, RegisterDepth, depth_registration
+from bidnerf_core.cli.camera_options import (
+    DatasetCamera,
+    DatasetDepthUnit,
+    MaskHides,
+    Masks,
+    RegisterDepth,
+    depth_registration,
+    mask_folder,
+)
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import (
     DEFAULT_BACKEND,
@@ -50,6 +58,8 @@ def run(arguments: list[str]) -> None:
         camera: DatasetCamera = None,
         register_depth: RegisterDepth = None,
         depth_unit: DatasetDepthUnit = None,
+        masks: Masks = None,
+        mask_hides: MaskHides = "black",
         background: Annotated[
             str | None,
             option("COLOUR", "colour behind images with alpha: white or black", "as the dataset has it"),
@@ -110,6 +120,7 @@ def run(arguments: list[str]) -> None:
             camera=camera,
             register_depth=depth_registration(register_depth),
             depth_unit=depth_unit,
+            masks=mask_folder(masks, mask_hides),
         )
         with stopped_by_ctrl_c() as cancel, Display() as progress:
             same: dict[str, Any] = {

@@ -21,7 +21,7 @@ POLL = 0.05
 """Seconds between two checks of a watched folder."""
 STEADY = 2
 """Number of checks for which a file's size has to stay the same before it is read, since it may still be being written."""
-KEYS = {"image", "depth", "time", "depth_unit"}
+KEYS = {"image", "depth", "time", "depth_unit", "mask"}
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class FrameRequest:
     depth: Path | None = None
     time: float | None = None  # seconds
     depth_unit: float | None = None  # metres per step
+    mask: Path | None = None  # black is not used
 
     @staticmethod
     def parse(line: str) -> FrameRequest:
@@ -46,13 +47,20 @@ class FrameRequest:
         if unknown := sorted(request.values.keys() - KEYS):
             raise request.error(f"unknown key {unknown[0]!r}, expected some of {', '.join(sorted(KEYS))}")
         time, unit = request.number("time"), request.number("depth_unit")
-        return FrameRequest(Path(image), None if depth is None else Path(depth), time, unit)
+        mask = request.text("mask")
+        return FrameRequest(
+            Path(image),
+            None if depth is None else Path(depth),
+            time,
+            unit,
+            None if mask is None else Path(mask),
+        )
 
     def read(self, camera: CameraSource, sensor: DepthCamera | None, background: Background) -> Frame:
         """Read the image and its depth. Raises ``InputError`` if they are not readable or the camera is not known."""
         return Frame.read(
             self.image, camera, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
-            background=background,
+            background=background, mask=self.mask,
         )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.image_folders import open_images
+from bidnerf_core.datasets.masked import MaskedDataset, mask_folder, masked_sequence
 from bidnerf_core.datasets.reader import (
     READERS,
     DepthRegistration,
@@ -33,6 +34,7 @@ from bidnerf_core.datasets.video import VIDEO_SUFFIXES, open_video
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, amount
+from bidnerf_core.frames.masks import MaskFolder
 from bidnerf_core.frames.photos import photos_in
 from bidnerf_core.io.images import Background
 
@@ -45,6 +47,8 @@ __all__ = [
     "DepthRegistration",
     "FileSequence",
     "FrameSequence",
+    "MaskFolder",
+    "MaskedDataset",
     "ReadOptions",
     "Reader",
     "ReadingProgress",
@@ -68,6 +72,7 @@ def open_dataset(
     camera: Intrinsics | str | Path | None = None,
     register_depth: DepthRegistration | None = None,
     depth_unit: float | None = None,
+    masks: str | Path | MaskFolder | None = None,
 ) -> Dataset:
     """Open the dataset in the folder ``path``. Descriptions are read and checked now, images when views are requested.
 
@@ -75,7 +80,8 @@ def open_dataset(
     white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. ``camera`` (intrinsics or
     a file of them) is for formats without a camera of their own, such as TUM RGB-D. ``register_depth`` determines whether
     depth is moved to the colour camera, and from which sensor; the default depends on the format. ``depth_unit`` (metres per
-    step of depth images) replaces the unit of the format. What a description lists and the folder lacks is left out, with an
+    step of depth images) replaces the unit of the format. ``masks`` is a folder of
+    images whose black pixels show what is not to be used (see ``MaskFolder``). What a description lists and the folder lacks is left out, with an
     ``InputWarning`` that counts it. Raises ``InputError`` where there is no such folder, where no reader recognises it, where
     nothing is left, and where a description is not usable.
     """
@@ -88,7 +94,8 @@ def open_dataset(
     if reader is None:
         raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
     options = _options(reader, folder, CameraSource(camera), background, register_depth, depth_unit)
-    return opened(reader, folder, options)
+    found = opened(reader, folder, options)
+    return found if masks is None else MaskedDataset(found, mask_folder(masks))
 
 
 def open_sequence(
@@ -102,16 +109,23 @@ def open_sequence(
     readers: Sequence[Reader] | None = None,
     register_depth: DepthRegistration | None = None,
     depth_unit: float | None = None,
+    masks: str | Path | MaskFolder | None = None,
 ) -> FrameSequence:
     """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video. None is read yet.
 
     Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
     ``Frame.open``. Without them, images have that of their EXIF; images without a focal length, and videos, have one of the
     ``assumed`` cameras. Datasets have their own cameras, except those for which ``open_dataset`` accepts one.
-    ``register_depth`` and ``depth_unit`` are as in ``open_dataset``; depth in a folder of images is registered if a sensor is
+    ``register_depth``, ``depth_unit`` and ``masks`` are as in ``open_dataset``; depth in a folder of images is registered if a sensor is
     given, and in millimetres unless a unit is given. Raises
     ``InputError`` where nothing is found, where a description is not usable, and for a missing or superfluous camera.
     """
+    if masks is not None:
+        unmasked = open_sequence(
+            path, camera=camera, focal=focal, hfov=hfov, assumed=assumed, background=background, readers=readers,
+            register_depth=register_depth, depth_unit=depth_unit,
+        )  # fmt: skip
+        return masked_sequence(unmasked, mask_folder(masks))
     place, given = Path(path), CameraSource(camera, focal, hfov, tuple(assumed))
     if not place.exists():
         raise InputError(f"{place}: no such file or folder")

@@ -44,6 +44,8 @@ class Dataset(Protocol):
     ) -> list[View]:
         """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
+        Of a whole split, frames that are hidden altogether by a mask are left out.
+
         Raises ``InputError`` for an unknown split or frame, and for a file that is missing or not usable.
         """
         ...

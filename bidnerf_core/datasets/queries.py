@@ -13,6 +13,7 @@ from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.masked import MaskedDataset
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.reader import expected_files
 from bidnerf_core.datasets.transforms import TransformsDataset
@@ -20,6 +21,7 @@ from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.masks import MaskFolder
 from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import Background
@@ -81,7 +83,7 @@ class Photos:
     """Image files, each a query.
 
     ``depth`` holds the depth file of each photo that has one, ``depth_unit`` is the length of one of its steps (metres), and
-    ``sensor`` the camera from which depth is registered to the photos.
+    ``sensor`` the camera from which depth is registered to the photos. ``masks`` hide parts of the photos.
     """
 
     def __init__(
@@ -93,26 +95,31 @@ class Photos:
         sensor: DepthCamera | None = None,
         background: Background = "black",
         points: DepthPoints | None = None,
+        masks: MaskFolder | None = None,
     ) -> None:
-        self._files, self._background, self._points = files, background, points
+        self._files, self._background, self._points, self._masks = files, background, points, masks
         self._camera = CameraSource() if camera is None else camera
         self._depth, self._depth_unit, self._sensor = depth or {}, depth_unit, sensor
         self._names = unique_names([(*file.parts[:-1], file.stem) for file in files])
         self._remarks: set[str] = set()
+        if masks is not None:
+            masks.require_any(self._names)
 
     @property
     def names(self) -> Sequence[str]:
         return self._names
 
     def read(self, place: int) -> Query:
-        file = self._files[place]
+        file, name = self._files[place], self._names[place]
+        masks = self._masks
+        mask = None if masks is None else masks.file_of(name) or masks.file_of(file.stem)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", InputWarning)
             frame = Frame.read(
                 file, self._camera, depth=self._depth.get(file), depth_unit=self._depth_unit,
-                sensor=self._sensor, background=self._background,
+                sensor=self._sensor, background=self._background, mask=mask,
+                mask_hides="black" if masks is None else masks.hides,
             )  # fmt: skip
-        name = self._names[place]
         for warning in caught:
             self._remark(name, str(warning.message).partition(": ")[2] or str(warning.message))
         self._remark(name, f"{frame.camera_source}")
@@ -156,8 +163,9 @@ class DatasetFrames:
     def read(self, place: int) -> Query:
         views = tuple(self._dataset.views(self._split, self._rigs[place]))
         file = None
-        if isinstance(self._dataset, TransformsDataset):
-            file = self._dataset.image_file(self._split, views[-1].frame.name)
+        dataset = self._dataset.unmasked if isinstance(self._dataset, MaskedDataset) else self._dataset
+        if isinstance(dataset, TransformsDataset):
+            file = dataset.image_file(self._split, views[-1].frame.name)
         rays = None if self._points is None else self._points.rays(views, self._split)
         return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, file)
 

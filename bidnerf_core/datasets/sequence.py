@@ -80,6 +80,11 @@ class FileSequence:
         return self._path
 
     @property
+    def entries(self) -> Sequence[SequenceEntry]:
+        """The frames, none of which is read."""
+        return self._entries
+
+    @property
     def names(self) -> list[str]:
         """The names of the frames, none of which is read."""
         return [entry.name for entry in self._entries]

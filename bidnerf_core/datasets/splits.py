@@ -12,6 +12,7 @@ from bidnerf_core.datasets.dataset import ReadingProgress, positions, unique_nam
 from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, SequenceEntry
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.masks import WhollyHidden
 from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import Background, background_colour
@@ -116,9 +117,14 @@ class SplitDataset(ABC, Generic[F]):
         frames = self._frames.select(split, names)
         views = []
         for done, (name, frame) in enumerate(frames, start=1):
-            found, truth = self._posed(frame, name)
-            assert truth is not None  # only frames with a pose are in splits
-            views.append(View(found, truth))
+            try:
+                found, truth = self._posed(frame, name)
+            except WhollyHidden:
+                if names is not None:
+                    raise
+            else:
+                assert truth is not None  # only frames with a pose are in splits
+                views.append(View(found, truth))
             if progress is not None:
                 progress(done, len(frames))
         return views

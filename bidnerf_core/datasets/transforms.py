@@ -10,7 +10,9 @@ These keys are read from a frame or, where it lacks them, from the file: ``camer
 0.001; as in nerfstudio it applies to ``.npy`` depth as well) or instant-ngp's ``integer_depth_scale``. These are read only from
 a frame: ``file_path`` (its extension may be missing, its separators may be those of Windows, its upper and lower case may differ
 from the file's), ``transform_matrix``, ``depth_file_path`` or instant-ngp's ``depth_path`` (planar z of the image's aspect ratio
-and of any size; each pixel has the depth of the nearest measurement; see ``depth_image`` for values that count as not measured).
+and of any size; each pixel has the depth of the nearest measurement; see ``depth_image`` for values that count as not measured),
+``mask_path`` (an image whose black pixels are not used). Where ``dynamic_mask_NAME.png`` of instant-ngp lies beside ``NAME.png``,
+its white pixels are not used.
 Frames whose image is missing are left out, and missing depth images too, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
 not undone, so the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or
 by the number that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
@@ -24,6 +26,7 @@ from functools import cached_property
 from pathlib import Path
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.incomplete import present, remark
@@ -35,8 +38,13 @@ from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, 
 from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.masks import HiddenColour, read_mask
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import is_file
 from bidnerf_core.io.images import Background, background_colour, read_header
+
+DYNAMIC_MASK = "dynamic_mask_"
+"""Prefix of the masks of instant-ngp, which lie beside the images."""
 
 
 class TransformsReader(Reader):
@@ -99,7 +107,20 @@ class TransformsDataset(SplitDataset[FrameRecord]):
             self._check_size(frame, path, width, height)
             return frame.camera.intrinsics(width, height)
 
-        return read_rgbd(name, path, camera_of, self.background, depth)
+        return self._masked(frame, path, read_rgbd(name, path, camera_of, self.background, depth))
+
+    def _masked(self, frame: FrameRecord, image: Path, read: Frame) -> Frame:
+        """Return the frame with what its masks hide: black in nerfstudio's ``mask_path``, white in instant-ngp's."""
+        masks: list[tuple[Path, HiddenColour]] = []
+        if frame in self._files.masks:
+            masks.append((self._files.masks[frame], "black"))
+        beside = image.with_name(f"{DYNAMIC_MASK}{image.stem}.png")
+        if is_file(beside):
+            masks.append((beside, "white"))
+        size = (read.intrinsics.width, read.intrinsics.height)
+        for path, hides in masks:
+            read = read.with_hidden(read_mask(path, Raster(*size), size, hides))
+        return read
 
     def _pose(self, frame: FrameRecord) -> SE3:
         return frame.T_world_camera
@@ -124,7 +145,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
 
 
 class _Files:
-    """The image and depth files of the frames; those that are missing are left out, and counted in a remark."""
+    """The images, depth images and masks of the frames; those that are missing are left out, and counted in a remark."""
 
     def __init__(self, folder: Path, splits: dict[str, list[FrameRecord]]) -> None:
         self._folder, self._names = folder, FileNames(folder)
@@ -146,6 +167,10 @@ class _Files:
             lambda frame: frame.depth_path,
             noun="depth image",
         )
+        hiding = [frame for frame in frames if frame in there and frame.mask_path is not None]
+        masks = {frame: self._names.find(frame.mask_path) for frame in hiding if frame.mask_path}
+        self.masks = {frame: path for frame, path in masks.items() if path is not None}
+        present(hiding, self.masks.__contains__, folder, lambda frame: frame.mask_path, self._no_mask, "mask")
         self._remark_names()
 
     def _no_image(self, frame: FrameRecord) -> InputError:
@@ -153,6 +178,9 @@ class _Files:
         return frame.record.error(
             f"no image {tried}, expected that file (also tried with the extension of an image added, in any case)"
         )
+
+    def _no_mask(self, frame: FrameRecord) -> InputError:
+        return frame.record.error(f"no mask {self._folder / str(frame.mask_path)}, expected that file (mask_path)")
 
     def _remark_names(self) -> None:
         """Report names that differ from those of the files by more than an added extension."""

@@ -37,6 +37,7 @@ class FrameRecord:
     depth_path: PurePosixPath | None
     depth_unit: float  # metres
     time: float | None  # seconds
+    mask_path: PurePosixPath | None  # black is hidden
 
     @property
     def stem(self) -> str:
@@ -138,7 +139,15 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
     T_world_camera, scale = pose_and_scale(Record(record.where, entry))
     depth, unit = _depth(record, own)
     return FrameRecord(
-        record, posix_name(path), camera_record(record), T_world_camera, scale, depth, unit, _time(own)
+        record,
+        posix_name(path),
+        camera_record(record),
+        T_world_camera,
+        scale,
+        depth,
+        unit,
+        _time(own),
+        posix_name(mask) if (mask := own.text("mask_path")) else None,
     )
 
 

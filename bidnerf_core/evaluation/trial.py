@@ -149,7 +149,7 @@ def _parts(folder: str) -> tuple[str, ...]:
 
 
 def views_digest(views: Sequence[View]) -> str:
-    """Return the digest of the images, depth, alpha, intrinsics and poses of ``views``; it depends on their order."""
+    """Return the digest of the images, depth, alpha, hidden pixels, intrinsics and poses of ``views``; it depends on their order."""
     hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
     for view in views:
         frame = view.frame
@@ -157,6 +157,8 @@ def views_digest(views: Sequence[View]) -> str:
         hashed.update(f"{frame.name}\n{camera}\n".encode(errors="surrogatepass"))
         for image in (frame.rgb, frame.depth, frame.alpha, view.T_ref_camera.matrix()):
             _add_tensor(hashed, image)
+        if frame.hidden is not None:
+            _add_tensor(hashed, frame.hidden)
     return hashed.hexdigest()
 
 

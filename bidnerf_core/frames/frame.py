@@ -20,6 +20,7 @@ from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.depth.images import depth_image
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.frames.masks import HiddenColour, WhollyHidden, read_mask
 from bidnerf_core.frames.photos import fit_depth, read_photo
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import Background, background_colour, over, pixel_array, split_alpha
@@ -53,8 +54,9 @@ class Frame:
     hidden: Bool[Tensor, "hh hw"] | None = None
     """The pixels where something that the map does not have hides the scene.
 
-    Depth counts as not measured there. No rays are drawn there, no keypoints are detected and no landmarks are expected;
-    only the thumbnails of a search by colour alone still show it.
+    Masks are read into it (see ``masks``). Depth counts as not measured there. No rays are drawn there, no keypoints are
+    detected, no points are followed and no landmarks are expected; the thumbnails of a search by colour alone continue the
+    colours around it.
     """
 
     def __post_init__(self) -> None:
@@ -76,11 +78,11 @@ class Frame:
             self._hide(self.hidden)
 
     def _hide(self, hidden: Bool[Tensor, "h w"]) -> None:
-        if hidden.dtype != torch.bool or bool(hidden.all()):
-            found = "all true" if hidden.dtype == torch.bool else f"of {hidden.dtype}"
-            raise InputError(
-                f"frame {self.name}: hidden is {found}, expected booleans that leave something visible"
-            )
+        expected = "expected booleans that leave something visible"
+        if hidden.dtype != torch.bool:
+            raise InputError(f"frame {self.name}: hidden is of {hidden.dtype}, {expected}")
+        if bool(hidden.all()):
+            raise WhollyHidden(f"frame {self.name}: hidden is all true, {expected}")
         if self.depth is not None and bool((self.depth[hidden.to(self.depth.device)] != 0).any()):
             depth = torch.where(hidden.to(self.depth.device), 0, self.depth)
             object.__setattr__(self, "depth", depth)
@@ -97,6 +99,8 @@ class Frame:
         depth_unit: float | None = None,
         background: Background = BLACK,
         largest: int | None = None,
+        mask: str | Path | None = None,
+        mask_hides: HiddenColour = "black",
     ) -> Frame:
         """Read a photo, turn it upright according to its EXIF orientation, and find its camera.
 
@@ -111,15 +115,17 @@ class Frame:
         assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists values that mean "nothing
         measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become 0. Depth of another resolution is resampled
         to the nearest measurement. ``background`` (rgb in [0, 1], "white" or "black") lies behind transparent pixels. Where
-        the longer side has more than ``largest`` pixels, the image is reduced to that size.
+        the longer side has more than ``largest`` pixels, the image is reduced to that size. ``mask`` is an image whose black
+        pixels (white ones with ``mask_hides="white"``) show what is not to be used: they become ``hidden``.
 
         Raises ``InputError`` where a file is not readable or has more than 100 megapixels, where the camera is not known or
         given twice, and where camera or depth belong to an image of another aspect ratio.
         """
         given = CameraSource(camera, focal, hfov, tuple(assumed))
         return Frame.read(
-            path, given, depth=depth, depth_unit=depth_unit, background=background, largest=largest
-        )
+            path, given, depth=depth, depth_unit=depth_unit, background=background, largest=largest,
+            mask=mask, mask_hides=mask_hides,
+        )  # fmt: skip
 
     @staticmethod
     def read(
@@ -131,6 +137,8 @@ class Frame:
         sensor: DepthCamera | None = None,
         background: Background = BLACK,
         largest: int | None = None,
+        mask: str | Path | None = None,
+        mask_hides: HiddenColour = "black",
     ) -> Frame:
         """Read a photo as ``open`` does; depth is registered to it from ``sensor``, if there is one."""
         path = Path(path)
@@ -145,11 +153,23 @@ class Frame:
         )
         if photo.remark is not None:
             warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=3)
-        found = photo.camera
+        found, hidden = photo.camera, None
+        if mask is not None:
+            size = (found.intrinsics.width, found.intrinsics.height)
+            hidden = read_mask(Path(mask), photo.raster, size, mask_hides)
         return Frame(
             path.stem, photo.rgb, found.intrinsics, photo.depth, photo.alpha, found.description,
-            found.approximate,
+            found.approximate, hidden=hidden if hidden is not None and bool(hidden.any()) else None,
         )  # fmt: skip
+
+    def with_hidden(self, hidden: Bool[Tensor, "h w"] | None) -> Frame:
+        """Return the frame with more pixels hidden; the frame itself where ``hidden`` is None or false everywhere.
+
+        Raises ``WhollyHidden`` where nothing would be left.
+        """
+        if hidden is None or not bool(hidden.any()):
+            return self
+        return replace(self, hidden=hidden if self.hidden is None else hidden | self.hidden)
 
     @staticmethod
     def from_numpy(
@@ -159,6 +179,7 @@ class Frame:
         depth: np.ndarray | Tensor | None = None,
         depth_unit: float | None = None,
         alpha: np.ndarray | Tensor | None = None,
+        hidden: np.ndarray | Tensor | None = None,
         name: str = "image",
         background: Background = BLACK,
     ) -> Frame:
@@ -167,6 +188,7 @@ class Frame:
         ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a second or
         fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are straight (not premultiplied) and
         laid over ``background``. ``depth`` (planar z) and ``depth_unit`` are as in ``open``, as is scaling of ``camera``.
+        ``hidden`` (h, w) holds booleans, true where a pixel is not to be used.
 
         Raises ``InputError`` for other types and shapes, NaN, floats outside [0, 1], and where camera or depth belong to
         an image of another aspect ratio.
@@ -198,7 +220,11 @@ class Frame:
             metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
             if remark := measured.remark(depth_unit is None):
                 warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
-        return Frame(name, over(colour, cover, background_colour(background)), intrinsics, metres, cover)
+        laid = over(colour, cover, background_colour(background))
+        unused = None if hidden is None else torch.as_tensor(hidden)
+        if unused is not None and unused.dtype == torch.bool and not bool(unused.any()):
+            unused = None
+        return Frame(name, laid, intrinsics, metres, cover, hidden=unused)
 
     def to(self, device: torch.device | str) -> Frame:
         """Return the frame with its images on ``device``; the frame itself where they lie there."""

@@ -38,6 +38,7 @@ class Photo:
     camera: FoundCamera
     depth: Float[Tensor, "h w"] | None  # planar z in metres, 0 where nothing was measured
     remark: str | None  # one line on the assumptions that were made about depth
+    raster: Raster  # of the image as stored
 
 
 def read_photo(
@@ -64,13 +65,13 @@ def read_photo(
     rgb = exif.orientation.upright(rgb)
     alpha = None if alpha is None else exif.orientation.upright(alpha)
     if measured is None or depth is None:
-        return Photo(rgb, alpha, found, None, None)
+        return Photo(rgb, alpha, found, None, None, raster)
     fitted = (
         fit_depth(measured, raster, size, f"{depth}: depth")
         if sensor is None
         else sensor.registered(measured.metres, found.intrinsics, depth)
     )
-    return Photo(rgb, alpha, found, fitted, measured.remark(depth_unit is None))
+    return Photo(rgb, alpha, found, fitted, measured.remark(depth_unit is None), raster)
 
 
 def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what: str) -> Float[Tensor, "h w"]:

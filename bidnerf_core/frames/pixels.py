@@ -11,11 +11,12 @@ from typing import Literal, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from kornia.color import rgb_to_grayscale
 from kornia.feature import gftt_response
 from kornia.geometry.subpix import nms2d
 from kornia.morphology import dilation
+from scipy.ndimage import distance_transform_edt
 from torch import Generator, Tensor
 
 from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
@@ -168,12 +169,27 @@ among_visible = Among(all_pixels)
 """Draws among all pixels that are not hidden."""
 
 
+def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+    """Return which of ``pixels`` (u, v) inside the image are not hidden."""
+    if frame.hidden is None:
+        return torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
+    columns, rows = pixels.to(frame.hidden.device).long().unbind(-1)
+    height, width = frame.hidden.shape
+    return ~frame.hidden[rows.clamp(0, height - 1), columns.clamp(0, width - 1)].to(pixels.device)
+
+
+def continued(frame: Frame) -> Float[Tensor, "h w 3"]:
+    """Return the colours of a frame with those of hidden pixels replaced by the colours of the nearest visible ones."""
+    if frame.hidden is None:
+        return frame.rgb
+    _, (rows, columns) = distance_transform_edt(frame.hidden.cpu().numpy(), return_indices=True)
+    nearest = (torch.from_numpy(index).long().to(frame.rgb.device) for index in (rows, columns))
+    return frame.rgb[tuple(nearest)]
+
+
 def _seen(pixels: Int[Tensor, "n 2"], frame: Frame) -> Int[Tensor, "k 2"]:
     """Return the pixels that are not hidden."""
-    if frame.hidden is None:
-        return pixels
-    columns, rows = pixels.to(frame.hidden.device).unbind(-1)
-    return pixels[~frame.hidden[rows, columns].to(pixels.device)]
+    return pixels if frame.hidden is None else pixels[visible_at(frame, pixels)]
 
 
 def drawer(name: DrawerName) -> PixelDrawer:

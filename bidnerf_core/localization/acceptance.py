@@ -199,7 +199,8 @@ def _doubted(found: LandmarkPose) -> str:
 
 def is_blank(frame: Frame) -> bool:
     """Return whether the image is of a single colour, as if the lens were covered, or the frame has no colours at all."""
-    return not frame.has_colour or float(frame.rgb.flatten(0, 1).std(0, correction=0).max()) < FLAT
+    shown = frame.rgb.flatten(0, 1) if frame.hidden is None else frame.rgb[~frame.hidden]
+    return not frame.has_colour or float(shown.std(0, correction=0).max()) < FLAT
 
 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:

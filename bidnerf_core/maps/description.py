@@ -38,6 +38,7 @@ class MapInfo:
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
     distances: bool = True  # False if all images are from one place, so that they do not determine distances
     sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
+    hidden: int = 0  # number of training pixels that masks hid
     weights: str = ""  # file names
     training: str | None = None  # state that resuming needs; dropped when training is complete
     surface: str | None = None  # baked from these weights

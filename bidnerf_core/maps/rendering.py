@@ -31,8 +31,11 @@ class RenderingScores:
 
 
 def rendering_scores(image: RenderedImage, frame: Frame) -> RenderingScores:
-    """Compare a rendered image with the colours and the measured depth of the frame from the same pose."""
+    """Compare a rendered image with the colours and the measured depth of the frame from the same pose, where it is not hidden."""
     errors = torch.zeros(0)
     if frame.depth is not None and frame.has_depth:
         errors = (image.depth - frame.depth).abs()[frame.depth > 0]
-    return RenderingScores(float(psnr(image.rgb, frame.rgb, 1.0)), errors)
+    shown, seen = image.rgb, frame.rgb
+    if frame.hidden is not None:
+        shown, seen = shown[~frame.hidden], seen[~frame.hidden]
+    return RenderingScores(float(psnr(shown, seen, 1.0)), errors)

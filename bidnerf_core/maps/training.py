@@ -115,6 +115,7 @@ def train(
         info = MapInfo(
             backend, to_plain(settings, "config"), bounds, 0, False, read.source, cameras=taken.cameras,
             pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=read.sparse_depth,
+            hidden=read.hidden,
             landmark_features=features,
         )  # fmt: skip
         return _trained(chosen, info, taken.views, taken.tracked, work)
@@ -212,6 +213,10 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
             f"{read.place}: {part} other frames or poses than {out} was begun with, expected those of {info.data!r} unchanged"
+        )
+    if read.hidden != info.hidden:
+        raise OtherSettings(
+            f"{out}: was begun with {info.hidden} pixels hidden by masks, got {read.hidden}; resuming keeps the masks (--masks)"
         )
     if read.sparse_depth != info.sparse_depth:
         raise OtherSettings(

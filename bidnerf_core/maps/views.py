@@ -10,8 +10,9 @@ from typing import TypeAlias
 
 from bidnerf_core.datasets import Background, Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import BLACK, View
+from bidnerf_core.frames.masks import INVERTED, masks_sentence
 from bidnerf_core.io.images import background_colour
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 
@@ -29,6 +30,7 @@ class ReadViews:
     source: str  # name of the dataset's folder; empty for views from memory
     place: str  # path of the dataset, or words for views from memory
     background: tuple[float, float, float]  # behind images with an alpha channel
+    hidden: int = 0  # pixels that masks hide
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
 
 
@@ -56,14 +58,27 @@ def read_views(
         if not data.frame_names(split):
             raise InputError(f"{data.path}: split {split!r} has no frames")
         views = data.views(split, None, counter("reading", "images", progress, cancel))
+        if left_out := len(data.frame_names(split)) - len(views):
+            log.info(f"{data.path}: {amount(left_out, 'image')} left out: hidden altogether; {INVERTED}")
+        if not views:
+            raise InputError(f"{data.path}: masks hide all of every image in split {split!r}; {INVERTED}")
         source, place, colour = data.path.resolve().name, str(data.path), data.background
     else:
         views, source, place = _checked(data), "", "views in memory"
         colour = BLACK if background is None else background_colour(background)
+    hidden = _hidden(views, place)
     if depth_points is None:
-        return ReadViews(views, source, place, colour)
+        return ReadViews(views, source, place, colour, hidden)
     views, count = _with_depth(views, Path(depth_points), point_choice or SparseChoice(), split)
-    return ReadViews(views, source, place, colour, count)
+    return ReadViews(views, source, place, colour, hidden, count)
+
+
+def _hidden(views: Sequence[View], place: str) -> int:
+    """Return how many pixels masks hide, and log it."""
+    hidden = [view.frame.hidden for view in views]
+    if (sentence := masks_sentence(hidden)) is not None:
+        log.info(f"{place}: {sentence}")
+    return sum(int(pixels.sum()) for pixels in hidden if pixels is not None)
 
 
 def _checked(views: Sequence[View]) -> list[View]:

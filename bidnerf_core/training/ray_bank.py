@@ -6,19 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, poses_of_rows
 from bidnerf_core.devices import moved
 from bidnerf_core.fields.contract import Rays, SceneBounds
 from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import SPARSE, View
+from bidnerf_core.frames.frame import SPARSE, Frame, View
 from bidnerf_core.geometry.se3 import SE3
 
 MEASURED_SHARE = 0.25
 """Fraction of a batch's rays that are drawn from pixels with depth, if these are so few that hardly any would be drawn
 otherwise (in DS-NeRF: half)."""
+REDRAWN = 64
+"""Rounds in which rays of hidden pixels are drawn anew, before the visible pixels are listed."""
 LANDMARK_SHARE = 0.125
 """Fraction of a batch's rays that are drawn from pixels that show a landmark."""
 
@@ -55,6 +57,7 @@ class RayBank:
         self.has_alpha = any(frame.alpha is not None for frame in frames)
         self.has_depth = any(frame.has_depth for frame in frames)
         self._rgb = torch.cat([frame.rgb.reshape(-1, 3) for frame in frames])
+        self._hidden = _hidden_pixels(frames)
         if self.has_alpha:
             one = [torch.ones(f.rgb.shape[:2]) if f.alpha is None else f.alpha for f in frames]
             self._alpha = torch.cat([a.reshape(-1) for a in one])
@@ -76,11 +79,11 @@ class RayBank:
         self._camera_start = torch.stack([starts[kinds.index(frame.intrinsics)] for frame in frames])
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
-        """Return the rays of ``count`` pixels, drawn uniformly from all views.
+        """Return the rays of ``count`` pixels, drawn uniformly from those of all views that are not hidden.
 
         Where only few pixels have depth, a fixed share is drawn from these; another share is drawn from those with landmarks.
         """
-        index = torch.randint(self.count, (count,), generator=generator)
+        index = self._visible(torch.randint(self.count, (count,), generator=generator), generator)
         if len(self._few):
             some = round(MEASURED_SHARE * count)
             index[:some] = self._few[torch.randint(len(self._few), (some,), generator=generator)]
@@ -103,6 +106,19 @@ class RayBank:
         rays = self.bounds.rays(origins, directions)
         return moved(TrainingBatch(rays, observed, background, view, deviation), self.device)
 
+    def _visible(self, index: Int[Tensor, "r"], generator: Generator) -> Int[Tensor, "r"]:
+        """Return the indices of pixels with those of hidden pixels drawn anew."""
+        if self._hidden is None:
+            return index
+        for _ in range(REDRAWN):
+            again = self._hidden[index].nonzero()[:, 0]
+            if not len(again):
+                return index
+            index[again] = torch.randint(self.count, (len(again),), generator=generator)
+        again, left = self._hidden[index].nonzero()[:, 0], (~self._hidden).nonzero()[:, 0]
+        index[again] = left[torch.randint(len(left), (len(again),), generator=generator)]
+        return index
+
     def _poses(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> SE3:
         """Return the poses of the cameras at the times at which pixels of the views were exposed."""
         T = SE3(self._rotation[view], self._origin[view])
@@ -124,6 +140,14 @@ class RayBank:
             return self._rgb[index], usual
         background = torch.rand((len(index), 3), generator=generator)
         return self._rgb[index] + (1 - self._alpha[index])[:, None] * (background - usual), background
+
+
+def _hidden_pixels(frames: Sequence[Frame]) -> Bool[Tensor, "n"] | None:
+    """Return which pixels of all frames are hidden; None if none is."""
+    if all(frame.hidden is None for frame in frames):
+        return None
+    parts = [torch.zeros(f.rgb.shape[:2], dtype=torch.bool) if f.hidden is None else f.hidden for f in frames]
+    return torch.cat([part.reshape(-1) for part in parts])
 
 
 def _motion_of(views: Sequence[View]) -> Float[Tensor, "v 6"] | None:

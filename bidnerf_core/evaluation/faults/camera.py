@@ -134,5 +134,6 @@ def _turned(frame: Frame, orientation: Orientation) -> Frame:
         rgb=orientation.upright(frame.rgb),
         depth=None if frame.depth is None else orientation.upright(frame.depth),
         alpha=None if frame.alpha is None else orientation.upright(frame.alpha),
+        hidden=None if frame.hidden is None else orientation.upright(frame.hidden),
         intrinsics=frame.intrinsics.upright(orientation),
     )

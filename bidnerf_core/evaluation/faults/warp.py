@@ -19,7 +19,9 @@ def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
     """
     alpha = None if frame.alpha is None else _interpolated(frame.alpha[..., None], pixels)[..., 0]
     depth = None if frame.depth is None else nearest(frame.depth, pixels)
-    return replace(frame, rgb=_interpolated(frame.rgb, pixels).clamp(0, 1), alpha=alpha, depth=depth)
+    hidden = None if frame.hidden is None else nearest(frame.hidden.float(), pixels) > 0
+    rgb = _interpolated(frame.rgb, pixels).clamp(0, 1)
+    return replace(frame, rgb=rgb, alpha=alpha, depth=depth, hidden=hidden)
 
 
 def reflected(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:

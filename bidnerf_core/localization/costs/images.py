@@ -24,6 +24,7 @@ from bidnerf_core.devices import constant
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.pixels import continued
 from bidnerf_core.geometry.robust import inlier_weight
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.exposure import Exposure, clipped, fit_exposure
@@ -80,7 +81,7 @@ def thumbnail(view: View, width: int) -> Thumbnail:
     """Return ``view`` reduced to at most ``width`` pixels on its longer side, without distortion, smoothed; on the CPU."""
     camera = view.frame.intrinsics
     small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
-    rgb = view.frame.rgb.cpu().float().permute(2, 0, 1)[None]
+    rgb = continued(view.frame).cpu().float().permute(2, 0, 1)[None]
     # Averaged first, so that every pixel of the image contributes.
     rgb = interpolate(rgb, (small.height, small.width), mode="area")
     if camera.distortion:

@@ -19,7 +19,7 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.residuals import Objective
 from bidnerf_core.fields.sampling import AroundDepth, Resampled
 from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import DrawerName, draw, drawer
+from bidnerf_core.frames.pixels import DrawerName, continued, draw, drawer
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.exposure import EXPOSURE_ROUNDS, Exposure, clipped, robust_exposure
@@ -89,7 +89,7 @@ def blurred(view: View, size: int) -> View:
     frame = view.frame
     height, width = frame.rgb.shape[:2]
     size = min(size, height, width)
-    small = avg_pool2d(frame.rgb.permute(2, 0, 1)[None], size, ceil_mode=True, count_include_pad=False)
+    small = avg_pool2d(continued(frame).permute(2, 0, 1)[None], size, ceil_mode=True, count_include_pad=False)
     # Enlarged to whole squares, then cut to the image, so that squares stay where they were.
     covered = (small.shape[2] * size, small.shape[3] * size)
     smooth = interpolate(small, covered, mode="bilinear", align_corners=False)[..., :height, :width]

@@ -127,4 +127,5 @@ def _shows_background(problem: Problem) -> bool:
 def _share_of_background(frame: Frame, bounds: SceneBounds) -> float:
     """Return the share of the pixels that have the background's colour and no measured depth."""
     plain = ((frame.rgb - constant(bounds.background, frame.rgb)).abs() <= DIFFERENT).all(-1)
-    return float((plain if frame.depth is None else plain & (frame.depth <= 0)).float().mean())
+    plain = plain if frame.depth is None else plain & (frame.depth <= 0)
+    return float((plain if frame.hidden is None else plain[~frame.hidden]).float().mean())

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from bidnerf_core.devices import moved
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import observe
+from bidnerf_core.frames.pixels import observe, visible_at
 from bidnerf_core.geometry.robust import inlier_weight
 from bidnerf_core.geometry.se3 import SE3, skew
 from bidnerf_core.localization.normal_equations import NormalEquations
@@ -268,6 +268,7 @@ def _cloud_of_rays(
         pixels = camera.project(local)
         size = pixels.new_tensor([camera.width, camera.height])
         seen = ((pixels >= 0) & (pixels < size)).all(-1)  # never where it is NaN, behind the camera
+        seen[seen.clone()] = visible_at(view.frame, pixels[seen])
         columns, rows = pixels[seen].long().unbind(-1)
         rgb[seen] = view.frame.rgb.cpu()[rows, columns].to(rgb)
         coloured |= seen

@@ -14,7 +14,7 @@ from bidnerf_core.camera.rolling_shutter import exposure_times, transposed_expos
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.landmarks.features import Features, Keypoints, detected
+from bidnerf_core.mapping.landmarks.features import Features, Keypoints, detected, visible_keypoints
 from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
@@ -48,10 +48,8 @@ def query_images(views: Sequence[View], features: Features) -> list[QueryImage]:
 
 
 def query_image(frame: Frame, T_rig_camera: SE3, features: Features) -> QueryImage:
-    keypoints, hidden = detected(features, frame.rgb), None if frame.hidden is None else frame.hidden.cpu()
-    if hidden is not None:
-        columns, rows = keypoints.pixels.long().unbind(-1)
-        keypoints = keypoints[~hidden[rows, columns]]
+    hidden = None if frame.hidden is None else frame.hidden.cpu()
+    keypoints = visible_keypoints(detected(features, frame.rgb), hidden)
     rays = frame.intrinsics.unproject(keypoints.pixels.double())
     depth = measured_depth(frame, keypoints.pixels)
     return QueryImage(keypoints, rays, depth, frame.intrinsics, T_rig_camera, hidden)

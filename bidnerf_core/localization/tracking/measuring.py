@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import visible_at
 from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
@@ -90,6 +91,7 @@ def followed(state: TrackerState, image: Grey | None, frame: Frame, predicted: S
     fresh = (state.points.landmark == FRESH) & found
     if bool(fresh.any()):  # landmarks, unlike corners, are known to be recognisable
         found[fresh.clone()] = alike(state.image, image, state.points.pixels[fresh], pixels[fresh])
+    found &= visible_at(frame, pixels)
     return replace(state.points, pixels=pixels)[found]
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import UNKNOWN, DepthNoise
 from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.pixels import visible_at
 from bidnerf_core.geometry.independent import CORNERS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.guided_refinement import RADII, matches_by_chance, usual_distance
@@ -285,6 +286,7 @@ class Odometry:
             return points
         apart = 0.7 * (image.shape[0] * image.shape[1] / self.count) ** 0.5
         pixels = corners(image, self.count, apart)
+        pixels = pixels[visible_at(frame, pixels)]
         depth = measured_depth(frame, pixels)
         pixels, depth = pixels[depth > 0], depth[depth > 0]
         ray = frame.intrinsics.unproject(pixels.double())

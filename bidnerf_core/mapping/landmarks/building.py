@@ -34,6 +34,7 @@ from bidnerf_core.mapping.landmarks.features import (
     Sift,
     detected,
     find_features,
+    visible_keypoints,
 )
 from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, measured_depth, placed
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
@@ -295,7 +296,7 @@ def _joined(images: Sequence[PosedKeypoints], pairs: list[list[int]], counter: _
 
 def _detected(view: View, features: Features) -> PosedKeypoints:
     intrinsics = view.frame.intrinsics
-    keypoints = detected(features, view.frame.rgb)
+    keypoints = visible_keypoints(detected(features, view.frame.rgb), view.frame.hidden)
     rays = intrinsics.unproject(keypoints.pixels.double())
     focal = (intrinsics.fx * intrinsics.fy) ** 0.5
     return PosedKeypoints(

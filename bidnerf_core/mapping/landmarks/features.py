@@ -13,7 +13,7 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.errors import enumeration
@@ -139,6 +139,18 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
             f"{who}: keypoints lie outside the image of {size[0]}x{size[1]} pixels, expected none"
         )
     return found
+
+
+def visible_keypoints(keypoints: Keypoints, hidden: Bool[Tensor, "h w"] | None) -> Keypoints:
+    """Return the keypoints whose neighbourhoods reach into no hidden pixel of their image."""
+    if hidden is None or not len(keypoints):
+        return keypoints
+    visible = np.ascontiguousarray((~hidden.cpu().numpy()).astype(np.uint8))
+    away = torch.from_numpy(cv2.distanceTransform(visible, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+    columns, rows = keypoints.pixels.long().unbind(-1)
+    height, width = hidden.shape
+    reached = away[rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
+    return keypoints[reached > keypoints.sizes.to(reached) / 2]
 
 
 @dataclass(frozen=True)

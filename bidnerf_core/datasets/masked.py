@@ -1,0 +1,99 @@
+"""Datasets and sequences whose images have masks in a folder of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from bidnerf_core.camera.source import Raster
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, ReadFrame, SequenceEntry, TimedFrame
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.masks import MaskFolder, WhollyHidden
+from bidnerf_core.geometry.se3 import SE3
+
+
+class MaskedDataset:
+    """A dataset whose frames hide what the masks of a folder hide, besides what they hide anyway; see ``Dataset``.
+
+    Where the whole of a split is read, frames that are hidden altogether are left out. Raises ``InputError`` where no frame
+    has a mask.
+    """
+
+    def __init__(self, dataset: Dataset, masks: MaskFolder) -> None:
+        self.unmasked, self._masks = dataset, masks
+        masks.require_any([name for split in dataset.splits for name in dataset.frame_names(split)])
+
+    @property
+    def path(self) -> Path:
+        return self.unmasked.path
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return self.unmasked.splits
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        return self.unmasked.background
+
+    def frame_names(self, split: str) -> list[str]:
+        return self.unmasked.frame_names(split)
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        found = []
+        for view in self.unmasked.views(split, names, progress):
+            try:
+                found.append(replace(view, frame=masked(view.frame, self._masks)))
+            except WhollyHidden:
+                if names is not None:
+                    raise
+        return found
+
+
+def mask_folder(masks: str | Path | MaskFolder) -> MaskFolder:
+    """Return the folder of masks, in which black is hidden unless it says otherwise."""
+    return masks if isinstance(masks, MaskFolder) else MaskFolder(masks)
+
+
+def masked(frame: Frame, masks: MaskFolder) -> Frame:
+    """Return the frame with what its mask hides, by its name. Raises ``InputError`` as ``MaskFolder.hidden`` does."""
+    size = (frame.intrinsics.width, frame.intrinsics.height)
+    return frame.with_hidden(masks.hidden(frame.name, Raster(*size), size))
+
+
+def masked_sequence(frames: FrameSequence, masks: MaskFolder) -> FrameSequence:
+    """Return a sequence whose frames hide what the masks of a folder hide. Raises ``InputError`` where no frame has a mask."""
+    if not isinstance(frames, FileSequence):
+        return _MaskedVideo(frames, masks)
+    masks.require_any(frames.names)
+    return FileSequence(
+        frames.path, [replace(entry, read=partial(_read, entry, masks)) for entry in frames.entries]
+    )
+
+
+def _read(entry: SequenceEntry, masks: MaskFolder) -> tuple[Frame, SE3 | None]:
+    read: ReadFrame = entry.read
+    frame, truth = read()
+    return masked(frame, masks), truth
+
+
+class _MaskedVideo:
+    """The frames of a video, whose masks are named after their numbers as the video's frames are."""
+
+    def __init__(self, frames: FrameSequence, masks: MaskFolder) -> None:
+        self._frames, self._masks = frames, masks
+
+    @property
+    def path(self) -> Path:
+        return self._frames.path
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        for timed in self._frames:
+            yield replace(timed, frame=masked(timed.frame, self._masks))

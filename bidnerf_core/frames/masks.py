@@ -1,0 +1,153 @@
+"""Masks: images that tell which pixels of a photo to leave out, such as those of people who walk through the scene.
+
+A mask is read into the boolean image ``Frame.hidden``. By the convention of nerfstudio and COLMAP, black is left out and
+everything brighter is used; masks of segmentation often mark what is to be left out in white instead.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import same_aspect
+from bidnerf_core.camera.source import Raster
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.io.images import IMAGE_SUFFIXES, decode, resampled
+
+HiddenColour = Literal["black", "white"]
+"""The colour in masks of the pixels that are left out."""
+INVERTED = "if it marks what should be used, the masks are inverted (--mask-hides, mask_hides in Python)"
+BRIGHT = 0.5
+"""Share of the largest value of the file's type from which a pixel counts as white."""
+MOSTLY = 0.5
+"""Share of the pixels, in most images, above which masks may be inverted."""
+PREFIXES, SUFFIXES = ("dynamic_mask_", "mask_"), ("_mask", ".mask", "-mask")
+"""What may stand before and behind the name of a photo in the name of its mask."""
+
+
+class WhollyHidden(InputError):
+    """A mask hides all of its image, of which nothing is left to use."""
+
+
+def read_mask(
+    path: Path, raster: Raster, size: tuple[int, int], hides: HiddenColour = "black"
+) -> Bool[Tensor, "h w"]:
+    """Return which pixels of an image of ``size`` (width, height) the mask in file ``path`` hides.
+
+    ``raster`` is that of the image file: a mask of the stored image is turned upright with it. A mask of another resolution is
+    resampled to the nearest of its pixels. Masks whose values are all small, such as 0 and 1, hide what is 0; otherwise the
+    bright half of the values is white. The alpha channel is the mask of files whose colours are uniform. Raises ``InputError``
+    where the file is not an image, or one of another aspect ratio, and ``WhollyHidden`` where it hides everything.
+    """
+    white = torch.from_numpy(_white(decode(path)))
+    given = (white.shape[1], white.shape[0])
+    if same_aspect(given, raster.size):
+        white = raster.orientation.upright(white)
+    elif not same_aspect(given, raster.upright_size):
+        expected = "x".join(map(str, raster.upright_size))
+        raise InputError(
+            f"{path}: mask is {given[0]}x{given[1]}, its image {expected}; expected the same aspect ratio"
+        )
+    if tuple(white.shape) != size[::-1]:
+        white = resampled(white, *size)
+    hidden = white if hides == "white" else ~white
+    if bool(hidden.all()):
+        raise WhollyHidden(f"{path}: mask is all {hides}, which hides the whole image; {INVERTED}")
+    return hidden
+
+
+def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
+    values = raw if raw.ndim == 3 else raw[..., None]
+    colours, alpha = (values[..., :-1], values[..., -1:]) if values.shape[-1] in (2, 4) else (values, None)
+    if alpha is not None and bool((colours == colours[:1, :1]).all()):
+        colours = alpha
+    brightness: np.ndarray = colours.max(-1)
+    full = float(np.iinfo(brightness.dtype).max) if brightness.dtype.kind in "ui" else 1.0
+    if float(brightness.max(initial=0)) < BRIGHT * full:
+        found: np.ndarray = brightness > 0
+        return found
+    found = brightness >= BRIGHT * full
+    return found
+
+
+class MaskFolder:
+    """A folder of masks that belong to photos by name.
+
+    The mask of ``NAME.jpg`` is ``NAME.png``, ``NAME.jpg.png`` as COLMAP calls it, or has ``mask`` before or behind the name
+    (``dynamic_mask_NAME.png``, ``NAME_mask.png``). Where photos lie in folders, so may their masks. Any image format will do.
+    ``hides`` is the colour of what is left out. Raises ``InputError`` where there is no such folder, or no image in it.
+    """
+
+    def __init__(self, path: str | Path, hides: HiddenColour = "black") -> None:
+        self.path, self.hides = Path(path), hides
+        if hides not in get_args(HiddenColour):
+            raise InputError(f"mask_hides is {hides!r}, expected one of {', '.join(get_args(HiddenColour))}")
+        if not self.path.is_dir():
+            what = "is a file" if self.path.exists() else "no such folder"
+            raise InputError(f"{self.path}: {what}, expected a folder of masks")
+        files = sorted(f for f in self.path.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file())
+        if not files:
+            raise InputError(f"{self.path}: no images in it, expected masks")
+        self._by_name = defaultdict[str, list[Path]](list)
+        for file in files:
+            parts = (*file.relative_to(self.path).parts[:-1], photo_of(file.name))
+            for depth in range(1, len(parts) + 1):
+                self._by_name["_".join(parts[-depth:])].append(file)
+
+    def file_of(self, name: str) -> Path | None:
+        """Return the mask of the frame called ``name``; None where there is none. Raises ``InputError`` where there are several."""
+        found = self._by_name.get(name, [])
+        if len(found) > 1:
+            raise InputError(
+                f"{found[0]} and {found[1]} both belong to {name} by their names, expected one mask"
+            )
+        return found[0] if found else None
+
+    def require_any(self, names: Sequence[str]) -> None:
+        """Raise ``InputError`` where no frame of ``names`` has a mask."""
+        if names and all(self.file_of(name) is None for name in names):
+            raise InputError(
+                f"{self.path}: no mask in it belongs to any of {amount(len(names), 'image')} by its name; expected"
+                f" {names[0]}.png or the like, found {next(iter(self._by_name))}"
+            )
+
+    def hidden(self, name: str, raster: Raster, size: tuple[int, int]) -> Bool[Tensor, "h w"] | None:
+        """Return what the mask of the frame called ``name`` hides, as ``read_mask`` does; None where it has no mask.
+
+        Raises ``InputError`` as ``read_mask`` does, and ``WhollyHidden`` for a mask that leaves nothing visible.
+        """
+        file = self.file_of(name)
+        return None if file is None else read_mask(file, raster, size, self.hides)
+
+
+def photo_of(mask: str) -> str:
+    """Return the stem of the photo to which the file called ``mask`` belongs."""
+    stem = PurePath(mask).stem
+    for prefix in PREFIXES:
+        stem = stem.removeprefix(prefix)
+    for suffix in SUFFIXES:
+        stem = stem.removesuffix(suffix)
+    return PurePath(stem).stem if PurePath(stem).suffix.lower() in IMAGE_SUFFIXES else stem
+
+
+def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
+    """Return how much of some images is hidden, in one sentence; None where nothing is.
+
+    Masks that hide most of most images may be inverted, and the sentence says so.
+    """
+    shares = [float(pixels.float().mean()) for pixels in hidden if pixels is not None]
+    if not shares:
+        return None
+    mean, without = 100 * sum(shares) / len(shares), len(hidden) - len(shares)
+    line = f"masks hide {mean:.3g} % of the pixels of {amount(len(shares), 'image')}"
+    line += f"; {amount(without, 'image')} without anything hidden" if without else ""
+    if float(np.median(shares)) > MOSTLY:
+        line += f"; {INVERTED}"
+    return line
