@@ -180,7 +180,9 @@ class _Files:
         )
 
     def _no_mask(self, frame: FrameRecord) -> InputError:
-        return frame.record.error(f"no mask {self._folder / str(frame.mask_path)}, expected that file (mask_path)")
+        return frame.record.error(
+            f"no mask {self._folder / str(frame.mask_path)}, expected that file (mask_path)"
+        )
 
     def _remark_names(self) -> None:
         """Report names that differ from those of the files by more than an added extension."""
