@@ -1,12 +1,20 @@
 """Rows with time stamps, as in the TUM RGB-D benchmark; trajectories, and their poses at the times in between.
 
 A row is ``timestamp value value ...``, separated by blanks or commas; ``#`` begins a comment, empty lines are skipped, and
-Windows line endings are allowed. Rows may be in any order.
+Windows line endings are allowed. Rows may be in any order. A last row that is cut off, as where a copy broke off, is left out
+with a remark.
+
+A trajectory is one of three kinds, which its rows tell apart. TUM: ``timestamp tx ty tz qx qy qz qw`` (seconds), or another
+order of the quaternion where a comment names one (``# timestamp tx ty tz qw qx qy qz``). EuRoC:
+``timestamp,px,py,pz,qw,qx,qy,qz[,...]`` (nanoseconds). KITTI: twelve numbers, the first three rows of a 4x4 matrix, without a
+time, one for each image. All are camera to world, or body to world for EuRoC.
 """
 
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -17,9 +25,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.datasets.incomplete import remark
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.geometry.pose_rows import rigid_pose
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.rows import Row, read_rows
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.rows import LARGEST_ROWS, Row, parse_rows, read_rows
 
 NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
 UNIT_TO = 0.01
@@ -27,6 +38,12 @@ UNIT_TO = 0.01
 LARGEST_GAP = 0.1
 """Seconds. Within this time a hand-held camera deviates from the interpolated path by a few millimetres; motion capture that
 lost its markers leaves longer gaps, in which no pose is known."""
+KITTI_ROW = 12
+"""Numbers of a row of KITTI's: a 3x4 matrix."""
+NANOSECONDS = 10**9
+LEAST_NANOSECONDS = 10**14
+"""Whole numbers from here on are nanoseconds: as seconds they would be three million years."""
+QUATERNION_COLUMNS = re.compile(r"\bq_?([wxyz])\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -36,6 +53,7 @@ class TimedRow:
     row: Row
     time: float  # seconds
     words: tuple[str, ...]  # what follows the time stamp
+    rest: str  # the same as one text, such as the name of a file with blanks in it
 
     @property
     def where(self) -> str:
@@ -49,17 +67,27 @@ def read_timed_rows(path: Path, columns: str) -> list[TimedRow]:
     Raises ``InputError`` where the file is missing, not text, too large or without rows, and for a row with fewer
     entries or without a finite time.
     """
-    rows = [
-        _timed(row, 1 + len(columns.split()))
-        for row in read_rows(path, "a list of time stamps", f"timestamp {columns}")
-    ]
+    return timed_rows(read_rows(path, "a list of time stamps", f"timestamp {columns}"), path, columns)
+
+
+def timed_rows(rows: Sequence[Row], path: Path, columns: str) -> list[TimedRow]:
+    """Return the rows of the file ``path`` in chronological order, as ``read_timed_rows`` does."""
+    count = 1 + len(columns.split())
     if not rows:
         raise InputError(f"{path}: has no rows, expected lines of timestamp {columns}")
-    return sorted(rows, key=lambda row: row.time)
+    if len(rows) > 1 and len(_words(rows[-1])) < count:
+        found = len(_words(rows[-1]))
+        remark(rows[-1].where, f"the last row is cut off ({found} of {count} entries) and is left out")
+        rows = rows[:-1]
+    return sorted((_timed(row, count) for row in rows), key=lambda row: row.time)
+
+
+def _words(row: Row) -> list[str]:
+    return row.text.replace(",", " ").split()
 
 
 def _timed(row: Row, count: int) -> TimedRow:
-    words = row.text.replace(",", " ").split()
+    words = _words(row)
     if len(words) < count:
         raise row.error(f" has {len(words)} of {count} entries")
     try:
@@ -68,7 +96,9 @@ def _timed(row: Row, count: int) -> TimedRow:
         raise row.error(f": {words[0]!r} is no time stamp") from error
     if not math.isfinite(time):
         raise row.error(f": the time stamp is {words[0]}")
-    return TimedRow(row, time, tuple(words[1:]))
+    if time >= LEAST_NANOSECONDS and words[0].isdecimal():
+        time = int(words[0]) / NANOSECONDS
+    return TimedRow(row, time, tuple(words[1:]), row.text[len(words[0]) :].lstrip(", \t"))
 
 
 def require_distinct_times(rows: list[TimedRow]) -> None:
@@ -111,20 +141,47 @@ class Trajectory:
         return SE3(rotation, torch.lerp(self.translations[after - 1], self.translations[after], share))
 
 
-def read_trajectory(path: Path) -> Trajectory:
-    """Read a file of rows ``timestamp tx ty tz qx qy qz qw``, such as TUM's ``groundtruth.txt`` or what ``bidnerf`` writes.
+def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Trajectory:
+    """Read a trajectory of one of the kinds above. ``times`` (seconds) are those of the images, for KITTI's, which has none.
 
-    Raises ``InputError``, with the file and line, where a row is cut off, a number is not finite, a quaternion is not of
-    length 1, or two rows have the same time and different poses.
+    Poses that are not finite, and those whose quaternion is zero, are left out with a remark that counts them. Raises
+    ``InputError``, with the file and line, where a row is cut off, a quaternion is not of length 1, two rows have the same time
+    and different poses, or the rows of KITTI's kind are not as many as the images.
     """
-    rows = read_timed_rows(path, NUMBERS_A_LINE)
-    numbers = [_pose_numbers(row) for row in rows]
+    content = read_file(path, "a trajectory", LARGEST_ROWS)
+    rows = parse_rows(content, path, "a trajectory", f"timestamp {NUMBERS_A_LINE}")
+    if rows and all(len(_words(row)) == KITTI_ROW for row in rows):
+        return _kitti(path, rows, times)
+    return _timed_trajectory(path, timed_rows(rows, path, NUMBERS_A_LINE), _quaternion_order(content, rows))
+
+
+def _quaternion_order(content: bytes, rows: Sequence[Row]) -> str:
+    """Return the order of the quaternion: that which a comment names, else that of EuRoC or of TUM."""
+    for line in content.decode("utf-8-sig", "replace").splitlines():
+        named = "".join(QUATERNION_COLUMNS.findall(line)).lower() if line.lstrip().startswith("#") else ""
+        if sorted(named) == sorted("xyzw"):
+            return named
+    is_euroc = rows and "," in rows[0].text and _words(rows[0])[0].isdecimal()
+    return "wxyz" if is_euroc and int(_words(rows[0])[0]) >= LEAST_NANOSECONDS else "xyzw"
+
+
+def _timed_trajectory(path: Path, rows: Sequence[TimedRow], order: str) -> Trajectory:
+    numbers = [_pose_numbers(row, order) for row in rows]
+    known = [place for place, found in enumerate(numbers) if found is not None]
+    if not known:
+        raise InputError(f"{path}: has no pose that is finite, expected lines of timestamp {NUMBERS_A_LINE}")
+    if len(known) < len(rows):
+        first = next(place for place, found in enumerate(numbers) if found is None)
+        left = amount(len(rows) - len(known), "pose")
+        remark(
+            path, f"{left} of {len(rows)} not finite or zero, left out (first: line {rows[first].row.line})"
+        )
     kept = list[int]()
-    for place, row in enumerate(rows):
-        if kept and rows[kept[-1]].time == row.time:
+    for place in known:
+        if kept and rows[kept[-1]].time == rows[place].time:
             if numbers[kept[-1]] != numbers[place]:
                 raise InputError(
-                    f"{row.where}: another pose at the time {row.time:.6f}, expected one pose a time"
+                    f"{rows[place].where}: another pose at the time {rows[place].time:.6f}, expected one pose a time"
                 )
             continue
         kept.append(place)
@@ -134,10 +191,40 @@ def read_trajectory(path: Path) -> Trajectory:
     return Trajectory(times, rotations, values[:, :3])
 
 
-def _pose_numbers(row: TimedRow) -> list[float]:
-    """Return the translation and the quaternion (x, y, z, w) of a row."""
-    numbers = row.row.numbers(row.words[:7])
+def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
+    """Return the translation and the quaternion (x, y, z, w) of a row, or None where there is no pose in it."""
+    numbers = row.row.plain_numbers(row.words[:7])
+    quaternion = dict(zip(order, numbers[3:], strict=True))
     length = math.hypot(*numbers[3:])
+    if length == 0 or not all(map(math.isfinite, numbers)):
+        return None
     if abs(length - 1) > UNIT_TO:
-        raise InputError(f"{row.where}: the quaternion has length {length:.3g}, expected 1 (qx qy qz qw)")
-    return numbers
+        names = " ".join(f"q{letter}" for letter in order)
+        raise InputError(f"{row.where}: the quaternion has length {length:.3g}, expected 1 ({names})")
+    return [*numbers[:3], *(quaternion[letter] for letter in "xyzw")]
+
+
+def _kitti(path: Path, rows: Sequence[Row], times: Sequence[float] | None) -> Trajectory:
+    """Return the poses of rows of 3x4 matrices, one for each of ``times``."""
+    kind = f"{path}: has rows of {KITTI_ROW} numbers, KITTI's 3x4 poses, which have no times"
+    if times is None or len(times) != len(rows):
+        images = "images of known times" if times is None else amount(len(times), "image")
+        raise InputError(f"{kind}; there are {len(rows)} for {images}, expected one for each image")
+    remark(
+        path, f"rows of {KITTI_ROW} numbers are read as KITTI's 3x4 camera-to-world poses, one for each image"
+    )
+    poses = [_kitti_pose(row) for row in rows]
+    return Trajectory(
+        torch.tensor(times, dtype=torch.float64),
+        torch.stack([pose.rotation for pose in poses]),
+        torch.stack([pose.translation for pose in poses]),
+    )
+
+
+def _kitti_pose(row: Row) -> SE3:
+    try:
+        return rigid_pose(torch.tensor(row.numbers(_words(row)), dtype=torch.float64).reshape(3, 4))
+    except InputError as error:
+        if str(error).startswith(str(row.path)):
+            raise
+        raise InputError(f"{row.where}: the rotation is {error}, expected a rigid transform") from error

@@ -5,7 +5,9 @@ camera in the frame of the motion capture: ``timestamp tx ty tz qx qy qz qw``, c
 sampled at different times and rates. A colour image is paired with the depth image that is nearest in time, if each is the
 other's nearest and they are at most 20 ms apart, and with the pose interpolated between the samples before and after it. A
 frame outside the time span of the ground truth, or in a gap of more than 0.1 s, has no pose: it is in the sequence but not in
-the dataset. Every eighth of the posed frames (the first, the ninth ...) is held out as "test" and the others are "train".
+the dataset, and a remark counts it. The ground truth may also be in the format of EuRoC, or of KITTI with one pose for each
+image. Every eighth of the posed frames (the first, the ninth ...) is held out as "test" and the others are "train". Listed
+images that are missing are left out with a remark; names may have blanks in them.
 
 Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image. The published
 images already contain the correction of the depth scale. Depth of other recordings in this layout is registered from the
@@ -30,6 +32,8 @@ import numpy as np
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.file_names import FileNames, posix_name
+from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -37,6 +41,7 @@ from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.datasets.trajectories import (
     LARGEST_GAP,
     TimedRow,
+    Trajectory,
     read_timed_rows,
     read_trajectory,
     require_distinct_times,
@@ -46,7 +51,6 @@ from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import is_file
 from bidnerf_core.io.images import Background
 
 COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
@@ -69,6 +73,7 @@ class ListedDepth:
 
     where: str
     image: Path
+    is_there: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +85,7 @@ class TumFrame:
     time: float
     depth: ListedDepth | None
     truth: SE3 | None  # T_world_camera
+    is_there: bool  # whether the image file exists
 
     @property
     def stem(self) -> str:
@@ -97,7 +103,7 @@ class TumReader(Reader):
     depth is registered from the sensor that is given, if there is one.
     """
 
-    accepts = ("camera", "register_depth")
+    accepts = ("camera", "register_depth", "depth_unit")
     expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
 
     def recognises(self, path: Path) -> bool:
@@ -107,12 +113,10 @@ class TumReader(Reader):
         """Read the lists. Raises ``InputError`` where one is missing or broken, and where no frame has a pose."""
         if not (path / TRUTH).is_file():
             raise InputError(f"{path / TRUTH}: no such file, expected the poses of the frames of a dataset")
-        posed = [frame for frame in tum_frames(path) if frame.truth is not None]
-        if not posed:
-            raise InputError(
-                f"{path / TRUTH}: covers no image of {COLOUR_LIST}, expected samples before and after their times, "
-                f"at most {LARGEST_GAP:g} s apart"
-            )
+        frames, trajectory = _recorded(path)
+        posed = [frame for frame in frames if frame.truth is not None]
+        if trajectory is not None and len(posed) < len(frames):
+            _remark_without_pose(path, len(frames), len(posed), trajectory)
         return self._dataset(path, hold_out(posed), options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -127,7 +131,8 @@ class TumReader(Reader):
         given = None if options.camera is None else _named_camera(options.camera) or options.camera
         unknown, ways = f"its name says none of {SENSORS}", f"one of {SENSORS}, or a file"
         camera = folder_camera(path, given, published_camera(path), unknown, ways)
-        return TumDataset(Splits(path, splits), camera, options.sensor(path), options.background)
+        unit = METRES_PER_STEP if options.depth_unit is None else options.depth_unit
+        return TumDataset(Splits(path, splits), camera, options.sensor(path), options.background, unit)
 
 
 class TumDataset(SplitDataset[TumFrame]):
@@ -139,18 +144,16 @@ class TumDataset(SplitDataset[TumFrame]):
         camera: CameraSource,
         sensor: DepthCamera | None,
         background: Background | None,
+        depth_unit: float,
     ) -> None:
         super().__init__(frames, background)
-        self._camera, self._sensor = camera, sensor
+        self._camera, self._sensor, self._depth_unit = camera, sensor, depth_unit
         self._read_depth = DepthReader(documented=("65535",))
 
     def _frame(self, frame: TumFrame, name: str) -> Frame:
-        for listed in (frame, frame.depth):
-            if listed is not None and not is_file(listed.image):
-                raise InputError(f"{listed.where}: no image {listed.image}, expected that file")
         depth = None
         if frame.depth is not None:
-            depth = DepthFile(frame.depth.image, METRES_PER_STEP, self._read_depth, self._sensor)
+            depth = DepthFile(frame.depth.image, self._depth_unit, self._read_depth, self._sensor)
         return read_rgbd(name, frame.image, self._camera.at(frame.image), self._background, depth)
 
     def _pose(self, frame: TumFrame) -> SE3 | None:
@@ -170,22 +173,81 @@ def _named_camera(given: Intrinsics | Path) -> Intrinsics | None:
 
 
 def tum_frames(folder: Path) -> list[TumFrame]:
-    """Read the lists of a folder and associate them by time; no image is opened. Raises ``InputError``."""
+    """Read the lists of a folder and associate them by time; no image is opened. Raises ``InputError``.
+
+    Images that are missing are left out, and remarks count them.
+    """
+    return _recorded(folder)[0]
+
+
+def _recorded(folder: Path) -> tuple[list[TumFrame], Trajectory | None]:
+    """Return the frames of a folder, and its ground truth where it has one."""
+    names = FileNames(folder)
     colours = _listed(folder / COLOUR_LIST)
-    depths = _listed(folder / DEPTHS) if (folder / DEPTHS).is_file() else []
-    path = read_trajectory(folder / TRUTH) if (folder / TRUTH).is_file() else None
-    partners = associate([row.time for row in colours], [row.time for row in depths], LARGEST_DIFFERENCE)
-    files = [ListedDepth(row.where, folder / row.words[0]) for row in depths]
-    return [
-        TumFrame(
-            row.where,
-            folder / row.words[0],
-            row.time,
-            files[partners[place]] if place in partners else None,
-            path.at(row.time) if path is not None else None,
-        )
+    times = [row.time for row in colours]
+    path = read_trajectory(folder / TRUTH, times) if (folder / TRUTH).is_file() else None
+    depths = _depths(folder, names)
+    partners = associate(times, [time for time, _ in depths], LARGEST_DIFFERENCE)
+    frames = [
+        _frame(row, names, folder, path, depths[partners[place]][1] if place in partners else None)
         for place, row in enumerate(colours)
     ]
+    there = present(
+        frames,
+        lambda frame: frame.is_there,
+        folder / COLOUR_LIST,
+        lambda frame: frame.image.relative_to(folder),
+        lambda frame: InputError(f"{frame.where}: no image {frame.image}, expected that file"),
+    )
+    return there, path
+
+
+def _frame(
+    row: TimedRow, names: FileNames, folder: Path, path: Trajectory | None, depth: ListedDepth | None
+) -> TumFrame:
+    image, is_there = _file(row, names, folder)
+    return TumFrame(row.where, image, row.time, depth, None if path is None else path.at(row.time), is_there)
+
+
+def _depths(folder: Path, names: FileNames) -> list[tuple[float, ListedDepth]]:
+    """Return the times and files of the depth images that are there."""
+    if not (folder / DEPTHS).is_file():
+        return []
+    listed = [
+        (row.time, ListedDepth(row.where, *_file(row, names, folder))) for row in _listed(folder / DEPTHS)
+    ]
+    return present(
+        listed,
+        lambda entry: entry[1].is_there,
+        folder / DEPTHS,
+        lambda entry: entry[1].image.relative_to(folder),
+        noun="depth image",
+    )
+
+
+def _file(row: TimedRow, names: FileNames, folder: Path) -> tuple[Path, bool]:
+    """Return the file that a row lists, whose name may have blanks, and whether it is there."""
+    for name in (row.rest.strip("\"'"), row.words[0]):
+        if (found := names.find(posix_name(name))) is not None:
+            return found, True
+    return folder / row.words[0], False
+
+
+def _remark_without_pose(path: Path, images: int, posed: int, trajectory: Trajectory) -> None:
+    """Count the images without a pose, with the usual gap between poses. Raises ``InputError`` where no image has a pose."""
+    if posed == 0:
+        raise InputError(
+            f"{path / TRUTH}: covers no image of {COLOUR_LIST}, expected samples before and after their times, "
+            f"at most {LARGEST_GAP:g} s apart"
+        )
+    gap = float(trajectory.times.diff().median()) if len(trajectory) > 1 else 0.0
+    why = (
+        f"its {len(trajectory)} poses are {gap:.2g} s apart as a rule, as those of keyframes are, and none is interpolated over"
+        f" more than {LARGEST_GAP:g} s"
+        if gap > LARGEST_GAP
+        else f"before its first pose, after its last, or in gaps of more than {LARGEST_GAP:g} s"
+    )
+    remark(path / TRUTH, f"{images - posed} of {images} images have no pose and are left out: {why}")
 
 
 def associate(times: Sequence[float], others: Sequence[float], largest: float) -> dict[int, int]:

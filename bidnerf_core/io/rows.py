@@ -46,13 +46,17 @@ class Row:
         words = self.words if words is None else words
         if count is not None and len(words) != count:
             raise self.error(f" has {len(words)} entries")
-        try:
-            found = [float(word) for word in words]
-        except ValueError as error:
-            raise self.error(f": {error}") from error
+        found = self.plain_numbers(words)
         if not all(map(math.isfinite, found)):
             raise self.error(f": {self.text[:SHOWN]!r} is not finite")
         return found
+
+    def plain_numbers(self, words: Sequence[str]) -> list[float]:
+        """Return the ``words`` as numbers, which may be NaN or infinite. Raises ``InputError`` for other words."""
+        try:
+            return [float(word) for word in words]
+        except ValueError as error:
+            raise self.error(f": {error}") from error
 
     def integer(self, word: str) -> int:
         """Return a word as a whole number of at most 64 bits. Raises ``InputError`` for anything else."""
