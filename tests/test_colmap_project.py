@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -118,13 +119,121 @@ def test_projection_agrees_with_pycolmap(project: Path) -> None:
         np.testing.assert_allclose(timed.truth.apply(torch.from_numpy(point)), world, atol=1e-9)
 
 
-@pytest.mark.parametrize("place", ["sparse", "."])
-def test_models_at_other_places(place: str, project: Path) -> None:
+PLACES = {  # of the model and of the images
+    "sparse": "images", "colmap/sparse/0": "images", "colmap": "colmap/images", ".": ".", "dense/0/sparse": "dense/0/images",
+    "sparse/0": "input", "dense/sparse": "dense/images",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_models_and_images_at_other_places(place: str, project: Path) -> None:
     expected = all_views(project)
-    for file in list((project / "sparse" / "0").iterdir()):
-        file.rename(project / place / file.name)
-    (project / "sparse" / "0").rmdir()
+    images, model = project / "moved images", project / "moved model"
+    (project / "images").rename(images)
+    (project / "sparse" / "0").rename(model)
+    shutil.rmtree(project / "sparse")
+    for source, target in ((model, project / place), (images, project / PLACES[place])):
+        target.mkdir(parents=True, exist_ok=True)
+        for file in list(source.iterdir()):
+            file.rename(target / file.name)
+        source.rmdir()
     assert all_views(project).keys() == expected.keys()
+
+
+def test_the_folder_of_a_model_finds_its_images(project: Path) -> None:
+    assert all_views(project / "sparse").keys() == all_views(project).keys()
+    assert all_views(project / "sparse" / "0").keys() == all_views(project).keys()
+
+
+def remarks_of(folder: Path) -> list[str]:
+    """Return the remarks that opening a folder causes."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        open_dataset(folder)
+    return [str(warning.message) for warning in caught]
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_the_largest_of_several_models_is_used(binary: bool, project: Path) -> None:
+    """The first model of the mapper has two of the ten images."""
+    (project / "sparse" / "0").rename(project / "sparse" / "1")
+    write_model(project / "sparse" / "0", [CAMERAS[1]], [(name, 1, SE3.identity()) for name in NAMES[:2]])
+    if binary:
+        for model in (project / "sparse").iterdir():
+            pycolmap.Reconstruction(str(model)).write_binary(str(model))
+            for file in model.glob("*.txt"):
+                file.unlink()
+    (said,) = remarks_of(project)
+    assert "has 2 models, of which sparse/1 with 10 images is used, not sparse/0 (2)" in said
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert len(open_sequence(project)) == 10
+
+
+def test_missing_images_and_photos_that_are_not_registered_are_counted(project: Path) -> None:
+    (project / "images/left/2.png").rename(project / "images/left/99.png")
+    said = remarks_of(project)
+    assert any(
+        "images: 1 of 10 images is missing and left out, the first is left/2.png" in text for text in said
+    )
+    assert any(
+        "1 of 10 photos are not registered in the model and are left out, the first is left/99.png" in text
+        for text in said
+    )
+    assert len(said) == 2
+    shutil.rmtree(project / "images")
+    with pytest.raises(
+        InputError, match=r"images/.*/\d+\.png: no such file, expected it as .* has that image"
+    ):
+        open_dataset(project)
+
+
+def test_names_of_windows(project: Path) -> None:
+    expected = all_views(project)
+    model = project / "sparse" / "0" / "images.txt"
+    model.write_text(model.read_text().replace("left/", "left\\").replace("right/", "Right\\"))
+    assert all_views(project).keys() == {name.replace("right", "Right") for name in expected}
+
+
+def test_rigs_and_frames_of_newer_versions_are_harmless(project: Path) -> None:
+    expected = all_views(project)
+    to_binary(project)
+    assert (project / "sparse/0/rigs.bin").is_file()
+    assert (project / "sparse/0/frames.bin").is_file()
+    for name, view in all_views(project).items():
+        torch.testing.assert_close(
+            view.T_ref_camera.matrix(), expected[name].T_ref_camera.matrix(), atol=1e-9, rtol=0
+        )
+
+
+def test_depth_maps_of_a_dense_reconstruction(project: Path) -> None:
+    """They are those of the images, in units of the model, and the geometric ones are preferred."""
+    maps = project / "stereo/depth_maps"
+    for name, kind, value in (
+        ("left/1", "photometric", 3.0),
+        ("left/1", "geometric", 2.0),
+        ("right/7", "photometric", 4.0),
+    ):
+        (maps / name).parent.mkdir(parents=True, exist_ok=True)
+        depth = np.full((12, 16), value, np.float32) + np.arange(16, dtype=np.float32) / 10
+        depth[0] = 0
+        (maps / f"{name}.png.{kind}.bin").write_bytes(b"16&12&1&" + depth.tobytes())
+    views = all_views(project)
+    measured = {name: view.frame.depth for name, view in views.items() if view.frame.depth is not None}
+    assert {name: round(float(depth[5, 0]), 3) for name, depth in measured.items()} == {
+        "1": 2,
+        "7": 4,
+    }
+    assert all(float(depth[0].abs().max()) == 0 for depth in measured.values())
+    assert float(measured["1"][7, 15]) == pytest.approx(3.5)
+    file = maps / "left/1.png.geometric.bin"
+    for content, message in (
+        (file.read_bytes()[:-4], "has 764 bytes after 16&12&1&, expected 768"),
+        (b"PNG", "does not begin with"),
+    ):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=message):
+            all_views(project)
 
 
 def test_images_reduced_after_the_reconstruction(project: Path) -> None:
@@ -174,7 +283,6 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str]] = {
     "parameters": (replaced("cameras.txt", "8.5 6.25", "8.5"), r"cameras\.txt: line 2: PINHOLE has 3 parameters, expected 4"),
     "camera twice": (replaced("cameras.txt", "2 SIMPLE", "1 SIMPLE"), r"cameras\.txt: line 3: camera 1 again"),
     "no camera": (replaced("cameras.txt", "5 OPENCV", "6 OPENCV"), r"image 'right/6\.png' has the camera 5, which cameras lacks"),
-    "no image": (replaced("images.txt", "left/2.png", "left/22.png"), r"left/22\.png: no such file"),
     "image twice": (replaced("images.txt", "left/2.png", "left/1.png"), r"image left/1\.png is registered twice"),
     "empty": (lambda model: (model / "images.txt").write_text("# nothing\n") and None, r"has no registered image"),
 }  # fmt: skip

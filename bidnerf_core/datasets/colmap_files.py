@@ -102,6 +102,14 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Intrins
     return _binary(images, _binary_image), dict(_binary(cameras, _binary_camera))
 
 
+def count_posed_images(folder: Path) -> int:
+    """Return the number of images that the model in ``folder`` says to hold. Raises ``InputError`` as ``read_posed_images``."""
+    if has_posed_images(folder, ".bin"):
+        (count,) = _Bytes(folder / "images.bin").take(COUNT)
+        return int(count)
+    return len(_text_images(folder / "images.txt"))
+
+
 def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
     """Return whether a folder has the cameras and images of a model, as .bin or .txt unless a suffix is given."""
     suffixes = (".bin", ".txt") if suffix is None else (suffix,)

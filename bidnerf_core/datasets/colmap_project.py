@@ -1,9 +1,14 @@
-"""Folders of a COLMAP project: ``images`` and a sparse model, with no other file.
+"""Folders of a COLMAP project: images and a sparse model, with no other file.
 
-The model is in ``sparse/0``, ``sparse`` or the folder itself, as .bin or .txt (``cameras`` and ``images``; ``points3D`` is not
-read). Images are in ``images``, or in the folder itself, under the names in the model. Every eighth registered image in the
-natural order of the names (the first, the ninth ...) is held out as "test" and the others are "train", as is usual for
-captures.
+Models are looked for in ``sparse``, ``colmap/sparse`` (nerfstudio), the folder itself, ``dense`` and the like, as .bin or .txt
+(``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). Where the mapper wrote several (``sparse/0``,
+``sparse/1`` ...), that with the most images is used, with a remark. Images are in the folder, of those where projects have them,
+that holds most of the model's images. Missing images and photos that are not registered are left out and counted. Every eighth
+registered image in the natural order of the names (the first, the ninth ...) is held out as "test" and the others are "train",
+as is usual for captures.
+
+In a workspace of dense reconstruction (``images``, ``sparse``, ``stereo/depth_maps``) the depth maps are the images' depth:
+those that were filtered geometrically, or else the photometric ones.
 
 The world is that of the model, whose unit of length is arbitrary: poses and maps are in it, not in metres. Images are used as
 they are stored, as in COLMAP, whose pixel centres are at +0.5 like ours. The camera of an image that was resized after the
@@ -12,27 +17,49 @@ reconstruction is scaled. COLMAP records no times: a sequence is in the order of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.colmap_files import ModelImage, has_posed_images, read_posed_images
+from bidnerf_core.datasets.colmap_depth import depth_map_of, read_colmap_depth
+from bidnerf_core.datasets.colmap_files import (
+    ModelImage,
+    count_posed_images,
+    has_posed_images,
+    read_posed_images,
+)
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.file_names import FileNames, posix_name
+from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.reader import Reader, ReadOptions
-from bidnerf_core.datasets.rgbd import read_rgbd
+from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import is_file
+from bidnerf_core.io.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 
-MODELS = ("sparse/0", "sparse", ".")
-"""Possible places of a model, in order of preference; COLMAP writes the first of several models to ``sparse/0``."""
-IMAGES = ("images", ".")
+MODELS = (
+    "sparse",
+    "colmap/sparse",
+    ".",
+    "colmap",
+    "dense/sparse",
+    "dense/0/sparse",
+    "undistorted/sparse",
+    "model",
+)
+"""Places of a model, or of numbered folders of models, in order of preference."""
+IMAGES = (
+    "images", "colmap/images", "dense/images", "dense/0/images", "undistorted/images", "input", "image", "photos", "rgb", ".",
+    "../images", "../../images",
+)  # fmt: skip
+"""Places of the images, relative to the folder; those beside the model come first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +70,7 @@ class ColmapFrame:
     image: Path
     camera: Intrinsics
     T_world_camera: SE3  # in units of the model
+    depth: Path | None  # of a dense reconstruction
 
     time = None
 
@@ -61,7 +89,7 @@ class ColmapReader(Reader):
     expected = "images with a sparse model in sparse/0 (COLMAP)"
 
     def recognises(self, path: Path) -> bool:
-        return _model_of(path) is not None
+        return bool(_models(path))
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Read the model. Raises ``InputError`` where it is damaged or has no registered image."""
@@ -71,8 +99,7 @@ class ColmapReader(Reader):
         return self._open(path, options).sequence()
 
     def _open(self, path: Path, options: ReadOptions) -> ColmapDataset:
-        model = _model_of(path)
-        assert model is not None  # recognises ensures it
+        model = _largest(path, _models(path))
         return ColmapDataset(Splits(path, hold_out(_frames(path, model))), options.background)
 
 
@@ -80,22 +107,56 @@ class ColmapDataset(SplitDataset[ColmapFrame]):
     """Views of a COLMAP project; see ``Dataset``."""
 
     def _frame(self, frame: ColmapFrame, name: str) -> Frame:
-        return read_rgbd(name, frame.image, CameraSource(frame.camera).at(frame.image), self._background)
+        depth = None if frame.depth is None else DepthFile(frame.depth, 1.0, read_colmap_depth)
+        camera = CameraSource(frame.camera).at(frame.image)
+        return read_rgbd(name, frame.image, camera, self._background, depth)
 
     def _pose(self, frame: ColmapFrame) -> SE3:
         return frame.T_world_camera
 
 
-def _model_of(path: Path) -> Path | None:
-    return next((path / place for place in MODELS if has_posed_images(path / place)), None)
+def _models(path: Path) -> list[Path]:
+    """Return the models of the first place that has any: the place itself, or numbered folders in it."""
+    for place in MODELS:
+        folder = path / place
+        inside = [child for child in folder.glob("*") if child.name.isdecimal() and has_posed_images(child)]
+        if inside or has_posed_images(folder):
+            own = [folder] if has_posed_images(folder) else []
+            return [*own, *sorted(inside, key=lambda child: natural_order(child.name))]
+    return []
+
+
+def _largest(path: Path, models: Sequence[Path]) -> Path:
+    """Return the model with the most images; a remark names the others."""
+    if len(models) == 1:
+        return models[0]
+    sizes = {model: count_posed_images(model) for model in models}
+    chosen = max(models, key=lambda model: sizes[model])
+    others = ", ".join(f"{model.relative_to(path)} ({sizes[model]})" for model in models if model != chosen)
+    remark(
+        path,
+        f"has {len(models)} models, of which {chosen.relative_to(path)} with {amount(sizes[chosen], 'image')} is used, not"
+        f" {others}; models have worlds of their own",
+    )
+    return chosen
 
 
 def _frames(path: Path, model: Path) -> list[ColmapFrame]:
     images, cameras = read_posed_images(model)
     if not images:
         raise InputError(f"{model}: has no registered image, expected a model with one or more")
-    folder = next(path / place for place in IMAGES if (path / place).is_dir())
-    frames = [_frame(model, folder, image, cameras) for image in images]
+    folder, files = _image_folder(path, model, images)
+    there = present(
+        images,
+        lambda image: image.name in files,
+        folder,
+        lambda image: image.name,
+        lambda image: InputError(
+            f"{folder / image.name}: no such file, expected it as {model} has that image"
+        ),
+    )
+    _remark_unregistered(path, folder, files)
+    frames = [_frame(model, image, files[image.name], cameras) for image in there]
     frames.sort(key=lambda frame: natural_order(str(frame.name)))
     for frame, following in pairwise(frames):
         if frame.name == following.name:
@@ -103,13 +164,40 @@ def _frames(path: Path, model: Path) -> list[ColmapFrame]:
     return frames
 
 
-def _frame(model: Path, folder: Path, image: ModelImage, cameras: dict[int, Intrinsics]) -> ColmapFrame:
+def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tuple[Path, dict[str, Path]]:
+    """Return the folder that holds most of the images, and the files of these by their names in the model."""
+    beside = [model.parent / "images", model.parent.parent / "images"]
+    places = list(dict.fromkeys([*beside, *(path / place for place in IMAGES)]))
+    best: tuple[Path, dict[str, Path]] = (path / IMAGES[0], {})
+    for folder in filter(Path.is_dir, places):
+        names = FileNames(folder)
+        found = {image.name: names.find(posix_name(image.name)) for image in images}
+        files = {name: file for name, file in found.items() if file is not None}
+        if len(files) > len(best[1]):
+            best = folder, files
+        if len(files) == len(images):
+            break
+    return best
+
+
+def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> None:
+    """Count the photos in a folder of images that the model lacks."""
+    if folder == path:
+        return
+    photos = [file for file in folder.rglob("*") if file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
+    others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
+    if others:
+        text = f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out"
+        remark(folder, f"{text}, the first is {others[0].relative_to(folder)}")
+
+
+def _frame(model: Path, image: ModelImage, file: Path, cameras: dict[int, Intrinsics]) -> ColmapFrame:
     if image.camera not in cameras:
         raise InputError(f"{model}: image {image.name!r} has the camera {image.camera}, which cameras lacks")
-    name = PurePosixPath(image.name.replace("\\", "/"))
-    if not is_file(folder / name):
-        raise InputError(f"{folder / name}: no such file, expected it as {model} has that image")
-    return ColmapFrame(name, folder / name, cameras[image.camera], image.T_camera_model.inverse())
+    name = PurePosixPath(posix_name(image.name))
+    return ColmapFrame(
+        name, file, cameras[image.camera], image.T_camera_model.inverse(), depth_map_of(model, image.name)
+    )
 
 
 reader = ColmapReader()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import Raster
-from bidnerf_core.depth.images import DepthReader
+from bidnerf_core.depth.images import DepthImage
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import fit_depth
@@ -21,7 +21,7 @@ class DepthFile:
 
     path: Path
     unit: float  # metres per step
-    read: DepthReader
+    read: Callable[[Path, float], DepthImage]  # from a file and the unit; often a ``DepthReader``
     sensor: DepthCamera | None = (
         None  # the sensor from which it is registered to its image; None: it already is
     )

@@ -1,0 +1,46 @@
+"""Depth maps of COLMAP's dense reconstruction: the text ``width&height&channels&``, then 32-bit floats, row by row.
+
+Depth is planar z of the undistorted image in units of the model, 0 where nothing was reconstructed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bidnerf_core.depth.images import DepthImage, depth_image
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import is_file, read_file
+
+FOLDER = "stereo/depth_maps"
+KINDS = ("geometric", "photometric")
+"""The kinds of depth maps, the more reliable one first."""
+LARGEST_HEAD = 64
+"""Bytes of the text before the numbers."""
+EXPECTED = "a depth map of COLMAP's"
+
+
+def depth_map_of(model: Path, name: str) -> Path | None:
+    """Return the depth map of an image of a model ``WORKSPACE/sparse`` or ``WORKSPACE/sparse/0``, or None."""
+    for workspace in (model.parent, model.parent.parent):
+        for kind in KINDS:
+            file = workspace / FOLDER / f"{name}.{kind}.bin"
+            if is_file(file):
+                return file
+    return None
+
+
+def read_colmap_depth(path: Path, unit: float) -> DepthImage:
+    """Read a depth map, in ``unit`` metres per unit of the model. Raises ``InputError`` for other and for cut files."""
+    content = read_file(path, EXPECTED)
+    *sizes, numbers = content.split(b"&", 3)
+    if len(sizes) != 3 or not all(size.isdigit() and len(size) < LARGEST_HEAD for size in sizes):
+        raise InputError(f"{path}: does not begin with width&height&channels&, expected {EXPECTED}")
+    width, height, channels = map(int, sizes)
+    if channels != 1 or width * height < 1 or len(numbers) != 4 * width * height:
+        raise InputError(
+            f"{path}: has {len(numbers)} bytes after {width}&{height}&{channels}&, expected {4 * width * height} of one channel"
+        )
+    values = np.frombuffer(numbers, "<f4").reshape(height, width)
+    return depth_image(np.where(values > 0, values, 0), unit, f"{path}: depth")
