@@ -48,7 +48,7 @@ WRONG = [
     ({"rgb": NO_VALUES.numpy()}, "rgb is a ndarray, expected a tensor; Frame.from_numpy"),
     ({"rgb": NO_VALUES.index_fill(0, torch.tensor([3]), torch.nan)}, "rgb has values that are NaN"),
     ({"rgb": NO_VALUES.index_fill(2, torch.tensor([1]), torch.inf)}, "rgb has values that are NaN or inf"),
-    ({"rgb": NO_VALUES.byte()}, "rgb is of uint8, expected floats"),
+    ({"rgb": NO_VALUES.short()}, "rgb is of int16, expected bytes or floats"),
     ({"rgb": NO_VALUES.bool()}, "rgb is of bool"),
     ({"rgb": NO_VALUES.long()}, "rgb is of int64"),
     ({"rgb": NO_VALUES.to(torch.complex64)}, "rgb is of complex64"),

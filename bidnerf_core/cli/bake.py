@@ -14,7 +14,7 @@ from bidnerf_core.cli.camera_options import (
     depth_registration,
     mask_folder,
 )
-from bidnerf_core.cli.options import Device, Flag, MapFolder, option, parse
+from bidnerf_core.cli.options import Device, Flag, Largest, MapFolder, option, parse
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import UsageError
@@ -42,6 +42,7 @@ def bake(
     depth_unit: DatasetDepthUnit = None,
     masks: Masks = None,
     mask_hides: MaskHides = "black",
+    largest: Largest = None,
     rendered_landmarks: Annotated[
         Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
     ] = False,
@@ -82,6 +83,7 @@ def bake(
             config,
             rendered_landmarks=rendered_landmarks,
             features=landmark_features,
+            largest=largest,
             progress=progress,
             cancel=cancel,
         )

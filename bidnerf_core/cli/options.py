@@ -41,6 +41,10 @@ FeaturesName: TypeAlias = Annotated[
     str, option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
 ]
 Device: TypeAlias = Annotated[str, option("NAME", "device on which the field computes: cpu, cuda ...")]
+Largest: TypeAlias = Annotated[
+    int | None,
+    option("PX", "longer side to which larger images are reduced", "1600, or less where memory is short"),
+]
 DataFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, option("DATA", "folder of a dataset")]
 Flag: TypeAlias = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]

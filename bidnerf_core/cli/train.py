@@ -23,6 +23,7 @@ from bidnerf_core.cli.options import (
     Device,
     FeaturesName,
     Flag,
+    Largest,
     option,
     parse,
     require,
@@ -39,7 +40,7 @@ from bidnerf_core.io.json import from_plain
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.maps import training
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS
-from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.settings import to_flat
 
 
@@ -60,6 +61,7 @@ def run(arguments: list[str]) -> None:
         depth_unit: DatasetDepthUnit = None,
         masks: Masks = None,
         mask_hides: MaskHides = "black",
+        largest: Largest = None,
         background: Annotated[
             str | None,
             option("COLOUR", "colour behind images with alpha: white or black", "as the dataset has it"),
@@ -100,6 +102,8 @@ def run(arguments: list[str]) -> None:
         require("--checkpoint-every", checkpoint_every, 0)
         if resume and overwrite:
             raise UsageError("--resume goes on with a map, --overwrite begins anew; expected one of them")
+        if largest is not None:
+            require("--largest", largest, 1)
         if background is not None:
             with wrong_usage():
                 background_colour(background)
@@ -110,6 +114,10 @@ def run(arguments: list[str]) -> None:
             info = training.interrupted(out, not no_bake)
             _check_unchanged(out, info, named, default, config)
             _check_refinement(out, info, refine_poses)
+            if largest is not None and largest != longest_side(info):
+                raise UsageError(
+                    f"{out}: was begun with images of {longest_side(info)} px, got --largest {largest}; leave it out"
+                )
             if landmark_features not in (USUAL_FEATURES, info.landmark_features):
                 began = f"--landmark-features {info.landmark_features}"
                 raise UsageError(f"{out}: was begun with {began}, got {landmark_features}; leave it out")
@@ -136,6 +144,7 @@ def run(arguments: list[str]) -> None:
                     refine_poses=refine_poses,
                     overwrite=overwrite,
                     features=landmark_features,
+                    largest=largest,
                     **same,
                 )
                 return

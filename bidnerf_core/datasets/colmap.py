@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -120,7 +120,7 @@ class SparsePoints:
         if view.frame.has_depth or len(points) == 0:
             return view
         depth = nearest_depth(points, view.frame.intrinsics)
-        return View(replace(view.frame, depth=depth), view.T_ref_camera)
+        return View(view.frame.with_images(depth=depth), view.T_ref_camera)
 
     def _measured(self, places: Sequence[tuple[str, SE3]], split: str) -> Unit:
         """Estimate the unit from the training cameras, and again without the outliers among them."""

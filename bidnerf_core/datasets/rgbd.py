@@ -12,7 +12,7 @@ from bidnerf_core.depth.images import DepthImage
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import fit_depth
-from bidnerf_core.io.images import read_header, read_image
+from bidnerf_core.io.images import read_compact_image, read_header
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def read_rgbd(
     """
     header = read_header(image)
     camera = camera_of(header.width, header.height)
-    rgb, alpha = read_image(image, background)
+    rgb, alpha = read_compact_image(image, background)
     metres = None
     if depth is not None:
         measured = depth.read(depth.path, depth.unit)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
@@ -20,10 +20,19 @@ from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.depth.images import depth_image
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.frames.colours import HELD, LAST, Colours, as_bytes
 from bidnerf_core.frames.masks import HiddenColour, WhollyHidden, read_mask
 from bidnerf_core.frames.photos import fit_depth, read_photo
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import Background, background_colour, over, pixel_array, split_alpha
+from bidnerf_core.io.images import (
+    Background,
+    background_colour,
+    over,
+    pixel_array,
+    reduced,
+    resampled,
+    split_alpha,
+)
 
 SPARSE = 0.05
 """Share of an image's pixels below which measured depth is sparse: the pixels in between then remain unknown."""
@@ -37,7 +46,7 @@ class Frame:
     name: str
     # rgb is in [0, 1], already over the background where there was an alpha channel; alpha is 1 where the scene covers
     # the pixel and 0 where the background shows. All are dense tensors of the size of the camera's image, of finite
-    # floats, which is checked here.
+    # floats, which is checked here. Colours may be given as bytes (uint8): they are held so, and read as floats.
     rgb: Float[Tensor, "h w channels"]
     intrinsics: Intrinsics
     depth: Float[Tensor, "dh dw"] | None = None
@@ -65,7 +74,7 @@ class Frame:
             raise InputError(f"{where}: intrinsics is a {type(camera).__name__}, expected Intrinsics")
         _require_rays(where, camera)
         for what, image, channels in (
-            ("rgb", self.rgb, 3),
+            ("rgb", self.held_rgb, 3),
             ("depth", self.depth, None),
             ("alpha", self.alpha, None),
             ("hidden", self.hidden, None),
@@ -230,10 +239,45 @@ class Frame:
         """Return the frame with its images on ``device``; the frame itself where they lie there."""
         others = (self.depth, self.alpha, self.hidden)
         depth, alpha, hidden = (None if image is None else image.to(device) for image in others)
-        rgb = self.rgb.to(device)
-        if all(a is b for a, b in zip((rgb, depth, alpha, hidden), (self.rgb, *others), strict=True)):
+        rgb = self.held_rgb.to(device)
+        if all(a is b for a, b in zip((rgb, depth, alpha, hidden), (self.held_rgb, *others), strict=True)):
             return self
         return replace(self, rgb=rgb, depth=depth, alpha=alpha, hidden=hidden)
+
+    @property
+    def held_rgb(self) -> Shaped[Tensor, "h w channels"]:
+        """The colours as they are held: bytes from 0 to 255, or floats in [0, 1]."""
+        held: Tensor = self.__dict__[HELD]
+        return held
+
+    def with_images(self, **images: Tensor | None) -> Frame:
+        """Return the frame with other depth, alpha or hidden pixels; its colours stay bytes where they are."""
+        return replace(self, rgb=self.held_rgb, **images)  # type: ignore[arg-type]
+
+    def at_most(self, largest: int) -> Frame:
+        """Return the frame reduced to ``largest`` pixels along its longer side; the frame itself where it has no more.
+
+        Colours become means over areas, rounded to bytes. Depth is that of the nearest pixel, and a pixel is hidden where any
+        that it covers is.
+        """
+        camera = self.intrinsics
+        longer = max(camera.width, camera.height)
+        if longer <= largest:
+            return self
+        small = camera.scaled(largest / longer)
+        size = (small.width, small.height)
+        rgb = reduced(self.held_rgb.cpu(), *size)
+        depth = None if self.depth is None else resampled(self.depth.cpu(), *size)
+        alpha = None if self.alpha is None else reduced(self.alpha.cpu().float(), *size)
+        hidden = None if self.hidden is None else reduced(self.hidden.cpu().float(), *size) > 0
+        return replace(
+            self, rgb=rgb if rgb.dtype == torch.uint8 else as_bytes(rgb), intrinsics=small, depth=depth,
+            alpha=alpha, hidden=hidden,
+        )  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy of the frame is made of: all but the weak reference to its colours as floats."""
+        return {name: value for name, value in self.__dict__.items() if name != LAST}
 
     @property
     def has_depth(self) -> bool:
@@ -244,6 +288,10 @@ class Frame:
     def has_dense_depth(self) -> bool:
         """Whether depth was measured at more than a few points."""
         return self.depth is not None and float((self.depth > 0).float().mean()) >= SPARSE
+
+
+Frame.rgb = Colours()  # type: ignore[assignment]
+"""Set after the class was made: in its body, it would be taken for a default value."""
 
 
 def _check_image(where: str, what: str, image: object, camera: Intrinsics, channels: int | None) -> None:
@@ -261,10 +309,10 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, chann
         raise InputError(f"{where}: {what} is {found[1]}x{found[0]}, its camera expects {size[1]}x{size[0]}")
     if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
         raise InputError(f"{where}: {what} is a sparse tensor or has no values, expected a dense one")
-    if what == "hidden":
+    if what == "hidden" or (what == "rgb" and image.dtype == torch.uint8):
         return
     if not image.is_floating_point():
-        scale = "floats in [0, 1]; Frame.from_numpy takes bytes" if what == "rgb" else "floats"
+        scale = "bytes or floats in [0, 1]" if what == "rgb" else "floats"
         raise InputError(f"{where}: {what} is of {str(image.dtype).removeprefix('torch.')}, expected {scale}")
     if image.requires_grad:
         raise InputError(f"{where}: {what} requires a gradient, expected measured values; detach() them")

@@ -20,6 +20,7 @@ from bidnerf_core.io.images import (
     IMAGE_SUFFIXES,
     Background,
     background_colour,
+    looks_like_image,
     read_header,
     read_image,
     resampled,
@@ -95,7 +96,7 @@ def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what:
 def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
     """Return the image files of a folder and its other files, both in natural order (``2.jpg`` before ``10.jpg``).
 
-    Depth images (``NAME.depth.png``), hidden files and whatever is not an image by its ending are among the others;
+    Depth images (``NAME.depth.png``), hidden files and whatever is not an image by its ending or its first bytes are among the others;
     folders inside are left out. Raises ``InputError`` where ``folder`` is not a folder that may be read.
     """
     try:
@@ -114,8 +115,9 @@ def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
 
 def _is_photo(file: Path) -> bool:
     hidden = file.name.startswith(".")  # such as the "._IMG_1.JPG" of macOS
-    image = file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
-    return image and not hidden and not file.stem.endswith(DEPTH_STEM)
+    if hidden or file.stem.endswith(DEPTH_STEM):
+        return False
+    return file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) or looks_like_image(file)
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:

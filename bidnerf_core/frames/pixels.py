@@ -21,6 +21,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
 from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.colours import colours_at
 from bidnerf_core.frames.frame import Frame, View
 
 
@@ -57,7 +58,7 @@ def observe(
     They are on ``device``, by default that of the image. Nothing is copied if the image, the pose and ``pixels`` are there.
     """
     frame = view.frame
-    columns, rows = pixels.to(frame.rgb.device).unbind(-1)
+    columns, rows = pixels.to(frame.held_rgb.device).unbind(-1)
     ray, length = frame.intrinsics.rays(pixels.double() + 0.5)
     depth = torch.zeros_like(length)
     if frame.depth is not None:
@@ -67,11 +68,10 @@ def observe(
         T = T @ poses_of_rows(exposure_times(pixels.to(ray) + 0.5, frame.intrinsics), view.motion)
     directions = T.rotate(ray)
     origins = T.translation.expand_as(directions)
-    there = frame.rgb.device if device is None else device
+    there = frame.held_rgb.device if device is None else device
     coloured = torch.full((len(length),), frame.has_colour, device=length.device)
-    return Observations(origins, directions, frame.rgb[rows, columns], depth * length, coloured).to(
-        there, dtype
-    )
+    rgb = colours_at(frame.held_rgb, rows, columns)
+    return Observations(origins, directions, rgb, depth * length, coloured).to(there, dtype)
 
 
 def draw(
@@ -127,7 +127,7 @@ REACH, ROUNDS = 5, 3
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
     """Return corners (column, row) by Shi and Tomasi 1994, "Good features to track"; possibly none."""
-    if min(frame.rgb.shape[:2]) <= BORDER:
+    if min(frame.held_rgb.shape[:2]) <= BORDER:
         return torch.zeros((0, 2), dtype=torch.long)
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
     response = nms2d(gftt_response(grey), (5, 5))[0, 0]
@@ -138,7 +138,7 @@ def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
 def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
     """Return the interest points of a frame and the pixels around them, row by row."""
     columns, rows = interest_points(frame).unbind(-1)
-    mask = torch.zeros((1, 1, *frame.rgb.shape[:2]))
+    mask = torch.zeros((1, 1, *frame.held_rgb.shape[:2]))
     mask[0, 0, rows, columns] = 1
     for _ in range(ROUNDS):
         mask = dilation(mask, torch.ones(REACH, REACH))

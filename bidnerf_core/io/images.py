@@ -23,16 +23,24 @@ from bidnerf_core.io.files import open_binary
 Background: TypeAlias = str | Sequence[float]
 """A background as users give it: "white", "black" or an rgb triple in [0, 1]."""
 
-LARGEST_IMAGE = 100_000_000
-"""Pixels. A small file can describe an image of any size, so the size is checked before memory is allocated."""
+LARGEST_IMAGE = 178_000_000
+"""Pixels: what Pillow opens, and more than the 108 megapixels of phones. A small file can describe an image of any size, so the
+size is checked before memory is allocated."""
 STRIP = 2**21
 """Pixels that are converted at a time: a conversion takes many times as much memory as the bytes of the image."""
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
 """The formats that are decoded, whatever a file's name. Pillow knows more, and reads EPS by starting another program."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
+"""Brands in the first bytes of HEIF files (ISO/IEC 23008-12)."""
+MAGIC = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8", b"BM")
+"""First bytes of PNG, JPEG, TIFF (both byte orders), GIF and BMP; WebP, AVIF and HEIF name themselves further on."""
+DEPTHS = (10, 12, 14)
+"""Bits of sensors whose values are stored in 16 bits: an image whose largest value fits one of them has that range."""
 NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV")
+CONVERTED = ("CMYK", "YCbCr", "HSV")
+"""Colour spaces that Pillow converts to RGB."""
 
 # Pillow warns about large images, odd EXIF and palettes, which is of no use to whoever opens a photo. It is done once and with
 # the lowest precedence: filters belong to the whole process, so threads that changed and restored them while they read images
@@ -64,16 +72,16 @@ def read_image(
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Read colour in [0, 1] over ``background``, and alpha where there is such a channel.
 
-    Grey becomes three channels. The raster is the stored one, whatever the EXIF orientation, reduced to ``size`` (width,
-    height) as ``reduced`` does: the image is read in strips, so that no more than its bytes and the result are in memory.
-    Raises ``InputError`` where the file is not a complete image of 1 to 4 channels of 8 bits (or 16 bits of grey), or is too
-    large.
+    Grey becomes three channels, CMYK becomes RGB, and the range of 16 bits is that of the sensor: 10, 12 or 14 bits where no
+    value needs more. The raster is the stored one, whatever the EXIF orientation, reduced to ``size`` (width, height) as
+    ``reduced`` does: the image is read in strips, so that no more than its bytes and the result are in memory. Raises
+    ``InputError`` where the file is not a complete image of 1 to 4 channels of 8 or 16 bits, or is too large.
     """
     rgb, alpha = None, None
     with open_image(path) as image:
         height, width = image.height, image.width if size is None else size[0]
-        for top, strip in _strips(path, image):
-            colour, cover = channels(strip, f"{path}: image decodes to")
+        for top, strip, full in _scaled_strips(path, image):
+            colour, cover = channels(strip, f"{path}: image decodes to", full)
             laid = over(colour, cover, background)
             if width != image.width:
                 laid = reduced(laid, width, len(strip))
@@ -87,17 +95,33 @@ def read_image(
     return reduced(found, *size), None if mask is None else reduced(mask, *size)
 
 
-def channels(raw: np.ndarray, finding: str) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+def read_compact_image(
+    path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)
+) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+    """Read an image as ``read_image`` does, but leave colours as bytes (uint8) where the file has 8 bits and no alpha."""
+    rgb = None
+    with open_image(path) as image:
+        if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
+            for top, strip in _strips(path, image):
+                colours = strip if strip.ndim == 3 else np.repeat(strip[..., None], 3, axis=2)
+                rgb = _placed(rgb, colours, top, image.height)
+    return read_image(path, background) if rgb is None else (torch.from_numpy(rgb), None)
+
+
+def channels(
+    raw: np.ndarray, finding: str, full: int | None = None
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Scale an array (h, w) or (h, w, 1 to 4) of unsigned integers to colour in [0, 1] and alpha.
 
-    ``finding`` is the beginning of the message of the ``InputError`` that other arrays raise.
+    ``full`` is the value of white, by default the largest of the array's type. ``finding`` is the beginning of the message of
+    the ``InputError`` that other arrays raise.
     """
     count = raw.shape[2] if raw.ndim == 3 else 1
     if raw.ndim not in (2, 3) or not 1 <= count <= 4 or raw.dtype.name not in FULL_SCALE:
         found = f"{'x'.join(map(str, raw.shape))} of {raw.dtype.name}"
-        raise InputError(f"{finding} {found}, expected grey, RGB or RGBA of 8 bit")
+        raise InputError(f"{finding} {found}, expected grey, RGB or RGBA of 8 or 16 bit")
     scaled = raw.reshape(*raw.shape[:2], count).astype(np.float32)
-    scaled /= FULL_SCALE[raw.dtype.name]
+    scaled /= full or FULL_SCALE[raw.dtype.name]
     return split_alpha(torch.from_numpy(scaled))
 
 
@@ -177,8 +201,8 @@ def background_colour(background: Background) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-def reduced(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "nh nw *c"]:
-    """Reduce an image to a smaller size; each new pixel is the mean over the area that it covers."""
+def reduced(image: Shaped[Tensor, "h w *c"], width: int, height: int) -> Shaped[Tensor, "nh nw *c"]:
+    """Reduce an image of floats or bytes to a smaller size; each new pixel is the mean over the area that it covers."""
     import cv2  # here, as most images keep their size
 
     small = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
@@ -197,24 +221,80 @@ def decode(path: Path) -> np.ndarray:
 
     Raises ``InputError`` where the file is not a whole image, and for colour spaces other than grey and RGB.
     """
-    pixels = None
     with open_image(path) as image:
-        for top, strip in _strips(path, image):
-            pixels = _placed(pixels, strip, top, image.height)
+        return _decoded(path, image)
+
+
+def _scaled_strips(path: Path, image: Image.Image) -> Iterator[tuple[int, np.ndarray, int | None]]:
+    """Yield strips as ``_strips`` does, each with the value of white; None is the largest of its type."""
+    if not _is_deep(image):
+        yield from ((top, strip, None) for top, strip in _strips(path, image))
+        return
+    whole = _decoded(path, image)
+    full = _used_range(whole)
+    rows = max(1, STRIP // image.width)
+    yield from ((top, whole[top : top + rows], full) for top in range(0, image.height, rows))
+
+
+def _used_range(pixels: np.ndarray) -> int:
+    """Return the largest value of the sensor whose values are stored in 16 bits."""
+    colours = pixels[..., :-1] if pixels.ndim == 3 and pixels.shape[2] in (2, 4) else pixels
+    largest = int(colours.max(initial=0))
+    fits = [2**bits - 1 for bits in DEPTHS if largest < 2**bits]
+    return fits[0] if fits and colours is pixels else FULL_SCALE["uint16"]
+
+
+def _is_deep(image: Image.Image) -> bool:
+    """Return whether an open image has 16 bits a channel, of which Pillow keeps 8 where there are several channels."""
+    return (
+        image.mode.startswith("I;16")
+        or (image.format == "PNG" and image.mode == "I")
+        or _is_deep_colour(image)
+    )
+
+
+def _is_deep_colour(image: Image.Image) -> bool:
+    tiles = getattr(image, "tile", [])
+    arguments = tiles[0][3] if tiles else ""
+    raw = arguments[0] if isinstance(arguments, tuple) and arguments else arguments
+    return image.mode in ("LA", "RGB", "RGBA") and isinstance(raw, str) and ";16" in raw
+
+
+def _decoded(path: Path, image: Image.Image) -> np.ndarray:
+    """Return the pixels of an open image as they are stored."""
+    pixels = None
+    if _is_deep_colour(image):
+        return _deep_colours(path)
+    for top, strip in _strips(path, image):
+        pixels = _placed(pixels, strip, top, image.height)
     assert pixels is not None  # no image is without rows
     return pixels
 
 
+def _deep_colours(path: Path) -> np.ndarray:
+    """Decode an image of 16 bits a channel by OpenCV."""
+    import cv2  # here, as most images have 8 bits
+
+    found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
+        raise InputError(
+            f"{path}: not readable as an image of 16 bits a channel, expected a whole image file"
+        )
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+
+
 def _strips(path: Path, image: Image.Image) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the first row and the pixels of one strip of an open image after another, from top to bottom."""
-    if image.mode in OTHER_COLOURS:
-        raise InputError(f"{path}: image is {image.mode}, expected grey, RGB or RGBA")
+    if image.mode == "LAB":
+        raise InputError(f"{path}: image is {image.mode}, expected grey, RGB, RGBA or CMYK")
     rows = max(1, STRIP // image.width)
     for top in range(0, image.height, rows):
         last = min(top + rows, image.height)
         strip = image if rows >= image.height else image.crop((0, top, image.width, last))
         if strip.mode in ("P", "PA"):
             strip = strip.convert("RGBA" if image.has_transparency_data else "RGB")
+        elif strip.mode in CONVERTED:
+            strip = strip.convert("RGB")
         pixels = np.array(strip)
         sixteen_bits = image.format == "PNG" and pixels.dtype == np.int32  # Pillow before 11.3
         yield top, pixels.astype(np.uint16) if sixteen_bits else pixels
@@ -237,9 +317,10 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     Raises ``InputError`` where there is no such regular file, where it is not readable as an image, and where the image has
     more than ``LARGEST_IMAGE`` pixels, which the header shows before memory is allocated.
     """
-    if path.suffix.lower() in HEIF_SUFFIXES:
-        _register_heif(path)
     with open_binary(path, "an image file") as file:
+        if is_heif(file.read(12)):
+            _register_heif(path)
+        file.seek(0)
         try:
             with Image.open(file, formats=_formats()) as image:
                 _check_pixels(path, image.width, image.height)
@@ -279,12 +360,28 @@ def _too_large(path: Path, size: str) -> InputError:
     return InputError(f"{path}: image is {size}, expected at most {LARGEST_IMAGE // 10**6} megapixels")
 
 
+def is_heif(head: bytes) -> bool:
+    """Return whether the first 12 bytes of a file are those of HEIF, such as an iPhone's HEIC, whatever its name."""
+    return head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS
+
+
+def looks_like_image(path: Path) -> bool:
+    """Return whether the first bytes of a file are those of an image; none is decoded."""
+    try:
+        with open_binary(path, "an image file") as file:
+            head = file.read(12)
+    except InputError:
+        return False
+    named = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
+    return head.startswith(MAGIC) or named or is_heif(head) or head[4:12] in (b"ftypavif", b"ftypavis")
+
+
 def _register_heif(path: Path) -> None:
     try:
         import pillow_heif
     except ImportError as error:
         raise InputError(
-            f"{path}: reading HEIC needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG"
+            f"{path}: is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG"
         ) from error
     pillow_heif.register_heif_opener()
 

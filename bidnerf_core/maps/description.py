@@ -64,6 +64,11 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
     return [(c.intrinsics, c.pose) for c in info.cameras]
 
 
+def longest_side(info: MapInfo) -> int | None:
+    """Return the columns or rows of the largest training image, to which images were reduced; None without cameras."""
+    return max((max(c.intrinsics.width, c.intrinsics.height) for c in info.cameras), default=None)
+
+
 def load_info(folder: Path) -> MapInfo:
     """Return the content of ``map.json``, checked. Raises ``InputError`` where it does not describe a map of this version."""
     path = folder / DESCRIPTION

@@ -40,7 +40,7 @@ from bidnerf_core.maps.files import (
 )
 from bidnerf_core.maps.same_scene import check_same_scene
 from bidnerf_core.maps.summary import MapSummary, summarized
-from bidnerf_core.maps.views import Images, read_views
+from bidnerf_core.maps.views import Images, checked_side, read_views
 from bidnerf_core.maps.weights import checked_weights
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
 from bidnerf_core.training import TrainingState
@@ -142,6 +142,7 @@ class Map:
         *,
         rendered_landmarks: bool = False,
         features: str | None = None,
+        largest: int | None = None,
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
     ) -> Map:
@@ -150,7 +151,7 @@ class Map:
         For the surface, views with measured depth replace rendered ones; landmarks are built from all views of ``data``
         (those of ``split``, where it is a dataset or the path to one). Without data, landmarks are built from images that the
         field renders, unless the map has landmarks of photos: these are kept unless ``rendered_landmarks`` is set.
-        ``features`` is the name of another detector of landmarks than the map's. Raises ``InputError`` where the data is not
+        ``features`` is the name of another detector of landmarks than the map's, and ``largest`` is as for ``train``. Raises ``InputError`` where the data is not
         usable or shows another scene, where nothing can be baked, and where another program writes into the folder; raises
         ``Cancelled`` once ``cancel`` returns True. Parts that are finished then stay.
         """
@@ -164,12 +165,16 @@ class Map:
                     f" {features!r} give the photos again (--data), or take --rendered-landmarks"
                 )
             return replace(self, info=replace(self.info, landmark_features=features)).bake(
-                data, split, config, rendered_landmarks=rendered_landmarks, progress=progress, cancel=cancel
-            )
+                data, split, config, rendered_landmarks=rendered_landmarks, largest=largest, progress=progress,
+                cancel=cancel,
+            )  # fmt: skip
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
             views = list[View]()
             if data is not None:
-                found = read_views(data, split, self._background(data), progress=progress, cancel=cancel)
+                found = read_views(
+                    data, split, self._background(data), progress=progress, cancel=cancel,
+                    largest=checked_side(largest), folder=self.folder,
+                )  # fmt: skip
                 views = at_stored_poses(found.views, self.info.cameras)
                 check_same_scene(self.info, self.field, views, self._name)
             settings = BakeConfig() if config is None else config

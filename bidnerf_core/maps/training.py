@@ -26,10 +26,10 @@ from bidnerf_core.io.tensors import packed
 from bidnerf_core.mapping import BakeConfig, TrackedViews, find_features
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS, Checkpoints
-from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.files import load_state, map_folder
 from bidnerf_core.maps.map import Map, build_field, frozen_field, load_map
-from bidnerf_core.maps.views import Images, ReadViews, read_views
+from bidnerf_core.maps.views import Images, ReadViews, checked_side, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
 from bidnerf_core.registry import PluginError
 from bidnerf_core.training import TrainingStopped
@@ -72,6 +72,7 @@ def train(
     point_choice: SparseChoice | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     features: str = USUAL_FEATURES,
+    largest: int | None = None,
 ) -> Map:
     """Train a map on posed images: check and refine their poses, train the field, and bake a surface and landmarks.
 
@@ -88,7 +89,8 @@ def train(
 
     ``background`` is the colour behind images with an alpha channel. Images without depth take that of the points of the COLMAP
     sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the
-    detector of the landmarks.
+    detector of the landmarks. Images with more than ``largest`` pixels along the longer side are reduced to that, by default
+    to 1600, or fewer where they would take more than 2 GB or a quarter of the available memory; the map's cameras are scaled.
 
     Raises ``InputError`` where data, settings or folder are not usable; the folder must be empty unless ``overwrite`` is set.
     """
@@ -100,7 +102,17 @@ def train(
         raise InputError(f"refine_poses is {refine_poses!r}, expected one of {choices}")
     work = _work(out, bake, device, checkpoint_seconds, progress, cancel)
     with contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite):
-        read = read_views(data, split, background, depth_points, point_choice, progress, cancel)
+        read = read_views(
+            data,
+            split,
+            background,
+            depth_points,
+            point_choice,
+            progress,
+            cancel,
+            checked_side(largest),
+            work.out,
+        )
         part = f" in split {split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
             log.info(f"{read.place}: no measured depth{part}; training on colour only")
@@ -148,7 +160,9 @@ def resume(
         info = interrupted(out, work.bake is not None)  # another process may have finished meanwhile
         if background is None and isinstance(data, str | Path):
             background = info.bounds.background
-        read = read_views(data, split, background, depth_points, point_choice, progress, cancel)
+        read = read_views(
+            data, split, background, depth_points, point_choice, progress, cancel, longest_side(info), out
+        )
         _check_same_views(out, info, read, split)
         views = at_stored_poses(read.views, info.cameras)
         if info.complete:  # stopped between training and baking

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
 from bidnerf_core.datasets import Background, Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.datasets.dataset import ReadingProgress
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import BLACK, View
+from bidnerf_core.frames.frame import BLACK, Frame, View
 from bidnerf_core.frames.masks import INVERTED, masks_sentence
+from bidnerf_core.frames.pixel_store import PixelStore, bytes_of
 from bidnerf_core.io.images import background_colour
+from bidnerf_core.io.memory import available_memory
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 
 log = logging.getLogger("bidnerf")
@@ -42,8 +45,13 @@ def read_views(
     point_choice: SparseChoice | None = None,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
+    largest: int | None = None,
+    folder: Path | None = None,
 ) -> ReadViews:
     """Read the views of ``data``; ``split`` names those of a dataset.
+
+    Images of a dataset with more than ``largest`` pixels along the longer side are reduced to that, by default to what
+    ``useful_size`` says. They are held as bytes, and where they are many in a nameless file in ``folder``, see ``PixelStore``.
 
     ``background`` is the colour behind images with an alpha channel, by default that of the dataset. Images without depth take
     that of the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``. Raises ``InputError`` where there
@@ -57,7 +65,7 @@ def read_views(
             raise InputError(f"{data.path}: was opened over background {data.background}, got {background!r}")
         if not data.frame_names(split):
             raise InputError(f"{data.path}: split {split!r} has no frames")
-        views = data.views(split, None, counter("reading", "images", progress, cancel))
+        views = _read(data, split, largest, folder, counter("reading", "images", progress, cancel))
         if left_out := len(data.frame_names(split)) - len(views):
             log.info(f"{data.path}: {amount(left_out, 'image')} left out: hidden altogether; {INVERTED}")
         if not views:
@@ -79,6 +87,60 @@ def _hidden(views: Sequence[View], place: str) -> int:
     if (sentence := masks_sentence(hidden)) is not None:
         log.info(f"{place}: {sentence}")
     return sum(int(pixels.sum()) for pixels in hidden if pixels is not None)
+
+
+def _read(
+    data: Dataset, split: str, largest: int | None, folder: Path | None, progress: ReadingProgress
+) -> list[View]:
+    """Read the views of a split one after another, so that only one image is in memory at its own size."""
+    names = data.frame_names(split)
+    views: list[View] = []
+    store, limit = PixelStore(0), largest or 0
+    for place, name in enumerate(names):
+        for view in data.views(split, [name]):
+            if not views:
+                limit = largest or useful_size(view.frame, len(names))
+                small = view.frame.at_most(limit)
+                store = PixelStore(len(names) * bytes_of(small), folder)
+                _say_size(str(data.path), view.frame, small, len(names))
+            views.append(replace(view, frame=store.stored(view.frame.at_most(limit))))
+        progress(place + 1, len(names))
+    return views
+
+
+def checked_side(largest: int | None) -> int | None:
+    """Return ``largest``, the columns or rows of the largest image. Raises ``InputError`` where it is no such number."""
+    if largest is not None and (isinstance(largest, bool) or not isinstance(largest, int) or largest < 1):
+        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
+    return largest
+
+
+USEFUL_SIDE, LEAST_SIDE = 1600, 800
+"""Pixels along the longer side: more are of little use to a map, whose keypoints are found at the latter; fewer harm it."""
+MOST_BYTES = 2_000_000_000
+"""Bytes that the images of a training take by default; on machines with little memory, a quarter of what is available."""
+
+
+def useful_size(frame: Frame, count: int) -> int:
+    """Return the longer side (pixels) to which ``count`` images like that of ``frame`` are reduced by default.
+
+    It is ``USEFUL_SIDE``, or less where so many images would not fit into memory, but not less than ``LEAST_SIDE``.
+    """
+    available = available_memory()
+    most = MOST_BYTES if available is None else min(MOST_BYTES, available // 4)
+    longer = max(frame.intrinsics.width, frame.intrinsics.height)
+    fitting = int(longer * (most / (count * bytes_of(frame))) ** 0.5)
+    return min(USEFUL_SIDE, max(LEAST_SIDE, fitting))
+
+
+def _say_size(place: str, frame: Frame, small: Frame, count: int) -> None:
+    if small is frame:
+        return
+    before, after = (f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (frame, small))
+    size = count * bytes_of(small) / 1e6
+    log.info(
+        f"{place}: {amount(count, 'image')} of {before} read at {after}, {size:.0f} MB; --largest (largest=) sets another size"
+    )
 
 
 def _checked(views: Sequence[View]) -> list[View]:

@@ -9,11 +9,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, poses_of_rows
+from bidnerf_core.camera.batch import CameraBatch
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.rolling_shutter import AT_REST, poses_of_rows
 from bidnerf_core.devices import moved
 from bidnerf_core.fields.contract import Rays, SceneBounds
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import SPARSE, Frame, View
+from bidnerf_core.frames.image_pixels import ImagePixels
 from bidnerf_core.geometry.se3 import SE3
 
 MEASURED_SHARE = 0.25
@@ -43,7 +46,8 @@ class RayBank:
     """All pixels of the training views, from which batches are drawn. Pixels stay in host memory; batches are on ``device``.
 
     Where an image has an alpha channel, each batch replaces its background by random colours, so that a field cannot
-    explain the background by matter of one colour (as in the code of Mueller et al. 2022).
+    explain the background by matter of one colour (as in the code of Mueller et al. 2022). The images are those of the views:
+    they are not copied where they lie in few blocks of memory, as in a ``PixelStore``.
     """
 
     def __init__(
@@ -51,32 +55,22 @@ class RayBank:
     ) -> None:
         self.bounds, self.device = bounds, torch.device(device)
         frames = [view.frame for view in views]
-        sizes = torch.tensor([frame.rgb.shape[0] * frame.rgb.shape[1] for frame in frames])
+        sizes = torch.tensor([frame.intrinsics.width * frame.intrinsics.height for frame in frames])
         self.offsets = sizes.cumsum(0) - sizes
         self.count = int(sizes.sum())
         self.has_alpha = any(frame.alpha is not None for frame in frames)
         self.has_depth = any(frame.has_depth for frame in frames)
-        self._rgb = torch.cat([frame.rgb.reshape(-1, 3) for frame in frames])
-        self._hidden = _hidden_pixels(frames)
-        if self.has_alpha:
-            one = [torch.ones(f.rgb.shape[:2]) if f.alpha is None else f.alpha for f in frames]
-            self._alpha = torch.cat([a.reshape(-1) for a in one])
-        if self.has_depth:
-            zero = [torch.zeros(f.rgb.shape[:2]) if f.depth is None else f.depth for f in frames]
-            self._depth = torch.cat([d.reshape(-1) for d in zero])
-        self._few = self._few_measured()
+        self._rgb = ImagePixels.of([frame.held_rgb for frame in frames], 3)
+        self._alpha = ImagePixels.of([frame.alpha for frame in frames], 1, default=1.0)
+        self._depth = ImagePixels.of([frame.depth for frame in frames], 1)
+        self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1)
+        self._visible = _visible_pixels(frames)
+        self._few = self._few_measured(frames)
         self._landmarks = _landmark_pixels(views, self.offsets)
         self._rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         self._origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
-        kinds = list(dict.fromkeys(frame.intrinsics for frame in frames))
-        grids = [kind.unproject(kind.pixel_centres()).reshape(-1, 3) for kind in kinds]
-        starts = torch.tensor([0, *[len(grid) for grid in grids]]).cumsum(0)
-        self._camera_rays = torch.cat(grids)  # z = 1
+        self._cameras = _PixelRays([frame.intrinsics for frame in frames])
         self._motion = _motion_of(views)
-        if self._motion is not None:
-            times = [exposure_times(kind.pixel_centres().reshape(-1, 2), kind) for kind in kinds]
-            self._exposure_times = torch.cat(times).float()
-        self._camera_start = torch.stack([starts[kinds.index(frame.intrinsics)] for frame in frames])
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return the rays of ``count`` pixels, drawn uniformly from those of all views that are not hidden.
@@ -94,13 +88,14 @@ class RayBank:
             index[:some] = self._landmarks.pixel[chosen]
             seen, deviation[:some] = self._landmarks.distance[chosen], self._landmarks.deviation[chosen]
         view = torch.searchsorted(self.offsets, index, right=True) - 1
-        ray = self._camera_rays[self._camera_start[view] + index - self.offsets[view]]
+        pixel = index - self.offsets[view]
+        ray = self._cameras.rays(view, pixel)
         length = torch.linalg.vector_norm(ray, dim=-1)
-        T = self._poses(view, index - self.offsets[view])
+        T = self._poses(view, pixel)
         directions = T.rotate(ray / length[:, None])
-        distance = self._depth[index] * length if self.has_depth else torch.zeros(count)
+        distance = self._depth.at(view, pixel)[:, 0] * length if self.has_depth else torch.zeros(count)
         distance[: len(seen)] = seen
-        rgb, background = self._coloured(index, generator)
+        rgb, background = self._coloured(view, pixel, generator)
         origins, coloured = T.translation, torch.ones(count, dtype=torch.bool)
         observed = Observations(origins, directions, rgb, distance, coloured)
         rays = self.bounds.rays(origins, directions)
@@ -108,46 +103,112 @@ class RayBank:
 
     def _visible(self, index: Int[Tensor, "r"], generator: Generator) -> Int[Tensor, "r"]:
         """Return the indices of pixels with those of hidden pixels drawn anew."""
-        if self._hidden is None:
+        if self._visible is None:
             return index
         for _ in range(REDRAWN):
-            again = self._hidden[index].nonzero()[:, 0]
+            again = self._is_hidden(index).nonzero()[:, 0]
             if not len(again):
                 return index
             index[again] = torch.randint(self.count, (len(again),), generator=generator)
-        again, left = self._hidden[index].nonzero()[:, 0], (~self._hidden).nonzero()[:, 0]
-        index[again] = left[torch.randint(len(left), (len(again),), generator=generator)]
+        again = self._is_hidden(index).nonzero()[:, 0]
+        chosen = torch.multinomial(self._visible, max(1, len(again)), replacement=True, generator=generator)
+        for place, view in zip(again.tolist(), chosen.tolist(), strict=False):
+            index[place] = self._any_visible(view, generator)
         return index
+
+    def _any_visible(self, view: int, generator: Generator) -> int:
+        """Return the index of one visible pixel of a view."""
+        first, last = int(self.offsets[view]), int((self.offsets.tolist() + [self.count])[view + 1])
+        left = (~self._is_hidden(torch.arange(first, last))).nonzero()[:, 0]
+        return first + int(left[torch.randint(len(left), (1,), generator=generator)])
+
+    def _is_hidden(self, index: Int[Tensor, "r"]) -> Bool[Tensor, "r"]:
+        view = torch.searchsorted(self.offsets, index, right=True) - 1
+        return self._hidden.at(view, index - self.offsets[view])[:, 0] > 0
 
     def _poses(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> SE3:
         """Return the poses of the cameras at the times at which pixels of the views were exposed."""
         T = SE3(self._rotation[view], self._origin[view])
         if self._motion is None:
             return T
-        return T @ poses_of_rows(self._exposure_times[self._camera_start[view] + pixel], self._motion[view])
+        return T @ poses_of_rows(self._cameras.exposure_times(view, pixel), self._motion[view])
 
-    def _few_measured(self) -> Int[Tensor, "m"]:
+    def _few_measured(self, frames: Sequence[Frame]) -> Int[Tensor, "m"]:
         """Return the indices of the pixels with depth if it is sparse (structure from motion); otherwise none."""
-        if not self.has_depth:
-            return torch.zeros(0, dtype=torch.long)
-        measured = (self._depth > 0).nonzero()[:, 0]
-        return measured if len(measured) < SPARSE * self.count else measured[:0]
+        none = torch.zeros(0, dtype=torch.long)
+        measured = sum(int((frame.depth > 0).sum()) for frame in frames if frame.depth is not None)
+        if not measured or measured >= SPARSE * self.count:
+            return none
+        parts = [
+            first + (frame.depth.reshape(-1) > 0).nonzero()[:, 0].cpu()
+            for frame, first in zip(frames, self.offsets.tolist(), strict=True)
+            if frame.depth is not None
+        ]
+        return torch.cat([none, *parts])
 
-    def _coloured(self, index: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
+    def _coloured(
+        self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"], generator: Generator
+    ) -> tuple[Tensor, Tensor]:
         """Return the pixels' colours and the background colours over which they are composited."""
-        usual = torch.tensor(self.bounds.background).expand(len(index), 3)
+        usual = torch.tensor(self.bounds.background).expand(len(view), 3)
+        rgb = self._rgb.at(view, pixel)
         if not self.has_alpha:
-            return self._rgb[index], usual
-        background = torch.rand((len(index), 3), generator=generator)
-        return self._rgb[index] + (1 - self._alpha[index])[:, None] * (background - usual), background
+            return rgb, usual
+        background = torch.rand((len(view), 3), generator=generator)
+        return rgb + (1 - self._alpha.at(view, pixel)) * (background - usual), background
 
 
-def _hidden_pixels(frames: Sequence[Frame]) -> Bool[Tensor, "n"] | None:
-    """Return which pixels of all frames are hidden; None if none is."""
+MOST_RAYS = 2**24
+"""Number of pixels, over all different cameras, whose rays are computed once; with more, those of each batch are computed."""
+
+
+class _PixelRays:
+    """The rays of the pixels of many cameras, of which most are usually equal; pixels are numbered row by row."""
+
+    def __init__(self, cameras: Sequence[Intrinsics]) -> None:
+        number = {kind: place for place, kind in enumerate(dict.fromkeys(cameras))}
+        kinds = list(number)
+        self._kind = torch.tensor([number[camera] for camera in cameras])
+        self._size = torch.tensor([[kind.width, kind.height] for kind in kinds])
+        self._batch = CameraBatch.of(kinds)
+        sizes = self._size.prod(1)
+        self._start = sizes.cumsum(0) - sizes
+        self._grid = None
+        if int(sizes.sum()) <= MOST_RAYS:
+            grids = [kind.unproject(kind.pixel_centres()).reshape(-1, 3) for kind in kinds]
+            self._grid = torch.cat(grids)
+
+    def rays(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r 3"]:
+        """Return the points on the plane z = 1 that pixels of the views' cameras show."""
+        kind = self._kind[view]
+        if self._grid is not None:
+            return self._grid[self._start[kind] + pixel]
+        return self._batch.unproject(self._centres(kind, pixel).float(), kind)
+
+    def exposure_times(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r"]:
+        """Return the times at which pixels were exposed, see ``rolling_shutter``."""
+        kind = self._kind[view]
+        size, centres = self._size[kind], self._centres(kind, pixel)
+        upright = size[:, 1] > size[:, 0]
+        along = torch.where(upright[:, None], centres / size, (centres / size).flip(1))[:, 0]
+        return (along - 0.5).float()
+
+    def _centres(self, kind: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r 2"]:
+        width = self._size[kind, 0]
+        return torch.stack([pixel % width, pixel // width], dim=-1).double() + 0.5
+
+
+def _visible_pixels(frames: Sequence[Frame]) -> Float[Tensor, "v"] | None:
+    """Return how many pixels of each frame are not hidden; None if all are visible."""
     if all(frame.hidden is None for frame in frames):
         return None
-    parts = [torch.zeros(f.rgb.shape[:2], dtype=torch.bool) if f.hidden is None else f.hidden for f in frames]
-    return torch.cat([part.reshape(-1) for part in parts])
+    counts = [
+        frame.intrinsics.width * frame.intrinsics.height
+        if frame.hidden is None
+        else int((~frame.hidden).sum())
+        for frame in frames
+    ]
+    return torch.tensor(counts, dtype=torch.float64)
 
 
 def _motion_of(views: Sequence[View]) -> Float[Tensor, "v 6"] | None:

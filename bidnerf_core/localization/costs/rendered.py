@@ -87,7 +87,7 @@ def draw_weighted_rays(
 def blurred(view: View, size: int) -> View:
     """Return the view with colours averaged over squares of ``size`` pixels and interpolated in between; depth is unchanged."""
     frame = view.frame
-    height, width = frame.rgb.shape[:2]
+    height, width = frame.held_rgb.shape[:2]
     size = min(size, height, width)
     small = avg_pool2d(continued(frame).permute(2, 0, 1)[None], size, ceil_mode=True, count_include_pad=False)
     # Enlarged to whole squares, then cut to the image, so that squares stay where they were.

@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.colours import colours_at
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import observe, visible_at
 from bidnerf_core.geometry.robust import inlier_weight
@@ -270,7 +271,7 @@ def _cloud_of_rays(
         seen = ((pixels >= 0) & (pixels < size)).all(-1)  # never where it is NaN, behind the camera
         seen[seen.clone()] = visible_at(view.frame, pixels[seen])
         columns, rows = pixels[seen].long().unbind(-1)
-        rgb[seen] = view.frame.rgb.cpu()[rows, columns].to(rgb)
+        rgb[seen] = colours_at(view.frame.held_rgb.cpu(), rows, columns).to(rgb)
         coloured |= seen
     return PointCloud(some.points, rgb, some.origins, coloured)
 

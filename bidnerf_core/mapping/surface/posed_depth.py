@@ -14,6 +14,7 @@ from torch.nn.functional import grid_sample
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.rendering import RenderedImage, render_image
+from bidnerf_core.frames.colours import colours_at
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 
@@ -93,7 +94,7 @@ def measured_image(view: View, pixels: float) -> PosedDepthImage:
     columns, rows = (small.pixel_centres() * scale).long().unbind(-1)
     depth = torch.zeros(rows.shape) if frame.depth is None else frame.depth.cpu()[rows, columns]
     depth = torch.where(depth.isfinite() & (depth > 0), depth, 0)
-    image = RenderedImage(frame.rgb.cpu()[rows, columns], depth, (depth > 0).to(depth))
+    image = RenderedImage(colours_at(frame.held_rgb.cpu(), rows, columns), depth, (depth > 0).to(depth))
     T = view.T_ref_camera.to("cpu", torch.float64)
     return PosedDepthImage(small, T, image, mean_focal(frame.intrinsics), True)
 
