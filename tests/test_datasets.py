@@ -643,10 +643,14 @@ def test_odd_pixels(nerfstudio: Callable[..., Path]) -> None:
     assert f"{folder / 'depth/r_0.png'}: depth is 8x12x3 of uint8, expected one channel" in message(folder)
 
 
-def test_cmyk_is_not_taken_for_alpha(nerfstudio: Callable[..., Path]) -> None:
+def test_cmyk_becomes_rgb_and_is_not_taken_for_alpha(nerfstudio: Callable[..., Path]) -> None:
     folder = nerfstudio(edit_frame(0, file_path="images/a.jpg"))
-    Image.new("CMYK", (W, H)).save(folder / "images/a.jpg")
-    assert f"{folder / 'images/a.jpg'}: image is CMYK, expected grey, RGB or RGBA" in message(folder)
+    Image.new("CMYK", (W, H), (0, 255, 0, 0)).save(folder / "images/a.jpg")
+    frames = {view.frame.name: view.frame for view in read_all(folder)}
+    assert frames["a"].alpha is None
+    torch.testing.assert_close(
+        frames["a"].rgb, torch.tensor([1.0, 0.0, 1.0]).expand(H, W, 3), atol=0.02, rtol=0
+    )
 
 
 def test_background_is_known_though_the_first_image_is_missing(blender: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
@@ -19,18 +19,24 @@ LEAST_GROUP = 3
 """Least number of linked photos that make a group."""
 
 
-def linked(seen: TrackedKeypoints) -> Bool[Tensor, "v v"]:
-    """Return which images share enough landmarks. ``seen`` are the keypoints that agree on their points."""
+def linked(seen: TrackedKeypoints) -> csr_array:
+    """Return the pairs of images that share enough landmarks, in both directions, as a sparse matrix (v, v).
+
+    ``seen`` are the keypoints that agree on their points.
+    """
     shape = (len(seen.images), max(1, seen.count))
     ones = np.ones(len(seen.point), np.int32)
     shows = csr_array((ones, (seen.image.numpy(), seen.point.numpy())), shape=shape)
-    shared = torch.from_numpy((shows @ shows.T).toarray())
-    return (shared >= LINK).fill_diagonal_(False)
+    shared = (shows @ shows.T).tocoo()
+    row, column = shared.coords
+    enough = (shared.data >= LINK) & (row != column)
+    links = np.ones(int(enough.sum()), bool), (row[enough], column[enough])
+    return csr_array(links, shape=(len(seen.images),) * 2)
 
 
-def groups(links: Bool[Tensor, "v v"]) -> Int[Tensor, "v"]:
+def groups(links: csr_array) -> Int[Tensor, "v"]:
     """Return the group of each image, 0 for the largest; -1 where too few images are linked to make one."""
-    _, found = connected_components(csr_array(links.numpy()), directed=False)
+    _, found = connected_components(links, directed=False)
     label = torch.from_numpy(found).long()
     sizes = torch.bincount(label)
     rank = sizes.argsort(descending=True, stable=True).argsort()

@@ -137,23 +137,42 @@ def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     return image
 
 
-def nearby(views: Sequence[View]) -> Bool[Tensor, "v v"]:
+@dataclass(frozen=True, eq=False)
+class Nearby:
+    """Which photos were taken from nearby places in similar directions, as pairs in both directions, each once."""
+
+    count: int  # of photos
+    photo: Int[Tensor, "p"]
+    other: Int[Tensor, "p"]
+
+    def __getitem__(self, kept: Bool[Tensor, "p"]) -> Nearby:
+        return Nearby(self.count, self.photo[kept], self.other[kept])
+
+    def within(self, group: Int[Tensor, "v"]) -> Nearby:
+        """Return the pairs of the same group; for photos without one, all of their pairs."""
+        same = group[self.photo] == group[self.other]
+        alone = torch.bincount(self.photo[same], minlength=self.count) == 0
+        return self[same | alone[self.photo]]
+
+    def medians(self, values: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """Return the lower median of the values of the photos near each photo; NaN where there are none."""
+        there = torch.bincount(self.photo, minlength=self.count) > 0
+        return torch.where(there, _medians(values[self.other], self.photo, self.count), torch.nan)
+
+
+def nearby(views: Sequence[View]) -> Nearby:
     """Return which photos were taken from nearby places in similar directions."""
-    near = torch.zeros((len(views), len(views)), dtype=torch.bool)
-    if len(views) > 1:
-        i, j = likely_pairs(views, NEIGHBOURS).unbind(-1)
-        near[i, j] = near[j, i] = True
-    return near
+    i, j = likely_pairs(views, NEIGHBOURS).unbind(-1) if len(views) > 1 else torch.zeros(2, 0).long()
+    return Nearby(len(views), torch.cat([i, j]), torch.cat([j, i]))
 
 
-def above_neighbours(values: Float[Tensor, "v"], near: Bool[Tensor, "v v"]) -> Float[Tensor, "v"]:
+def above_neighbours(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
     """Return by how much each value exceeds the median of those nearby; 0 where there are none."""
-    around = torch.where(near, values, torch.nan).nanmedian(dim=1).values if len(values) else values
-    return (values - around).nan_to_num(0.0)
+    return (values - near.medians(values)).nan_to_num(0.0)
 
 
 def exposures(
-    views: Sequence[View], seen: TrackedKeypoints, brightness: Float[Tensor, "v"], near: Bool[Tensor, "v v"]
+    views: Sequence[View], seen: TrackedKeypoints, brightness: Float[Tensor, "v"], near: Nearby
 ) -> Float[Tensor, "v"]:
     """Return the exposure of each photo (stops) relative to the median of all.
 
@@ -170,8 +189,8 @@ def exposures(
         found = torch.where(enough, of_images, 0.0)
         found = found - found[enough].median() if bool(enough.any()) else found
     own = brightness - found
-    compared = near & enough if bool(enough.any()) else near
-    around = torch.where(compared, own, torch.nan).nanmedian(dim=1).values
+    compared = near[enough[near.other]] if bool(enough.any()) else near
+    around = compared.medians(own)
     everywhere = own[enough].median() if bool(enough.any()) else brightness.median()
     whole = brightness - around.nan_to_num(float(everywhere))
     return torch.where(enough, found, whole)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.captures.coverage import coverage
 from bidnerf_core.captures.links import groups, linked
 from bidnerf_core.captures.photos import (
     LEAST_BLUR,
+    Nearby,
     PhotoMeasures,
     above_neighbours,
     exposures,
@@ -53,7 +54,7 @@ def surveyed(
     seen, positions = tracked.triangulated(config)
     links, measures = linked(seen), photo_measures(views)
     group = groups(links)
-    near = _comparable(nearby(views), group)
+    near = nearby(views).within(group)
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, count, group)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
@@ -67,18 +68,12 @@ def surveyed(
         record = PhotoRecord(
             view.frame.name, _three(view.T_ref_camera.translation), _three(view.T_ref_camera.rotation[:, 2]),
             float(sharpness[i]), float(exposure[i]), float(measures.overexposed[i]), float(measures.underexposed[i]),
-            len(image.keypoints), int(count[i]), int(links[i].sum()), int(group[i]), problems=problems[i],
+            len(image.keypoints), int(count[i]), int(links.indptr[i + 1] - links.indptr[i]), int(group[i]), problems=problems[i],
         )  # fmt: skip
         photos.append(found.onto(record) if found else record)
     spread = exposure.quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
     covered = coverage(_sound(views, problems), tracked.matched, seen, config.parallax)
     return CaptureReport(tuple(photos), covered, trial, float(spread[1] - spread[0]))
-
-
-def _comparable(near: Bool[Tensor, "v v"], group: Int[Tensor, "v"]) -> Bool[Tensor, "v v"]:
-    """Return which nearby photos also belong to the same group; all that are nearby where none does."""
-    same = near & (group[:, None] == group)
-    return torch.where(same.any(dim=1, keepdim=True), same, near)
 
 
 def _sound(views: Sequence[View], problems: Sequence[tuple[PhotoProblem, ...]]) -> Sequence[View]:
@@ -114,7 +109,7 @@ def _by_own_landmarks(
 def _problems(
     measures: PhotoMeasures,
     exposure: Float[Tensor, "v"],
-    near: Bool[Tensor, "v v"],
+    near: Nearby,
     group: Int[Tensor, "v"],
     posed: Mapping[int, Relocation | None],
 ) -> list[tuple[PhotoProblem, ...]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -41,9 +41,8 @@ def likely_pairs_of_poses(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, 
     Half of the neighbours are those with the most similar poses. The others are spread over the next ones, every third,
     because successive images of a video have too little baseline for triangulation.
     """
-    order = _dissimilarity(poses).argsort(dim=1, stable=True)
-    ranks = _ranks(neighbours, len(poses) - 1)
-    chosen = order[:, ranks]
+    ranks = torch.tensor(_ranks(neighbours, len(poses) - 1), dtype=torch.long)
+    chosen = torch.cat([order[:, ranks] for order in _by_similarity(poses)])
     own = torch.arange(len(poses))[:, None].expand_as(chosen)
     pairs = torch.stack([own.minimum(chosen), own.maximum(chosen)], dim=-1).reshape(-1, 2)
     return pairs.unique(dim=0)
@@ -56,16 +55,24 @@ def _ranks(count: int, others: int) -> list[int]:
     return [rank for rank in ranks if rank < others] or list(range(others))
 
 
-def _dissimilarity(poses: Sequence[SE3]) -> Float[Tensor, "v v"]:
-    """Return how dissimilar two poses are: relative distance of the centres plus 1 - cosine between the optical axes.
+ROWS = 1024
+"""Views whose dissimilarity to all others is computed at a time: no matrix of all pairs is ever in memory."""
 
-    It is infinite between a view and itself.
+
+def _by_similarity(poses: Sequence[SE3]) -> Iterator[Int[Tensor, "r v"]]:
+    """Yield, for some views after others, the order of all views from the most similar pose to the least.
+
+    The dissimilarity is the distance of the centres relative to the mean of all, plus 1 - cosine between the optical axes;
+    a view itself comes last.
     """
     centres = torch.stack([pose.translation.cpu().double() for pose in poses])
     axes = torch.stack([pose.rotation[:, 2].cpu().double() for pose in poses])
-    away = torch.cdist(centres, centres)
-    unlike = away / away.mean().clamp(min=1e-12) + 1 - axes @ axes.T
-    return unlike.fill_diagonal_(torch.inf)
+    blocks = torch.arange(len(poses)).split(ROWS)
+    usual = sum(float(torch.cdist(centres[own], centres).sum()) for own in blocks) / len(poses) ** 2
+    for own in blocks:
+        unlike = torch.cdist(centres[own], centres) / max(usual, 1e-12) + 1 - axes[own] @ axes.T
+        unlike[torch.arange(len(own)), own] = torch.inf
+        yield unlike.argsort(dim=1, stable=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,14 +155,20 @@ def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[i
         [np.zeros((0, 2), np.int64)] + [m.pairs.numpy() + first[[i, j]] for i, j, m in matches]
     )
     ambiguity = np.concatenate([np.zeros(0)] + [m.ambiguity.numpy() for _, _, m in matches])
-    parent = list(range(first[-1]))
-    images = [{image} for image, size in enumerate(sizes) for _ in range(size)]
+    # Most keypoints match no other: only those that do are joined.
+    matched, ends = np.unique(ends, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    image = np.searchsorted(first, matched, side="right") - 1
+    parent, images = list(range(len(matched))), [{number} for number in image.tolist()]
     for a, b in ends[np.argsort(ambiguity, kind="stable")].tolist():
         small, large = sorted((_root(parent, a), _root(parent, b)), key=lambda root: len(images[root]))
         if small != large and images[small].isdisjoint(images[large]):
             parent[small] = large
             images[large] |= images[small]
-    return torch.tensor([_root(parent, number) for number in range(first[-1])], dtype=torch.long)
+            images[small] = images[large]
+    label = np.arange(first[-1])
+    label[matched] = matched[[_root(parent, number) for number in range(len(matched))]]
+    return torch.from_numpy(label)
 
 
 def _root(parent: list[int], number: int) -> int:
