@@ -20,6 +20,7 @@ from jaxtyping import UInt8
 from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.datasets.sequence import TimedFrame
 from bidnerf_core.errors import InputError
+from bidnerf_core.frames.colours import as_floats
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.io.files import open_binary
 from bidnerf_core.io.images import LARGEST_IMAGE, reason
@@ -27,6 +28,8 @@ from bidnerf_core.io.images import LARGEST_IMAGE, reason
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
 MICROSECONDS = 1_000_000
 """The unit in which a file states its start, per second."""
+BT_2020 = 9
+"""The matrix from luma and chroma to colours (ITU-T H.273) that stands in for those that FFmpeg lacks."""
 OPTIONS = {"protocol_whitelist": "file"}
 """A playlist that is called a video must not open connections."""
 
@@ -64,7 +67,7 @@ class Video:
             raise self._broken(0, ValueError("no frame could be decoded"))
 
     def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
-        rgb = torch.from_numpy(pixels.astype(np.float32) / 255)
+        rgb = as_floats(torch.from_numpy(pixels))  # at once, as a tracker reads them often
         found = self.camera.find(self.path, Raster(pixels.shape[1], pixels.shape[0]))
         return Frame(
             f"{number:06d}", rgb, found.intrinsics, camera_source=found.description,
@@ -131,5 +134,10 @@ def _time(container: Any, picture: Any) -> float:
 
 
 def _upright(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
-    pixels: np.ndarray = picture.to_ndarray(format="rgb24")
+    """Return the pixels of a picture, of any bit depth; colours of HDR are as they are coded, without tone mapping."""
+    try:
+        pixels: np.ndarray = picture.to_ndarray(format="rgb24")
+    except OSError:  # FFmpeg does not convert from the colour space that the file names, such as BT.2020 of constant luminance
+        picture.colorspace = BT_2020
+        pixels = picture.to_ndarray(format="rgb24")
     return np.ascontiguousarray(np.rot90(pixels, round(picture.rotation / 90)))
