@@ -13,7 +13,7 @@ from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.dataset import ReadingProgress
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import BLACK, Frame, View
-from bidnerf_core.frames.masks import INVERTED, masks_sentence
+from bidnerf_core.frames.masks import INVERTED, WhollyHidden, masks_sentence
 from bidnerf_core.frames.pixel_store import PixelStore, bytes_of
 from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.memory import available_memory
@@ -97,7 +97,7 @@ def _read(
     views: list[View] = []
     store, limit = PixelStore(0), largest or 0
     for place, name in enumerate(names):
-        for view in data.views(split, [name]):
+        for view in _one(data, split, name):
             if not views:
                 limit = largest or useful_size(view.frame, len(names))
                 small = view.frame.at_most(limit)
@@ -106,6 +106,14 @@ def _read(
             views.append(replace(view, frame=store.stored(view.frame.at_most(limit))))
         progress(place + 1, len(names))
     return views
+
+
+def _one(data: Dataset, split: str, name: str) -> list[View]:
+    """Read a frame; none where a mask hides all of it, as when a whole split is read."""
+    try:
+        return data.views(split, [name])
+    except WhollyHidden:
+        return []
 
 
 def checked_side(largest: int | None) -> int | None:

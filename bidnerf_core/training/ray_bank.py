@@ -64,7 +64,7 @@ class RayBank:
         self._alpha = ImagePixels.of([frame.alpha for frame in frames], 1, default=1.0)
         self._depth = ImagePixels.of([frame.depth for frame in frames], 1)
         self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1)
-        self._visible = _visible_pixels(frames)
+        self._visible_counts = _visible_pixels(frames)
         self._few = self._few_measured(frames)
         self._landmarks = _landmark_pixels(views, self.offsets)
         self._rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
@@ -103,7 +103,7 @@ class RayBank:
 
     def _visible(self, index: Int[Tensor, "r"], generator: Generator) -> Int[Tensor, "r"]:
         """Return the indices of pixels with those of hidden pixels drawn anew."""
-        if self._visible is None:
+        if self._visible_counts is None:
             return index
         for _ in range(REDRAWN):
             again = self._is_hidden(index).nonzero()[:, 0]
@@ -111,14 +111,16 @@ class RayBank:
                 return index
             index[again] = torch.randint(self.count, (len(again),), generator=generator)
         again = self._is_hidden(index).nonzero()[:, 0]
-        chosen = torch.multinomial(self._visible, max(1, len(again)), replacement=True, generator=generator)
+        chosen = torch.multinomial(
+            self._visible_counts, max(1, len(again)), replacement=True, generator=generator
+        )
         for place, view in zip(again.tolist(), chosen.tolist(), strict=False):
             index[place] = self._any_visible(view, generator)
         return index
 
     def _any_visible(self, view: int, generator: Generator) -> int:
         """Return the index of one visible pixel of a view."""
-        first, last = int(self.offsets[view]), int((self.offsets.tolist() + [self.count])[view + 1])
+        first, last = [*self.offsets.tolist(), self.count][view : view + 2]
         left = (~self._is_hidden(torch.arange(first, last))).nonzero()[:, 0]
         return first + int(left[torch.randint(len(left), (1,), generator=generator)])
 
