@@ -15,8 +15,8 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, LandmarkMatcher, LandmarkPose, propose, rig
 from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.landmarks.consensus import Candidate
 from bidnerf_core.localization.landmarks.far_cameras import UNSUSPECTED, camera_fit
-from bidnerf_core.localization.search.ransac import Hypothesis
 from bidnerf_core.mapping import Calibration, ObservedPoints, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.results.errors import pose_error
@@ -55,7 +55,7 @@ def agreeing(data: ObservedPoints, T: SE3) -> int:
     return int((torch.linalg.vector_norm(data.residuals(T), dim=-1) <= LIMIT).sum())
 
 
-def fitted(data: ObservedPoints, start: SE3 = TRUTH) -> Hypothesis:
+def fitted(data: ObservedPoints, start: SE3 = TRUTH) -> Candidate:
     found = camera_fit(data, start, GIVEN, LIMIT)
     assert found is not None
     return found

@@ -9,7 +9,7 @@ from torch import Generator
 
 import baked
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.search.hypotheses import (
+from bidnerf_core.localization.search.starts import (
     _without_repetition,
     hypotheses_for_points,
     neighbours,

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3
-from bidnerf_core.localization.search.correspondences import query_images
-from bidnerf_core.localization.search.guided import guided_matches
+from bidnerf_core.localization.landmarks.correspondences import query_images
+from bidnerf_core.localization.landmarks.guided import guided_matches
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.mapping.landmarks import landmark_map
 from bidnerf_core.mapping.landmarks.building import build_landmarks

@@ -10,7 +10,7 @@ import torch
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.search.chance import log10_nfa
+from bidnerf_core.localization.landmarks.chance import log10_nfa
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import NOMINAL
 from bidnerf_core.mapping.landmarks.features import squared_distances

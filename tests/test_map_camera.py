@@ -12,6 +12,7 @@ import torch
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, Outcome, propose
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.hypotheses import STATED, Whose
 from bidnerf_core.localization.landmarks.map_camera import (
     SAME_CAMERA,
@@ -20,8 +21,7 @@ from bidnerf_core.localization.landmarks.map_camera import (
     map_cameras,
 )
 from bidnerf_core.localization.landmarks.propose import updated
-from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.unguided import unguided_matches
+from bidnerf_core.localization.landmarks.unguided import unguided_matches
 from bidnerf_core.mapping import Calibration, LandmarkMap, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL
 from landmark_scene import PINHOLE, Points, looking_in, ring

@@ -25,7 +25,7 @@ from bidnerf_core.frames.pixels import DrawerName, drawer
 from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.costs.images import thumbnail
 from bidnerf_core.localization.costs.rendered import blurred
-from bidnerf_core.localization.search.correspondences import query_images
+from bidnerf_core.localization.landmarks.correspondences import query_images
 from bidnerf_core.mapping import tracked_views
 from bidnerf_core.mapping.landmarks.features import SIFT
 from bidnerf_core.maps.rendering import rendering_scores

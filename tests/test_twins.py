@@ -21,7 +21,7 @@ from bidnerf_core.localization import (
     rig,
 )
 from bidnerf_core.localization.alternatives import Decision, decide
-from bidnerf_core.localization.search.chance import log_odds_of_share
+from bidnerf_core.localization.landmarks.chance import log_odds_of_share
 from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.results.errors import pose_error

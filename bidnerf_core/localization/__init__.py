@@ -7,14 +7,14 @@ from bidnerf_core.localization.costs.rendered import RayCounts, RenderedCost, Re
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.first_order import BidConfig, InerfConfig
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm, propose
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.methods import METHODS, Method, find_method, settings_of
 from bidnerf_core.localization.normal_equations import Cost, NormalEquations, Scaled, Sum
 from bidnerf_core.localization.problem import Problem, SceneMap, rig, window
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.second_order import BidLmConfig, InerfLmConfig
 from bidnerf_core.localization.settings import (
     AdamSettings,

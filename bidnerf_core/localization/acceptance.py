@@ -16,7 +16,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import RenderedThresholds

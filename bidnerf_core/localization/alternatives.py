@@ -23,14 +23,14 @@ from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.depth_scale import corrected
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose, Rival
+from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.mirrored import mirror_evidence, mirror_image
+from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.propose import confirm, propose
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.chance import DECISIVE, log_odds_of_share
-from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import mirror_evidence, mirror_image
 from bidnerf_core.localization.settings import ColourSettings, RefinementSettings, RefinementStage
 from bidnerf_core.localization.solvers.pivots import pivot
 

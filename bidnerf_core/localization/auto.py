@@ -37,12 +37,12 @@ from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import corrected
 from bidnerf_core.localization.first_order import BidConfig, bid
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm
 from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
 

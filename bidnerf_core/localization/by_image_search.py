@@ -26,7 +26,7 @@ from bidnerf_core.localization.search.by_images import (
     ImageStage,
 )
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
+from bidnerf_core.localization.search.starts import Surroundings, hypotheses_for_images
 from bidnerf_core.localization.settings import AutoConfig, ByColourConfig
 from bidnerf_core.mapping import SurfaceMap
 

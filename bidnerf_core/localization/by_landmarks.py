@@ -34,11 +34,11 @@ from bidnerf_core.localization.fusion import (
     nearby_start,
 )
 from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import propose, updated
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.mapping import SurfaceMap
 

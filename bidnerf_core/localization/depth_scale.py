@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.depth.sensors import DepthSensorModel
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import SurfaceCost
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.solvers.pivots import Pivot

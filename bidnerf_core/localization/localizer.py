@@ -21,10 +21,10 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.io.json import LARGEST_INTEGER
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
 from bidnerf_core.localization.problem import Problem, SceneMap, on_device, rig
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.settings import ByColourConfig
 
 WARM_UP_RAYS = 64

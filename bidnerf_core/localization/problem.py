@@ -17,7 +17,7 @@ from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, 
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 

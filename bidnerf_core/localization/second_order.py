@@ -16,7 +16,7 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import refine
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
-from bidnerf_core.localization.search.hypotheses import neighbours
+from bidnerf_core.localization.search.starts import neighbours
 from bidnerf_core.localization.settings import (
     ByColourConfig,
     ColourRefinementSettings,

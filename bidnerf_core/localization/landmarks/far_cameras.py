@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Bool
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.guided_refinement import LEAST_GUIDED_MATCHES, refined_pose
-from bidnerf_core.localization.landmarks.landmark_evidence import described
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
-from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
+from bidnerf_core.localization.landmarks.consensus import Candidate, focal_consensus, sample_consensus
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.evidence import described
 from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
-from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
+from bidnerf_core.localization.landmarks.refinement import LEAST_GUIDED_MATCHES, refined_pose
 from bidnerf_core.mapping.geometry.calibration import ANY, FIXED, STRETCHED, Calibration
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.reprojection import SCALE, ReprojectionErrors, State
@@ -64,7 +64,7 @@ def with_far_camera(query: LandmarkQuery, matches: LandmarkMatches, found: Landm
     return found if better is None else replace(found, better_camera=better.calibration)
 
 
-def better_camera(query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose) -> Hypothesis | None:
+def better_camera(query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose) -> Candidate | None:
     """Return a pose and a correction of the intrinsics with which far more matches agree than with a pose that was found, or None.
 
     Nothing is sought where most matches agree with that pose already, or, if its intrinsics were estimated, all of them.
@@ -85,7 +85,7 @@ def camera_fit(
     calibration: Calibration,
     limit: float,
     unsuspected: float = UNSUSPECTED,
-) -> Hypothesis | None:
+) -> Candidate | None:
     """Return the fit of a camera with which far more matches agree than with the one that was found; None if there is none.
 
     ``data`` are matches by descriptors alone; a match agrees if its residual is within ``limit`` (pixels). The camera that was
@@ -109,7 +109,7 @@ def camera_fit(
         )
         fits.append(_fitted(data, rough.state, limit, FIT_SCALES[1:]))
     best = max(fits, key=lambda fit: fit.support)
-    return best.hypothesis if best.support >= enough else None
+    return best.candidate if best.support >= enough else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +127,8 @@ class _Fit:
         return _Fit(state, off <= 1, float((1 - off**2).clip(min=0).sum()))
 
     @property
-    def hypothesis(self) -> Hypothesis:
-        return Hypothesis(self.state.pose(), torch.from_numpy(self.inliers), 0, self.state.calibration)
+    def candidate(self) -> Candidate:
+        return Candidate(self.state.pose(), torch.from_numpy(self.inliers), 0, self.state.calibration)
 
 
 def _fitted(data: ObservedPoints, start: State, limit: float, scales: Sequence[float]) -> _Fit:
@@ -167,7 +167,7 @@ def _with_map_camera(
 ) -> LandmarkPose | None:
     """Return the pose by minimal samples with one of the map's cameras; None unless far more matches agree with it."""
     enough = SUPPORT_RATIO * found.agreeing + MIN_EXTRA_INLIERS
-    sampled: list[tuple[MapCamera, Hypothesis]] = []
+    sampled: list[tuple[MapCamera, Candidate]] = []
     for camera in map_cameras(query.images[-1].intrinsics, query.landmarks.cameras, crops=True):
         data = query.seen_by([camera.intrinsics] * len(query.images)).observed(matches)
         first = sample_consensus(data, matches.view, query.threshold, seed=0)

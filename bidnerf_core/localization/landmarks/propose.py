@@ -10,21 +10,21 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.consensus import Candidate, focal_consensus, sample_consensus
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, query_images
+from bidnerf_core.localization.landmarks.evidence import described, log10_agreement
 from bidnerf_core.localization.landmarks.far_cameras import better_camera, with_far_camera
-from bidnerf_core.localization.landmarks.guided_refinement import (
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
+from bidnerf_core.localization.landmarks.refinement import (
     agreeing_with,
     confirmed,
     refined_pose,
     visible_and_matching,
 )
-from bidnerf_core.localization.landmarks.landmark_evidence import described, log10_agreement
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
-from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
-from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
-from bidnerf_core.localization.search.twins import second_of_plane, twin_of
-from bidnerf_core.localization.search.unguided import unguided_matches
+from bidnerf_core.localization.landmarks.twins import second_of_plane, twin_of
+from bidnerf_core.localization.landmarks.unguided import unguided_matches
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.landmarks.features import Features
 
@@ -147,7 +147,7 @@ def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:
 
 def _first_pose(
     query: LandmarkQuery, matcher: LandmarkMatcher, seed: int
-) -> tuple[LandmarkMatches, Hypothesis | None]:
+) -> tuple[LandmarkMatches, Candidate | None]:
     """Match the strongest keypoints, then all if those do not give a convincing pose."""
     most = max(len(image.keypoints) for image in query.images)
     for count in (min(STRONGEST, most), most):
@@ -159,7 +159,7 @@ def _first_pose(
     return matches, found
 
 
-def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Hypothesis | None:
+def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Candidate | None:
     data = query.observed(matches)
     found = sample_consensus(data, matches.view, query.threshold, seed)
     if query.prior.log_focal > APPROXIMATE:
@@ -171,7 +171,7 @@ def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Hyp
     return found
 
 
-def _map_camera_consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> list[Hypothesis]:
+def _map_camera_consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> list[Candidate]:
     """Return the hypotheses that most matches agree with if one of the map's cameras took the images, as far as that is probable.
 
     With a known focal length, three correct matches make a hypothesis instead of four, and far more are tried in the same time.

@@ -14,7 +14,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import FINEST
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
-from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_points
+from bidnerf_core.localization.search.starts import Surroundings, hypotheses_for_points
 from bidnerf_core.mapping import SurfaceMap
 
 JUDGED = 0.02

@@ -19,8 +19,8 @@ from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_ve
 from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, refine_by_colour
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale
-from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
-from bidnerf_core.localization.landmarks.landmark_query import pixel_threshold
+from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.query import pixel_threshold
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult

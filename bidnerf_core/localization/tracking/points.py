@@ -15,6 +15,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times, transposed_exposure_times
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.consensus import sample_consensus
 from bidnerf_core.localization.landmarks.hypotheses import (
     Hypothesis,
     Motion,
@@ -23,7 +24,6 @@ from bidnerf_core.localization.landmarks.hypotheses import (
     posterior,
     share_moving,
 )
-from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect

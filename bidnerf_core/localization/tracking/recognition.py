@@ -18,21 +18,21 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.pixels import visible_at
 from bidnerf_core.geometry.independent import CORNERS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.guided_refinement import RADII, matches_by_chance, usual_distance
-from bidnerf_core.localization.landmarks.landmark_evidence import (
+from bidnerf_core.localization.landmarks.chance import log10_nfa
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, query_image
+from bidnerf_core.localization.landmarks.evidence import (
     cell_numbers,
     depth_scale,
     median_distance,
     probability_within,
     share_of_cells,
 )
-from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
-from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery, pixel_threshold
-from bidnerf_core.localization.search.chance import log10_nfa
-from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
-from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches, projected_landmarks
-from bidnerf_core.localization.search.matching import EXHAUSTIVE, LandmarkMatcher
-from bidnerf_core.localization.search.unguided import unguided_matches
+from bidnerf_core.localization.landmarks.guided import OBLIQUE, guided_matches, projected_landmarks
+from bidnerf_core.localization.landmarks.matching import EXHAUSTIVE, LandmarkMatcher
+from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.query import LandmarkQuery, pixel_threshold
+from bidnerf_core.localization.landmarks.refinement import RADII, matches_by_chance, usual_distance
+from bidnerf_core.localization.landmarks.unguided import unguided_matches
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion

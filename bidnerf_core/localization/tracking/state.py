@@ -20,7 +20,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, parse_json, to_plain
 from bidnerf_core.io.tensors import read_tensors_and_metadata
-from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt
+from bidnerf_core.localization.landmarks.pose import CameraDoubt
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Clock, Motion

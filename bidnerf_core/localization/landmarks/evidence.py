@@ -10,12 +10,12 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.guided_refinement import GuidedPose
+from bidnerf_core.localization.landmarks.chance import log10_nfa
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.hypotheses import Whose
-from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
-from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.chance import log10_nfa
-from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
+from bidnerf_core.localization.landmarks.refinement import GuidedPose
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 LEAST_DEPTHS = 6

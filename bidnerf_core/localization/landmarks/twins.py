@@ -13,15 +13,15 @@ from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.beyond_chance import log_odds
-from bidnerf_core.localization.landmarks.guided_refinement import LEAST_GUIDED_MATCHES, RADII, confirmed
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose, Rival
-from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.chance import DECISIVE, log_odds_of_share
-from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.planar_pose import second_pose
-from bidnerf_core.localization.search.ransac import sample_consensus
-from bidnerf_core.localization.search.unguided import LOOKED_UP
+from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share
+from bidnerf_core.localization.landmarks.consensus import sample_consensus
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.planar_pose import second_pose
+from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
+from bidnerf_core.localization.landmarks.refinement import LEAST_GUIDED_MATCHES, RADII, confirmed
+from bidnerf_core.localization.landmarks.unguided import LOOKED_UP
 from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 LOOKED_UP = 4

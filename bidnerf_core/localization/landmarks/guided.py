@@ -14,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, moved_points
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage
 from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.landmarks.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap

@@ -29,7 +29,7 @@ FOCAL_RANGE = (0.2, 5.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class Candidate:
     """A pose and the correspondences that agree with it."""
 
     T_world_rig: SE3
@@ -40,7 +40,7 @@ class Hypothesis:
 
 def sample_consensus(
     data: ObservedPoints, view: Int[Tensor, "m"], threshold: float, seed: int
-) -> Hypothesis | None:
+) -> Candidate | None:
     """Return the pose with the most inliers within ``threshold`` pixels; None if there are too few matches or no solution.
 
     The matches in ``data`` must be ordered from the most to the least reliable. For a rig, each camera is also tried alone,
@@ -54,9 +54,9 @@ def sample_consensus(
     return max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)
 
 
-def _judged(data: ObservedPoints, T: SE3, threshold: float, draws: int) -> Hypothesis:
+def _judged(data: ObservedPoints, T: SE3, threshold: float, draws: int) -> Candidate:
     within = torch.linalg.vector_norm(data.residuals(T), dim=-1) <= threshold
-    return Hypothesis(T, within, draws)
+    return Candidate(T, within, draws)
 
 
 def _options(threshold: float, seed: int) -> dict[str, object]:
@@ -100,7 +100,7 @@ def _generalized(
 
 def focal_consensus(
     data: ObservedPoints, threshold: float, seed: int, most_draws: int = MOST_DRAWS_WITH_FOCAL
-) -> Hypothesis | None:
+) -> Candidate | None:
     """Return the pose and focal length of one camera with the most inliers within ``threshold`` pixels, or None.
 
     The matches in ``data`` must be ordered from the most to the least reliable. The focal length is searched within
@@ -127,7 +127,7 @@ def focal_consensus(
         return None
     T_camera_rig = SE3(data.rotation[0], data.translation[0])
     T = _transform(best[0]).inverse() @ T_camera_rig
-    return Hypothesis(T, torch.from_numpy(best[2]), draws, Calibration(log_focal=math.log(best[1])))
+    return Candidate(T, torch.from_numpy(best[2]), draws, Calibration(log_focal=math.log(best[1])))
 
 
 def _projected(pose: poselib.CameraPose, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 2"]:

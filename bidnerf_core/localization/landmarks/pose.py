@@ -11,9 +11,9 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.covariance import position_deviation
-from bidnerf_core.localization.landmarks.guided_refinement import GuidedPose
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED, Posterior, Whose
-from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.refinement import GuidedPose
 from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 
 ESTIMATED_INFLATION = 3.0

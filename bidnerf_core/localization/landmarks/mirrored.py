@@ -6,12 +6,12 @@ from dataclasses import replace
 
 from bidnerf_core.camera.orientation import Orientation
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.localization.landmarks.landmark_evidence import log10_agreement
-from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.correspondences import query_images
-from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.ransac import sample_consensus
-from bidnerf_core.localization.search.unguided import unguided_matches
+from bidnerf_core.localization.landmarks.consensus import sample_consensus
+from bidnerf_core.localization.landmarks.correspondences import query_images
+from bidnerf_core.localization.landmarks.evidence import log10_agreement
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
+from bidnerf_core.localization.landmarks.unguided import unguided_matches
 from bidnerf_core.mapping.geometry.calibration import FIXED
 
 KEYPOINTS = 700

@@ -11,9 +11,9 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage, observed_points
 from bidnerf_core.localization.landmarks.hypotheses import STATED, Hypothesis, camera_hypotheses
 from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
-from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
 from bidnerf_core.mapping.geometry.calibration import FIXED, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.landmarks.features import paired_squared_distances

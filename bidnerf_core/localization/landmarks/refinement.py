@@ -11,6 +11,9 @@ from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.consensus import Candidate
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.guided import ProjectedLandmarks, guided_matches, projected_landmarks
 from bidnerf_core.localization.landmarks.hypotheses import (
     Explanation,
     Motion,
@@ -19,10 +22,7 @@ from bidnerf_core.localization.landmarks.hypotheses import (
     posterior,
     share_moving,
 )
-from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.guided import ProjectedLandmarks, guided_matches, projected_landmarks
-from bidnerf_core.localization.search.ransac import Hypothesis
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
@@ -76,7 +76,7 @@ class GuidedPose:
         return _explained(replace(self, posterior=self.posterior.updated(log_odds)), log_odds)
 
 
-def refined_pose(query: LandmarkQuery, matches: LandmarkMatches, first: Hypothesis) -> GuidedPose:
+def refined_pose(query: LandmarkQuery, matches: LandmarkMatches, first: Candidate) -> GuidedPose:
     """Refine the pose on its inliers, then on guided matches within shrinking radii until they no longer change."""
     inliers = matches[first.inliers]
     correlation = query.landmarks.correlation_of(len(inliers))

@@ -1,3 +1,0 @@
-"""Where an environment that was installed before the last change of entry points looks for a method."""
-
-from bidnerf_core.localization.second_order import INERF_LM as INERF_LM
