@@ -48,24 +48,19 @@ class ReprojectionFit:
     # Of the right update (translation, rotation), with the uncertainty of the calibration and of the motion.
     covariance: Float[Tensor, "6 6"]
     calibration_deviations: Float[Tensor, "5"]  # standard deviations, in the order of ``Calibration``
-    minimum: Minimum
+    system: RobustEquations  # at the minimum
+    first_of_motion: int  # number of the first unknown that belongs to the motion
 
     @cached_property
     def covariance_by_motion(self) -> Float[Tensor, "6 6"]:
         """The part of the pose's covariance due to the motion, to which the other unknowns adapt."""
-        minimum = self.minimum
-        return torch.from_numpy(minimum.system.covariance_by_last(minimum.first_of_motion))
+        return torch.from_numpy(self.system.covariance_by_last(self.first_of_motion))
 
     @cached_property
     def motion_posterior(self) -> Float[Tensor, "k k"]:
         """The covariance of the motion, from the curvature of the cost; 0x0 for a camera at rest."""
-        first = self.minimum.first_of_motion
-        return torch.from_numpy(self.minimum.system.inverse_curvature[first:, first:].copy())
-
-    @cached_property
-    def slope(self) -> Float[Tensor, "6 5"]:
-        """The derivative of the pose (right update) with respect to the calibration, with the best motion if it is unknown."""
-        return self.minimum.slope(self.noise)
+        first = self.first_of_motion
+        return torch.from_numpy(self.system.inverse_curvature[first:, first:].copy())
 
     def log_occam_factor(self, prior: MotionPrior) -> float:
         """Return the logarithm of the Occam factor of an estimated motion: how much the observations narrow its prior.
@@ -79,34 +74,6 @@ class ReprojectionFit:
     def motion_in_deviations(self, prior: MotionPrior) -> float:
         """Return the squared size of the motion, in standard deviations of its prior."""
         return float((self.motion / prior.deviations).square().sum())
-
-
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """The equations at the pose that was found, from which more about it is computed where it is asked for."""
-
-    errors: ReprojectionErrors
-    system: RobustEquations
-    state: State
-    correlation: float
-    deviations: Array  # (11,) of the priors of the calibration and the motion
-
-    @property
-    def first_of_motion(self) -> int:
-        """The number of the first unknown that belongs to the motion."""
-        return 6 + int(np.count_nonzero(self.deviations[:5]))
-
-    def slope(self, noise: float) -> Float[Tensor, "6 5"]:
-        moving = 5 + self.deviations[5:].nonzero()[0]
-        free = np.concatenate([np.arange(5), moving])
-        system = self.errors.system(self.errors.linearized(self.state, free), noise)
-        system = system.weighted(1 / self.correlation)
-        hessian = system.with_prior(self.state.camera[moving], self.deviations[moving]).hessian
-        follows = np.concatenate([np.arange(6), np.arange(11, len(hessian))])
-        by_calibration = hessian[follows[:, None], np.arange(6, 11)]
-        return torch.from_numpy(
-            -damped_solution(hessian[follows[:, None], follows], 1e-9, by_calibration)[:6]
-        )
 
 
 def resect(
@@ -134,7 +101,7 @@ def resect(
     of_calibration[free] = covariance.diagonal()[6:].clamp(min=0).sqrt()
     return ReprojectionFit(
         state.pose(), state.calibration, state.motion, noise, covariance[:6, :6].clone(), of_calibration[:5].clone(),
-        Minimum(errors, system, state, correlation, deviations),
+        system, 6 + int(np.count_nonzero(deviations[:5])),
     )  # fmt: skip
 
 
