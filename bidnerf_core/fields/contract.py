@@ -80,6 +80,34 @@ class RadianceField(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """The places at which rays meet something, nearest first, and what is seen there. Those that are not valid have no effect."""
+
+    distance: Float[Tensor, "*r s"]  # metres along the ray
+    alpha: Float[Tensor, "*r s"]  # share of the light that is stopped there, in [0, 1]; 0 where not valid
+    rgb: Float[Tensor, "*r s 3"]  # in [0, 1]
+    valid: Bool[Tensor, "*r s"]
+
+    @property
+    def samples(self) -> RaySamples:
+        """The places as intervals of no length."""
+        return RaySamples(self.distance, self.distance, self.valid)
+
+
+@runtime_checkable
+class HitField(RadianceField, Protocol):
+    """An optional part of a field, which finds for whole rays what they meet, as splats and meshes do.
+
+    ``render`` then takes ``hits`` in place of ``sampler`` and ``query``. These remain, for points and for whoever samples rays
+    otherwise, and agree with it: the integral of ``query``'s density along a ray gives the opacity of the ray's hits.
+    """
+
+    def hits(self, rays: Rays) -> RayHits:
+        """Return what rays meet in [near, far]; differentiable in the rays and in the parameters."""
+        ...
+
+
 def levels(field: RadianceField) -> tuple[RadianceField, ...]:
     """Return the field's levels of detail, coarsest first; a field that offers none is its own only level."""
     return tuple(getattr(field, "levels", None) or (field,))

@@ -11,7 +11,16 @@ from torch import Generator, Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
 from bidnerf_core.devices import constant, may_wait
-from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySamples, SceneBounds, device_of
+from bidnerf_core.fields.contract import (
+    FieldValues,
+    HitField,
+    RadianceField,
+    RayHits,
+    Rays,
+    RaySamples,
+    SceneBounds,
+    device_of,
+)
 from bidnerf_core.geometry.se3 import SE3
 
 
@@ -103,6 +112,8 @@ def render(
     jitter: Generator | None = None,
 ) -> Rendering:
     """Render rays; differentiable in the field's parameters and in the rays."""
+    if isinstance(field, HitField):
+        return render_hits(field.hits(rays), background)
     return render_samples(field, rays, field.sampler(rays, jitter), background)
 
 
@@ -114,6 +125,25 @@ def render_samples(
 ) -> Rendering:
     """Render rays from given samples, see ``render``."""
     weights, density, colour = _composed(field, rays, samples)
+    return _over(background, colour, weights, samples, density)
+
+
+def render_hits(
+    hits: RayHits, background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0)
+) -> Rendering:
+    """Composite what rays meet: ``w_i = alpha_i prod_{j<i} (1 - alpha_j)``, which is eq. 3 with ``alpha = 1 - exp(-sigma dt)``."""
+    passed = torch.cumprod(1 - hits.alpha, dim=-1)
+    before = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], dim=-1)[..., : passed.shape[-1]]
+    weights = hits.alpha * before
+    colour = (weights[..., None] * hits.rgb).sum(-2)
+    return _over(background, colour, weights, hits.samples, None)
+
+
+def _over(
+    background: tuple[float, float, float] | Float[Tensor, "*#r 3"], colour: Float[Tensor, "*r 3"],
+    weights: Float[Tensor, "*r s"], samples: RaySamples, density: Float[Tensor, "*r s"] | None,
+) -> Rendering:  # fmt: skip
+    """Return the rendering of rays with these colours in front of ``background``."""
     opacity = weights.sum(-1)
     behind = constant(background, weights) if isinstance(background, tuple) else background.to(weights)
     rgb = colour + (1 - opacity)[..., None] * behind

@@ -11,7 +11,16 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import max_pool1d, pad
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
+from bidnerf_core.fields.contract import (
+    FieldValues,
+    HitField,
+    RadianceField,
+    RayHits,
+    Rays,
+    RaySampler,
+    RaySamples,
+    SceneBounds,
+)
 from bidnerf_core.fields.rendering import query_samples, rendering_weights
 from bidnerf_core.fields.voxel_grid import OccupancyMask
 
@@ -75,6 +84,28 @@ class AroundDepth:
             rays, far=torch.where(measured, rays.near, rays.far)
         )  # empty where a distance was measured
         return either(measured, Stratified(self.count)(window, jitter), self.otherwise(rest, jitter))
+
+
+@dataclass(frozen=True, eq=False)
+class HitsAroundDepth:
+    """A field whose hits are only those within ``reach`` metres of the distance measured along each ray, see ``AroundDepth``."""
+
+    field: HitField
+    distance: Float[Tensor, "*r"]  # metres along the rays to be rendered; 0 where nothing was measured
+    reach: float
+
+    @property
+    def sampler(self) -> RaySampler:
+        return self.field.sampler
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        return self.field.query(positions, directions)
+
+    def hits(self, rays: Rays) -> RayHits:
+        measured = self.distance > 0
+        near = torch.where(measured, torch.maximum(rays.near, self.distance - self.reach), rays.near)
+        far = torch.where(measured, torch.minimum(rays.far, self.distance + self.reach), rays.far)
+        return self.field.hits(replace(rays, near=near, far=far))
 
 
 @dataclass(frozen=True)

@@ -140,6 +140,9 @@ class BackendContract(Subject):
     def test_rays_that_miss_see_the_background(self) -> None:
         self._each(samples.check_background)
 
+    def test_hits_agree_with_the_density(self) -> None:
+        self._each(samples.check_hits)
+
     def test_levels_are_fields_coarsest_first(self) -> None:
         for field in self._fields():
             samples.check_levels(field)

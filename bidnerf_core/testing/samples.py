@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.fields.contract import RadianceField, Rays, RaySamples
-from bidnerf_core.fields.rendering import Rendering, render
+from bidnerf_core.fields.contract import HitField, RadianceField, RayHits, Rays, RaySamples
+from bidnerf_core.fields.rendering import Rendering, render, rendering_weights
+from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.testing.faults import calling, require_that, sample
 from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
 from bidnerf_core.testing.values import close
@@ -110,6 +111,75 @@ def check_levels(field: RadianceField) -> None:
         close(seen(offered[-1], rays, "rays"), seen(field, rays, "rays"), 1e-3),
         f"{type(field).__name__}.levels: the last one renders otherwise than the field itself; expected the coarsest"
         " first and the field itself last",
+    )
+
+
+FINE_INTERVALS = 1024
+"""Intervals of a ray over which the density of a field with hits is summed."""
+SAME_OPACITY = 0.05
+"""Difference allowed between the opacity of a ray's hits and that by the field's density, on nine rays of ten."""
+
+
+def check_hits(field: RadianceField) -> None:
+    """Check the hits of a field that offers them: in order, in range, in [near, far], and as opaque as its density."""
+    if not isinstance(field, HitField):
+        return
+    for of, rays in awkward_rays().items():
+        _check_hits(field, rays, of)
+    every = awkward_rays()["rays from outside"]
+    for shape in ((), (1,), (2, 3), (0,), (2, 0)):
+        count = torch.Size(shape).numel()
+        arranged = picked(every, torch.arange(count).reshape(shape))
+        found = _hits(field, arranged, f"rays arranged as {shape}")
+        require_that(
+            tuple(found.distance.shape[:-1]) == shape,
+            f"{type(field).__name__}.hits of rays arranged as {shape}: distance has shape {tuple(found.distance.shape)},"
+            " expected the rays' shape and one more axis",
+        )
+    _check_density(field, every)
+
+
+def _hits(field: HitField, rays: Rays, of: str) -> RayHits:
+    with calling(f"{type(field).__name__}.hits of {of}"), torch.no_grad():
+        return field.hits(rays)
+
+
+def _check_hits(field: HitField, rays: Rays, of: str) -> None:
+    found = _hits(field, rays, of)
+    who = f"{type(field).__name__}.hits of {of}"
+    for what, values in (("distance", found.distance), ("alpha", found.alpha), ("rgb", found.rgb)):
+        require_that(bool(values.isfinite().all()), f"{who}: {what} is NaN or infinite, also where not valid")
+    for what, values in (("alpha", found.alpha), ("rgb", found.rgb)):
+        require_that(
+            bool(((values >= 0) & (values <= 1)).all()),
+            f"{who}: {what} is outside of [0, 1], expected within",
+        )
+    require_that(
+        not bool((found.alpha[~found.valid] != 0).any()), f"{who}: alpha is not 0 where a hit is not valid"
+    )
+    distance, valid = found.distance, found.valid
+    within = (distance >= rays.near[..., None] - SLACK) & (distance <= rays.far[..., None] + SLACK)
+    require_that(bool(within[valid].all()), f"{who}: a valid hit lies outside [near, far] of its ray")
+    reached = torch.where(valid, distance, -torch.inf).cummax(-1).values if distance.shape[-1] else distance
+    turned = (distance[..., 1:] < reached[..., :-1] - SLACK) & valid[..., 1:]
+    require_that(not bool(turned.any()), f"{who}: hits are not sorted, expected nearest first")
+
+
+def _check_density(field: HitField, rays: Rays) -> None:
+    """Check that the density of ``query``, summed along rays, stops as much light as the hits do."""
+    hits = _hits(field, rays, "rays")
+    expected = 1 - torch.prod(1 - hits.alpha, dim=-1)
+    samples = Stratified(FINE_INTERVALS)(rays)
+    with calling(f"{type(field).__name__}.query along rays"), torch.no_grad():
+        places = rays.at(samples.middles)
+        density = field.query(places, rays.directions[..., None, :].expand_as(places)).density
+    found = rendering_weights(density, samples).sum(-1)
+    off = (found - expected).abs()
+    require_that(
+        float((off <= SAME_OPACITY).float().mean()) >= 0.9,
+        f"{type(field).__name__}: query's density stops {float(found.mean()):.0%} of the light of rays on average and hits stop"
+        f" {float(expected.mean()):.0%}, up to {float(off.max()):.0%} apart; expected the integral of the density along a ray to"
+        " give the opacity of its hits",
     )
 
 

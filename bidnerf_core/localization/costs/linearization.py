@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields.contract import RadianceField, Rays, RaySamples
+from bidnerf_core.fields.contract import HitField, RadianceField, Rays, RaySamples
 from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import Rendering, render_samples
+from bidnerf_core.fields.rendering import Rendering, render, render_samples
 from bidnerf_core.fields.residuals import Residual
 from bidnerf_core.fields.sampling import rows_of
 from bidnerf_core.geometry.se3 import SE3
@@ -55,25 +55,52 @@ def linearize(
     """
     flat, shape = flattened(rays), rays.near.shape
     repeated = observed.repeated(shape[0])
+    has_hits = isinstance(field, HitField)
+    with torch.set_grad_enabled(has_hits):
+        # A field that finds what rays meet is rendered once: nearly all of the time goes into finding it.
+        leaves = [part.detach().requires_grad_(has_hits) for part in (flat.origins, flat.directions)]
+        rendering = render(field, replace(flat, origins=leaves[0], directions=leaves[1]), background)
     with torch.no_grad():
-        rendering = render_samples(field, flat, field.sampler(flat), background)
         # Rendered and measured colours nearly cancel at the answer, so their difference is taken in float64.
         precise = replace(rendering, rgb=rendering.rgb.double())
         residuals = residual(precise, replace(repeated, rgb=repeated.rgb.double()))
-    kept = rendering.samples.valid
-    if least_weight > 0:
-        kept = kept & (rendering.weights > least_weight)
     count = residuals.shape[-1]
     wanted = tuple(range(count)) if channels is None else channels
-    gradients = _ray_gradients(
-        field, flat, repeated, residual, rendering.samples, kept, background, wanted, count
-    )
+    if has_hits:
+        gradients = _gradients_by(leaves, rendering, repeated, residual, wanted, count)
+    else:
+        kept = rendering.samples.valid
+        if least_weight > 0:
+            kept = kept & (rendering.weights > least_weight)
+        gradients = _ray_gradients(
+            field, flat, repeated, residual, rendering.samples, kept, background, wanted, count
+        )
     by_origin, by_direction = (part.reshape(*shape, count, 3) for part in gradients)
     jacobian = _by_update(rays, T_world_pivot, by_origin, by_direction)
     steepness = torch.linalg.vector_norm(by_origin, dim=-1)
     return Linearization(
         residuals.reshape(*shape, count), rendering.rgb.reshape(*shape, 3), steepness, jacobian
     )
+
+
+def _gradients_by(
+    leaves: list[Tensor], rendering: Rendering, observed: Observations, residual: Residual, channels: tuple[int, ...],
+    count: int,
+) -> tuple[Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]:  # fmt: skip
+    """Return the gradients of each ray's residuals with respect to ``leaves``: the origins and directions that were rendered."""
+    results = [leaf.new_zeros((len(leaf), count, 3)) for leaf in leaves]
+    if not rendering.rgb.requires_grad:  # no ray meets anything
+        return results[0], results[1]
+    with torch.enable_grad():
+        found = residual(rendering, observed)
+    for channel in channels:
+        gradients: tuple[Tensor | None, ...] = torch.autograd.grad(
+            found[:, channel].sum(), leaves, retain_graph=channel != channels[-1], allow_unused=True
+        )
+        for result, gradient in zip(results, gradients, strict=True):
+            if gradient is not None:
+                result[:, channel] = gradient
+    return results[0], results[1]
 
 
 def flattened(rays: Rays) -> Rays:

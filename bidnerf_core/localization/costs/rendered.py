@@ -14,10 +14,10 @@ from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields.contract import RadianceField, Rays
+from bidnerf_core.fields.contract import HitField, RadianceField, Rays
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.residuals import Objective
-from bidnerf_core.fields.sampling import AroundDepth, Resampled
+from bidnerf_core.fields.sampling import AroundDepth, HitsAroundDepth, Resampled
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import DrawerName, continued, draw, drawer
 from bidnerf_core.geometry.se3 import SE3
@@ -240,6 +240,8 @@ class RenderedCost:
         if self.stage.window == 0:
             return self.field
         distance = self.rays.observed.distance.expand(rays.near.shape).flatten()
+        if isinstance(self.field, HitField):
+            return HitsAroundDepth(self.field, distance, self.stage.window)
         count = self.settings.window_samples
         return Resampled(self.field, AroundDepth(distance, self.stage.window, count, self.field.sampler))
 
