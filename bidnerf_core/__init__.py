@@ -37,7 +37,9 @@ if TYPE_CHECKING:
     from bidnerf_core.evaluation.protocols import perturb as perturb
     from bidnerf_core.evaluation.results import ResultTable as ResultTable
     from bidnerf_core.fields.contract import FieldValues as FieldValues
+    from bidnerf_core.fields.contract import HitField as HitField
     from bidnerf_core.fields.contract import RadianceField as RadianceField
+    from bidnerf_core.fields.contract import RayHits as RayHits
     from bidnerf_core.fields.contract import Rays as Rays
     from bidnerf_core.fields.contract import RaySampler as RaySampler
     from bidnerf_core.fields.contract import RaySamples as RaySamples
@@ -60,6 +62,8 @@ if TYPE_CHECKING:
     from bidnerf_core.localization import settings_of as settings_of
     from bidnerf_core.localization.corrector import Corrector as Corrector
     from bidnerf_core.mapping import BakeConfig as BakeConfig
+    from bidnerf_core.maps.importers import ImportedField as ImportedField
+    from bidnerf_core.maps.importing import import_map as import_map
     from bidnerf_core.maps.map import Map as Map
     from bidnerf_core.maps.map import load_map as load_map
     from bidnerf_core.maps.rendering import RenderingScores as RenderingScores
@@ -96,6 +100,8 @@ HOMES = {
     "FieldValues": "fields.contract",
     "Frame": "frames.frame",
     "FrameSequence": "datasets",
+    "HitField": "fields.contract",
+    "ImportedField": "maps.importers",
     "InputError": "errors",
     "InputWarning": "errors",
     "Intrinsics": "camera.intrinsics",
@@ -110,6 +116,7 @@ HOMES = {
     "Progress": "progress",
     "ProgressCallback": "progress",
     "RadianceField": "fields.contract",
+    "RayHits": "fields.contract",
     "RaySampler": "fields.contract",
     "RaySamples": "fields.contract",
     "Rays": "fields.contract",
@@ -129,6 +136,7 @@ HOMES = {
     "closed_form_map": "scenes.closed_form_data",
     "compare": "evaluation.evaluate",
     "evaluate": "evaluation.evaluate",
+    "import_map": "maps.importing",
     "levels": "fields.contract",
     "list_plugins": "registry",
     "load_backend": "backend",

@@ -1,4 +1,4 @@
-"""What strangers register, by name: backends, readers, methods, features, faults and writers.
+"""What strangers register, by name: backends, readers, methods, features, faults, writers and importers.
 
 A distribution offers an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones come the same way. A
 script or a notebook offers one with ``register``. Listing reads only metadata and source text, so that a broken plugin cannot
@@ -33,6 +33,7 @@ GROUPS: Mapping[str, str] = {
     "features": "detector",
     "faults": "fault",
     "writers": "writer",
+    "importers": "importer",
 }
 """What can be registered, and the noun for one of it. The entry-point group has the prefix ``bidnerf.``."""
 

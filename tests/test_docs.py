@@ -46,8 +46,8 @@ FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 NOT_RUN: dict[tuple[str, str], str] = {}
 """Python blocks that are not executed, by page and first line, each with the reason."""
-TOO_SLOW = {"train", "demo", "evaluate", "compare", "report"}
-"""Commands that are only parsed: they take minutes, or the results of one that does."""
+TOO_SLOW = {"train", "demo", "evaluate", "compare", "report", "import"}
+"""Commands that are only parsed: they take minutes, or the results of one that does, or files of a plugin's."""
 OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest"}
 """Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""
 LANGUAGES = {"python", "sh", "toml", "bibtex", "text"}

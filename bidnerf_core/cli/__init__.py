@@ -20,6 +20,7 @@ COMMANDS = {
     "backends": "list the installed kinds of field",
     "plugins": "list all that is registered by name: backends, readers, methods and others",
     "train": "make a map from a dataset",
+    "import": "make a map of a field that others trained: splats, a checkpoint",
     "bake": "add to a map what localization without a start needs, as train does",
     "info": "describe a map",
     "render": "render images and depth of a map from a dataset's poses",

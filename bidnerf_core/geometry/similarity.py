@@ -19,6 +19,12 @@ class Similarity:
     scale: float  # target units per source unit
     T_target_source: SE3  # applied after scaling
 
+    @property
+    def is_identity(self) -> bool:
+        """Whether it leaves all points where they are."""
+        matrix = self.T_target_source.matrix()
+        return self.scale == 1 and bool((matrix == torch.eye(4).to(matrix)).all())
+
     def apply(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         return self.T_target_source.apply(self.scale * points)
 

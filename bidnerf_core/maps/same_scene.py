@@ -25,6 +25,11 @@ def check_same_scene(info: MapInfo, field: RadianceField, views: Sequence[View],
     known = any((c.name, c.T_world_camera) in own for c in stored_cameras(views))
     if known or not own:
         return
+    check_alike(info, field, views, where)
+
+
+def check_alike(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
+    """Raise ``InputError`` for photos that are unlike the field, whichever they are."""
     off, usual = colour_noise(field, info.bounds, views), info.colour_noise
     if off > (UNLIKE_ANY if usual is None else max(UNLIKE, UNLIKE_ITS_OWN * usual)):
         raise InputError(

@@ -6,33 +6,13 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.geometry.se3 import SE3
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 """Angle (rad) whose successive multiples fill a circle evenly, however many there are."""
-
-
-def look_at(
-    eye: Sequence[float] | Float[Tensor, "3"],
-    target: Sequence[float] | Float[Tensor, "3"],
-    up: Sequence[float] = (0.0, 0.0, 1.0),
-) -> SE3:
-    """Return ``T_world_camera`` (float64) of a camera at ``eye`` that looks at ``target`` with ``up`` upwards."""
-    position = torch.as_tensor(eye, dtype=torch.float64)
-    forward = torch.as_tensor(target, dtype=torch.float64) - position
-    if not torch.linalg.vector_norm(forward) > 0:
-        raise InputError(f"look_at: the camera's place {position.tolist()} and its target are the same")
-    forward = torch.nn.functional.normalize(forward, dim=0)
-    right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=torch.float64))
-    if torch.linalg.vector_norm(right) < 1e-6:  # straight up or down: any right will do
-        right = torch.linalg.cross(forward, forward.new_tensor([0.0, 1.0, 0.0]))
-    right = torch.nn.functional.normalize(right, dim=0)
-    return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1), position)
 
 
 def orbit(

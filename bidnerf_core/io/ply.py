@@ -1,0 +1,150 @@
+"""PLY files: elements of named numbers, whose size is checked against the file before memory is allocated for them."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import open_binary
+
+LARGEST_HEADER = 64 * 1024
+"""Bytes."""
+SHORTEST_NUMBER = 2
+"""Bytes of a number in a text file, with the blank behind it."""
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """One kind of element, as the header of a file declares it."""
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str], ...]  # name and NumPy's type, without the order of bytes
+    has_lists: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the properties."""
+        return tuple(name for name, _ in self.properties)
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """The header of a file."""
+
+    order: str  # of bytes, as NumPy writes it; "=" for a text file
+    elements: tuple[PlyElement, ...]
+    length: int  # bytes
+
+    def element(self, name: str) -> PlyElement | None:
+        """Return the declaration of the elements of that name, or None where there are none."""
+        return next((element for element in self.elements if element.name == name), None)
+
+
+def read_ply_header(path: Path, expected: str = "a PLY file") -> PlyHeader:
+    """Return the header of a PLY file. Raises ``InputError`` where it has none, or a malformed one."""
+    with open_binary(path, expected) as file:
+        return _header(file, path, expected)
+
+
+def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
+    """Return the elements of a PLY file by name, each as a structured array with a field per property.
+
+    Elements with lists, such as the faces of a mesh, and all elements behind the first of these are left out. Raises
+    ``InputError`` for a malformed header, and for more elements than a file of its size can hold.
+    """
+    with open_binary(path, expected) as file:
+        header = _header(file, path, expected)
+        left = os.fstat(file.fileno()).st_size - header.length
+        found: dict[str, np.ndarray] = {}
+        for element in header.elements:
+            if element.has_lists:
+                break
+            kind = np.dtype([(name, header.order + of) for name, of in element.properties])
+            is_text = header.order == "="
+            size = SHORTEST_NUMBER * len(kind) if is_text else kind.itemsize
+            if element.count * size > left + is_text:
+                raise InputError(
+                    f"{path}: declares {element.count:,} elements {element.name!r}, for which its {left:,} bytes of data"
+                    " are too few; is the file truncated?"
+                )
+            found[element.name] = (
+                _text_rows(file, element.count, kind, path)
+                if is_text
+                else np.frombuffer(file.read(element.count * size), dtype=kind)
+            )
+            left -= element.count * size
+        return found
+
+
+def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
+    start = file.read(LARGEST_HEADER)
+    end = start.find(b"end_header")
+    stop = start.find(b"\n", end)
+    if not start.startswith(b"ply") or end < 0 or stop < 0:
+        raise InputError(f"{path}: no header of a PLY file, expected {expected}")
+    order, elements = "", list[PlyElement]()
+    for line in start[:end].decode("latin-1").splitlines()[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        try:
+            if words[0] == "format":
+                order = ORDERS[words[1]]
+            elif words[0] == "element":
+                count = int(words[2])
+                if count < 0:
+                    raise ValueError
+                elements.append(PlyElement(words[1], count, ()))
+            elif words[0] == "property":
+                elements[-1] = _with_property(elements[-1], words)
+            else:
+                raise ValueError
+        except (ValueError, KeyError, IndexError) as error:
+            raise InputError(f"{path}: a line {line[:60]!r} in its header, expected {expected}") from error
+    if not order:
+        raise InputError(f"{path}: its header names no format, expected {expected}")
+    file.seek(stop + 1)
+    return PlyHeader(order, tuple(elements), stop + 1)
+
+
+def _with_property(element: PlyElement, words: list[str]) -> PlyElement:
+    if words[1] == "list":
+        return PlyElement(element.name, element.count, element.properties, True)
+    name = words[2]
+    if name in element.names:
+        raise ValueError
+    return PlyElement(
+        element.name, element.count, (*element.properties, (name, TYPES[words[1]])), element.has_lists
+    )
+
+
+def _text_rows(file: BinaryIO, count: int, kind: np.dtype, path: Path) -> np.ndarray:
+    """Return the next ``count`` rows of numbers of a text file."""
+    lines = [file.readline() for _ in range(count)]
+    try:
+        rows = (
+            np.loadtxt(io.BytesIO(b"".join(lines)), dtype=np.float64, ndmin=2)
+            if lines
+            else np.zeros((0, len(kind)))
+        )
+        if rows.shape != (count, len(kind)):
+            raise ValueError(f"{rows.shape[0]} rows of {rows.shape[1]}")
+    except ValueError as error:
+        raise InputError(f"{path}: expected {count:,} rows of {len(kind)} numbers ({error})") from error
+    found = np.empty(count, kind)
+    for number, name in enumerate(kind.names or ()):
+        found[name] = rows[:, number]
+    return found

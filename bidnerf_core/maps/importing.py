@@ -1,0 +1,211 @@
+"""Importing: a map of a field that others trained, or of a mesh or the like."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.devices import working_device
+from bidnerf_core.errors import InputError, InputWarning, amount
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.pixels import draw, uniform
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.io.json import from_plain, to_plain
+from bidnerf_core.mapping import BakeConfig, find_features
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.files import map_folder, save_map
+from bidnerf_core.maps.importers import ImportedField, importer_of, robust_box
+from bidnerf_core.maps.map import Map, frozen_field
+from bidnerf_core.maps.same_scene import check_alike
+from bidnerf_core.maps.training import USUAL_BAKE
+from bidnerf_core.maps.viewpoints import viewpoints
+from bidnerf_core.maps.views import Images, read_views
+from bidnerf_core.progress import Cancel, ProgressCallback
+from bidnerf_core.registry import PluginError
+from bidnerf_core.training import TrainingState
+
+log = logging.getLogger("bidnerf")
+
+SMALLEST, LARGEST = 0.05, 500.0
+"""Metres: longest sides of a scene beyond which its lengths are hardly metres."""
+COMPARED_RAYS = 4096
+SAME_LENGTH = 0.03
+"""Relative difference between rendered and measured depth that is not worth a word."""
+FEWEST_COMPARED = 200
+
+
+def import_map(
+    path: str | Path,
+    out: str | Path | None = None,
+    importer: str | None = None,
+    config: Any = None,
+    scale: float = 1.0,
+    T_world_file: SE3 | None = None,
+    photos: Images | None = None,
+    split: str = "train",
+    bake: bool | BakeConfig = True,
+    device: torch.device | str = "cpu",
+    overwrite: bool = False,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+    *,
+    features: str = USUAL_FEATURES,
+) -> Map:
+    """Make a map of a field in a file: splats, a checkpoint, whatever an installed importer reads.
+
+    ``importer`` is the name of one, by default that which recognises the file; ``config`` holds its settings: an object of its
+    ``config_type``, or a dict of those that differ from the defaults. Lengths are multiplied by ``scale``, and ``T_world_file``
+    then takes the file's coordinates to the world. ``photos`` are images with poses in the world (a dataset, the path to one, or
+    views), of which ``split`` names the part; they give the landmarks. Without any, landmarks come from images that the field
+    renders, which photos match less well. ``features`` is the name of the detector of the landmarks. The map is stored in folder
+    ``out``, and stays in memory only if that is None.
+
+    Raises ``InputError`` where the file, the photos, the settings or the folder are not usable, and where the photos do not show
+    the scene of the field; the folder must be empty unless ``overwrite`` is set.
+    """
+    path = Path(path)
+    if not (math.isfinite(scale) and scale > 0):
+        raise InputError(f"scale is {scale}, expected a number above 0")
+    find_features(features)
+    name, chosen = importer_of(path, importer)
+    settings = config
+    if config is None or isinstance(config, dict):
+        settings = from_plain(chosen.config_type, config or {}, f"settings of importer {name!r}")
+    placement = Similarity(scale, SE3.identity() if T_world_file is None else T_world_file)
+    place = None if out is None else Path(out)
+    there = working_device(device)
+    with contextlib.nullcontext() if place is None else map_folder(place, overwrite):
+        found = chosen.read(path, settings, placement)
+        for line in found.found:
+            log.info(f"{path}: {line}")
+        _tell_extent(found, str(path), scale != 1)
+        views, background = _read(photos, split, progress, cancel)
+        bounds = found.bounds if background is None else replace(found.bounds, background=background)
+        info = MapInfo(
+            found.backend, to_plain(found.config, "config"), bounds, found.steps, True, path.name,
+            landmark_features=features,
+        )  # fmt: skip
+        field = frozen_field(info, found.tensors, None)
+        scene = Map(info, field).to(there)
+        scene = replace(scene, info=replace(info, cameras=_cameras(scene.field, found, views, str(path))))
+        if views:
+            _check_photos(scene, views, str(path))
+        if place is not None:
+            state = TrainingState(found.steps, found.tensors, {})
+            scene = replace(scene, info=save_map(place, scene.info, state), folder=place)
+        settings_of_bake = bake if isinstance(bake, BakeConfig) else USUAL_BAKE
+        return _baked(scene, views, settings_of_bake, progress, cancel) if bake else scene
+
+
+def _read(
+    photos: Images | None, split: str, progress: ProgressCallback | None, cancel: Cancel | None
+) -> tuple[list[View], tuple[float, float, float] | None]:
+    """Return the photos, and the background of those that have an alpha channel."""
+    if photos is None:
+        return [], None
+    read = read_views(photos, split, progress=progress, cancel=cancel)
+    has_alpha = any(view.frame.alpha is not None for view in read.views)
+    return read.views, read.background if has_alpha else None
+
+
+def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], where: str) -> Any:
+    if views:
+        return stored_cameras(views)
+    if found.cameras:
+        log.info(f"{where}: {amount(len(found.cameras), 'camera')} of its training images beside it")
+        return found.cameras
+    chosen = viewpoints(field, found.bounds, found.up)
+    log.info(
+        f"{where}: no photos; looked at from {amount(len(chosen), 'viewpoint')} that were found in free space"
+    )
+    return chosen
+
+
+def _tell_extent(found: ImportedField, where: str, is_scaled: bool) -> None:
+    """Say how large the scene is, and warn where its lengths are hardly metres."""
+    if found.points is None or not len(found.points):
+        size = found.bounds.size
+    else:
+        lower, upper = robust_box(found.points, margin=0.0)
+        a, b, c = (upper - lower).tolist()
+        size = (a, b, c)
+    extent = " x ".join(f"{side:.3g}" for side in size)
+    log.info(
+        f"{where}: extent {extent}"
+        + (
+            " after scaling"
+            if is_scaled
+            else "; its unit is not stored, so it is taken for metres (--scale changes it)"
+        )
+    )
+    if not SMALLEST <= max(size) <= LARGEST:
+        unit = "millimetres" if max(size) > LARGEST else "kilometres or a unit of its own"
+        warnings.warn(
+            f"{where}: {extent} would be {'very large' if max(size) > LARGEST else 'tiny'} in metres; are its lengths {unit}?"
+            " --scale changes them",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def _check_photos(scene: Map, views: Sequence[View], where: str) -> None:
+    """Raise ``InputError`` for photos that do not show the field, and warn where their depth has another unit."""
+    check_alike(scene.info, scene.field, views, where)
+    ratio = depth_ratio(scene.field, scene.bounds, views)
+    if ratio is not None and abs(ratio - 1) > SAME_LENGTH:
+        warnings.warn(
+            f"{where}: the depth that the photos measured is {ratio:.3g} times what the field shows; is its scale another one? The"
+            " poses of the photos would have to be scaled as well",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+@torch.no_grad()
+def depth_ratio(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float | None:
+    """Return the median ratio of measured to rendered depth, or None where too few rays have both."""
+    measured = [view for view in views if view.frame.has_depth]
+    if not measured:
+        return None
+    generator = torch.Generator().manual_seed(0)
+    count = max(COMPARED_RAYS, len(measured))
+    pixels = draw(measured, count, uniform, generator, device=device_of(field)).flattened()
+    seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
+    both = (pixels.distance > 0) & (seen.opacity > 0.9)
+    if int(both.sum()) < FEWEST_COMPARED:
+        return None
+    return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())
+
+
+def _baked(
+    scene: Map,
+    views: Sequence[View],
+    config: BakeConfig,
+    progress: ProgressCallback | None,
+    cancel: Cancel | None,
+) -> Map:
+    if not views:
+        log.info(
+            f"{scene.info.data}: landmarks from rendered images: a photo matches them less well than other photos;"
+            " --photos gives landmarks as a map that was trained here has"
+        )
+    try:
+        return scene.with_baked_parts(list(views), config, not views, None, progress, cancel)
+    except PluginError:  # nothing that other images would mend
+        raise
+    except InputError as error:  # the map itself is sound
+        log.info(f"{scene.info.data}: no surface baked: {error}")
+        return scene
