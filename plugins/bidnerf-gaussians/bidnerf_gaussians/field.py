@@ -1,0 +1,334 @@
+"""Gaussians as a radiance field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor, nn
+
+from bidnerf_core.devices import may_wait
+from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds
+from bidnerf_core.settings import Range
+from bidnerf_gaussians.gaussians import COEFFICIENTS, LEAST_OPACITY, Gaussians
+from bidnerf_gaussians.index import Lines, TooMany, level_sizes, met, nearest_met, tree_of
+from bidnerf_gaussians.quaternions import matrices, turned_back
+from bidnerf_gaussians.spherical_harmonics import colours
+
+LARGEST_ALPHA = 0.999
+"""Of one Gaussian along a ray, as in gsplat."""
+STOPPED = 1e-4
+"""Share of a ray's light that still shines through where nothing behind is looked at, as in the first paper's code."""
+LEAST_EXTENT = 2.0
+"""Standard deviations to which at least a Gaussian's box extends, so that ``query`` finds nearly all of its density."""
+RAYS_AT_ONCE = 2048
+POINTS_AT_ONCE = 2**15
+KEPT_HITS = 64
+"""Gaussians along a ray where their number must be known beforehand; the nearest ones are kept."""
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Size of the field."""
+
+    gaussians: Annotated[int, Range(1, 2 * 10**8)] = 30_000  # number of Gaussians
+    degree: Annotated[int, Range(0, 3)] = 0  # degree of the spherical harmonics of colours
+
+
+@dataclass(frozen=True, eq=False)
+class _Peaks:
+    """Where lines come nearest to Gaussians, in their metric, and what is seen there."""
+
+    distance: Float[Tensor, "*p"]  # metres from the line's origin; may be negative
+    alpha: Float[Tensor, "*p"]
+    spread: Float[Tensor, "*p"]  # metres: standard deviation of the Gaussian along the line
+
+
+class GaussiansField(nn.Module):
+    """Gaussians that a ray meets at its peak in each, nearest first, as in 3D Gaussian ray tracing (Moenne-Loccoz et al. 2024).
+
+    Along a ray with origin o and direction d, a Gaussian of precision P about m is largest at ``t = d'P(m - o) / d'Pd``; its
+    opacity times its value there is alpha. ``hits`` gives these. Their optical thickness ``-log(1 - alpha)``, spread over the
+    ray as the Gaussian is, makes the density that ``query`` returns: its integral along a ray gives the same opacity.
+    """
+
+    order: Tensor
+
+    def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
+        super().__init__()
+        self.config, self.bounds = config, bounds
+        count = config.gaussians
+        lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
+        width = math.log(0.5 * bounds.side / max(2.0, count ** (1 / 2)))
+        self.means = nn.Parameter(lower + size * torch.rand(count, 3))
+        self.log_scales = nn.Parameter(torch.full((count, 3), width))
+        self.quaternions = nn.Parameter(torch.nn.functional.normalize(torch.randn(count, 4), dim=-1))
+        self.logits = nn.Parameter(torch.full((count,), -2.0))
+        self.harmonics = nn.Parameter(0.5 * torch.randn(count, COEFFICIENTS[config.degree], 3))
+        self.register_buffer("order", torch.arange(count))
+        for number, nodes in enumerate(level_sizes(count)):
+            self.register_buffer(f"boxes_{number}", torch.zeros(6, nodes, 8))
+        self.refit()
+
+    @property
+    def boxes(self) -> list[Float[Tensor, "6 m 8"]]:
+        """The boxes of the tree, the lowest level first, see ``index``."""
+        return [getattr(self, f"boxes_{number}") for number in range(len(level_sizes(len(self.means))))]
+
+    @torch.no_grad()
+    def refit(self) -> None:
+        """Make the tree anew, after the Gaussians have moved."""
+        opacity = self.logits.sigmoid()
+        seen = opacity >= LEAST_OPACITY
+        # alpha falls to the least opacity at this many standard deviations
+        extent = (2 * (opacity / LEAST_OPACITY).clamp(min=1).log()).sqrt().clamp(min=LEAST_EXTENT)
+        turns = matrices(torch.nn.functional.normalize(self.quaternions, dim=-1))
+        spread = (turns.square() * (2 * self.log_scales).exp()[:, None]).sum(-1).sqrt()
+        order, levels = tree_of(self.means, extent[:, None] * spread, seen)
+        self.order.copy_(order)
+        for boxes, found in zip(self.boxes, levels, strict=True):
+            boxes.copy_(found)
+
+    @torch.no_grad()
+    def assign(self, gaussians: Gaussians) -> None:
+        """Take on the parameters of as many Gaussians, of the same degree."""
+        for name in ("means", "log_scales", "quaternions", "logits", "harmonics"):
+            getattr(self, name).copy_(getattr(gaussians, name))
+        self.refit()
+
+    def gaussians(self) -> Gaussians:
+        """Return the Gaussians, on the CPU."""
+        names = ("means", "log_scales", "quaternions", "logits", "harmonics")
+        return Gaussians(*(getattr(self, name).detach().cpu().float() for name in names))
+
+    @property
+    def sampler(self) -> PeakSampler:
+        """The sampler that puts an interval about each peak."""
+        return PeakSampler(self)
+
+    def hits(self, rays: Rays) -> RayHits:
+        """Return the peaks along rays, nearest first, with colour and alpha; differentiable in the rays and the parameters."""
+        shape = rays.near.shape
+        flat = _flattened(rays)
+        gaussian, valid = self.met(flat)
+        width = gaussian.shape[1]
+        place, ray, index = _listed(gaussian, valid)
+        directions = flat.directions.index_select(0, ray)
+        peaks = self._peaks(index, flat.origins.index_select(0, ray), directions)
+        rgb = colours(self.harmonics.index_select(0, index), directions)
+        parts = []
+        for value in (peaks.distance, peaks.alpha, rgb):
+            whole = value.new_zeros((valid.numel(), *value.shape[1:]))
+            parts.append(whole.index_copy(0, place, value).reshape(*shape, width, *value.shape[1:]))
+        valid = valid.reshape(*shape, width)
+        alpha = torch.where(valid, parts[1], 0)
+        return RayHits(torch.where(valid, parts[0], flat.near.reshape(*shape, 1)), alpha, parts[2], valid)
+
+    @torch.no_grad()
+    def met(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+        """Return the numbers of the Gaussians that rays (r) meet, nearest first, up to where hardly any light is left."""
+        if not len(rays.near):
+            empty = torch.zeros((0, 0), dtype=torch.long, device=self.order.device)
+            return empty, empty.bool()
+        if not may_wait(rays.near.device):
+            return self._met_in_known_shape(rays)
+        parts = list(self._met_in_parts(rays, RAYS_AT_ONCE))
+        width = max(gaussian.shape[1] for gaussian, _ in parts)
+        gaussian, valid = (
+            torch.cat([torch.nn.functional.pad(part[i], (0, width - part[i].shape[1])) for part in parts])
+            for i in range(2)
+        )
+        return gaussian, valid
+
+    def _met_in_parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Tensor]]:
+        parts = zip(
+            *(getattr(rays, n).split(count) for n in ("origins", "directions", "near", "far")), strict=True
+        )
+        found = []
+        for part in parts:
+            few = Rays(*part)
+            try:
+                found.append(self._met_by_few(few))
+            except TooMany:
+                found += self._met_in_parts(few, (len(few.near) + 1) // 2)
+        return found
+
+    def _met_by_few(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+        ray, index = met(self._lines(rays), self.boxes, self.order)
+        peaks = self._peaks(index, rays.origins.index_select(0, ray), rays.directions.index_select(0, ray))
+        near, far = (part.index_select(0, ray) for part in (rays.near, rays.far))
+        kept = _is_hit(peaks, near, far).nonzero()[:, 0]
+        ray, index, distance, alpha = (
+            part.index_select(0, kept) for part in (ray, index, peaks.distance, peaks.alpha)
+        )
+        count = torch.bincount(ray, minlength=len(rays.near))
+        width = int(count.max()) if len(ray) else 0
+        place = ray * width + torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
+        rows = (len(rays.near), width)
+        return _nearest_first(*(
+            value.new_full((rows[0] * width,), fill).index_copy(0, place, value).reshape(rows)
+            for value, fill in ((distance, torch.inf), (alpha, 0), (index, 0))
+        ))  # fmt: skip
+
+    def _met_in_known_shape(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+        index, valid = nearest_met(self._lines(rays), self.boxes, self.order)
+        ray = torch.arange(len(index), device=index.device)[:, None].expand(index.shape).reshape(-1)
+        peaks = self._peaks(
+            index.reshape(-1), rays.origins.index_select(0, ray), rays.directions.index_select(0, ray)
+        )
+        hit = (
+            _is_hit(peaks, rays.near.index_select(0, ray), rays.far.index_select(0, ray)).reshape(index.shape)
+            & valid
+        )
+        distance = torch.where(hit, peaks.distance.reshape(index.shape), torch.inf)
+        kept = distance.topk(min(KEPT_HITS, distance.shape[1]), dim=1, largest=False, sorted=True).indices
+        alpha = torch.where(hit, peaks.alpha.reshape(index.shape), 0)
+        return _nearest_first(*(part.gather(1, kept) for part in (distance, alpha, index)))
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Return the density whose integral along ``directions`` gives the opacity of ``hits``, and the mean colour."""
+        shape = positions.shape[:-1]
+        parts = zip(
+            positions.reshape(-1, 3).split(POINTS_AT_ONCE),
+            directions.reshape(-1, 3).split(POINTS_AT_ONCE),
+            strict=True,
+        )
+        values = [self._values(*part) for part in parts]
+        density = torch.cat([value.density for value in values])
+        return FieldValues(
+            density.reshape(shape), torch.cat([value.rgb for value in values]).reshape(*shape, 3)
+        )
+
+    def _values(self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]) -> FieldValues:
+        try:
+            point, index, counts = self._about(positions)
+        except TooMany:
+            halves = zip(*(part.chunk(2) for part in (positions, directions)), strict=True)
+            found = [self._values(*half) for half in halves]
+            return FieldValues(torch.cat([f.density for f in found]), torch.cat([f.rgb for f in found]))
+        towards = directions.index_select(0, point)
+        peaks = self._peaks(index, positions.index_select(0, point), towards)
+        thickness = torch.where(counts & (peaks.alpha >= LEAST_OPACITY), -torch.log1p(-peaks.alpha), 0)
+        profile = torch.exp(-0.5 * (peaks.distance / peaks.spread).square()) / (
+            math.sqrt(2 * math.pi) * peaks.spread
+        )
+        density = thickness * profile
+        rgb = colours(self.harmonics.index_select(0, index), towards)
+        count = len(positions)
+        total = density.new_zeros(count).index_add(0, point, density)
+        colour = rgb.new_zeros((count, 3)).index_add(0, point, density[:, None] * rgb)
+        return FieldValues(total, (colour / total.clamp(min=1e-20)[:, None]).clamp(0, 1))
+
+    @torch.no_grad()
+    def _about(
+        self, positions: Float[Tensor, "p 3"]
+    ) -> tuple[Int[Tensor, "q"], Int[Tensor, "q"], Bool[Tensor, "q"]]:
+        """Return pairs of a point and a Gaussian whose box holds it, and whether each counts.
+
+        Where the host must not wait, each point has equally many, of which some do not count.
+        """
+        zero = torch.zeros_like(positions[:, 0])
+        lines = Lines.of(positions, torch.ones_like(positions), zero, zero)
+        if may_wait(positions.device):
+            point, index = met(lines, self.boxes, self.order)
+            return point, index, torch.ones_like(point, dtype=torch.bool)
+        index, valid = nearest_met(lines, self.boxes, self.order)
+        point = torch.arange(len(index), device=index.device)[:, None].expand(index.shape)
+        return point.reshape(-1), index.reshape(-1), valid.reshape(-1)
+
+    def _lines(self, rays: Rays) -> Lines:
+        far = torch.where(rays.far > rays.near, rays.far, rays.near - 1)  # nothing is met by rays that miss
+        return Lines.of(rays.origins, rays.directions, rays.near, far)
+
+    def _peaks(
+        self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
+    ) -> _Peaks:
+        """Return where lines come nearest to the Gaussians number ``index``."""
+        means, widths, turns, logits = (
+            part.index_select(0, index)
+            for part in (self.means, self.log_scales, self.quaternions, self.logits)
+        )
+        turns = turns * turns.square().sum(-1, keepdim=True).clamp(min=1e-24).rsqrt()
+        # From the point nearest to the mean, so that rounding is that of lengths about the Gaussian.
+        along = ((means - origins) * directions).sum(-1, keepdim=True)
+        narrow = (-widths).exp()
+        u = turned_back(turns, origins + along * directions - means) * narrow
+        v = turned_back(turns, directions) * narrow
+        speed = v.square().sum(-1).clamp(min=1e-30)
+        square = torch.linalg.cross(u, v).square().sum(-1) / speed  # of the distance, in standard deviations
+        alpha = logits.sigmoid() * torch.exp(-0.5 * square)
+        return _Peaks(along[:, 0] - (u * v).sum(-1) / speed, alpha.clamp(max=LARGEST_ALPHA), speed.rsqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class PeakSampler:
+    """An interval about each Gaussian that a ray meets, as long as its density is there divided by its peak.
+
+    Where a Gaussian stands alone, density times length is its optical thickness; where several overlap, their intervals end
+    half-way between their peaks. ``hits`` is exact, and what the core renders.
+    """
+
+    field: GaussiansField
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        shape, flat = rays.near.shape, _flattened(rays)
+        gaussian, valid = self.field.met(flat)
+        width = gaussian.shape[1]
+        ray = torch.arange(len(gaussian), device=gaussian.device)[:, None].expand(gaussian.shape).reshape(-1)
+        peaks = self.field._peaks(
+            gaussian.reshape(-1), flat.origins.index_select(0, ray), flat.directions.index_select(0, ray)
+        )
+        middle, half = (
+            part.reshape(gaussian.shape) for part in (peaks.distance, math.sqrt(math.pi / 2) * peaks.spread)
+        )
+        near, far = flat.near[:, None], torch.maximum(flat.near, flat.far)[:, None]
+        starts = torch.where(valid, torch.maximum(middle - half, near), far)
+        ends = torch.where(valid, torch.minimum(middle + half, far), far)
+        if width > 1:
+            place = torch.where(valid, middle, torch.inf)
+            between = (place[:, 1:] + place[:, :-1]) / 2
+            starts[:, 1:] = torch.maximum(starts[:, 1:], torch.where(valid[:, 1:], between, far))
+            ends[:, :-1] = torch.where(valid[:, 1:], torch.minimum(ends[:, :-1], between), ends[:, :-1])
+        ends = torch.maximum(starts, ends)
+        return RaySamples(*(part.reshape(*shape, width) for part in (starts, ends, valid)))
+
+
+def _flattened(rays: Rays) -> Rays:
+    return Rays(
+        rays.origins.reshape(-1, 3),
+        rays.directions.reshape(-1, 3),
+        rays.near.reshape(-1),
+        rays.far.reshape(-1),
+    )
+
+
+def _is_hit(peaks: _Peaks, near: Float[Tensor, "p"], far: Float[Tensor, "p"]) -> Bool[Tensor, "p"]:
+    return (peaks.alpha >= LEAST_OPACITY) & (peaks.distance >= near) & (peaks.distance <= far)
+
+
+def _nearest_first(
+    distance: Float[Tensor, "r s"], alpha: Float[Tensor, "r s"], index: Int[Tensor, "r s"]
+) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+    """Return the indices in order of distance, and which of them count: those that are reached by any light."""
+    distance, order = distance.sort(dim=1, stable=True)
+    alpha, index = alpha.gather(1, order), index.gather(1, order)
+    thickness = -torch.log1p(-alpha)
+    before = thickness.cumsum(1) - thickness
+    valid = (distance < torch.inf) & (before < -math.log(STOPPED))
+    if may_wait(valid.device):
+        width = int(valid.sum(1).max()) if valid.numel() else 0
+        return index[:, :width], valid[:, :width]
+    return index, valid
+
+
+def _listed(index: Int[Tensor, "r s"], valid: Bool[Tensor, "r s"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return place in the table, row and index of the valid entries or, where the host must not wait, of all."""
+    if may_wait(valid.device):
+        place = valid.reshape(-1).nonzero()[:, 0]
+    else:
+        place = torch.arange(valid.numel(), device=valid.device)
+    return place, place // max(1, valid.shape[1]), index.reshape(-1).index_select(0, place)

@@ -1,0 +1,81 @@
+"""Checkpoints of gsplat's examples and of nerfstudio's splatfacto, read without running code in them."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_gaussians.gaussians import Gaussians
+
+EXPECTED = "a checkpoint of gsplat or splatfacto"
+ENDINGS = (".pt", ".ckpt", ".pth")
+NAMES = {
+    "means": "means", "scales": "log_scales", "quats": "quaternions", "opacities": "logits", "sh0": "sh0",
+    "shN": "shN", "features_dc": "sh0", "features_rest": "shN",
+}  # fmt: skip
+"""What the parameters of both are called here."""
+PREFIX = "_model.gauss_params."
+"""Of the parameters of splatfacto."""
+ZIP = b"PK\x03\x04"
+
+
+def recognises(path: Path) -> bool:
+    """Return whether the file was written by ``torch.save`` and names parameters of Gaussians."""
+    if path.suffix.lower() not in ENDINGS or not path.is_file():
+        return False
+    try:
+        _parameters(path)
+    except InputError:
+        return False
+    return True
+
+
+def read(path: Path) -> Gaussians:
+    """Return the Gaussians of a checkpoint. Raises ``InputError`` where it would run code, or holds something else."""
+    found = _parameters(path)
+    missing = [name for name in ("means", "log_scales", "quaternions", "logits", "sh0") if name not in found]
+    if missing:
+        raise InputError(f"{path}: has no {', '.join(missing)}, expected {EXPECTED}")
+    parts = {name: value.float() for name, value in found.items()}
+    count = len(parts["means"])
+    sh0 = parts["sh0"].reshape(count, 1, 3)
+    harmonics = torch.cat([sh0, parts["shN"].reshape(count, -1, 3)], dim=1) if "shN" in parts else sh0
+    try:
+        return Gaussians(
+            parts["means"].reshape(count, 3), parts["log_scales"].reshape(count, 3),
+            parts["quaternions"].reshape(count, 4), parts["logits"].reshape(count), harmonics,
+        )  # fmt: skip
+    except RuntimeError as error:
+        raise InputError(f"{path}: tensors of different counts ({error}), expected {EXPECTED}") from error
+
+
+def _parameters(path: Path) -> dict[str, Tensor]:
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # each kind of damage raises another exception
+        code = re.search(r"GLOBAL ([\w.]+)", str(error))
+        if isinstance(error, pickle.UnpicklingError) and code:
+            raise InputError(
+                f"{path}: it would run code ({code[1]}) and was not read, expected {EXPECTED}"
+            ) from error
+        raise InputError(f"{path}: not written by torch.save, or damaged ({type(error).__name__})") from error
+    tensors = _inside(found)
+    return {
+        ours: tensors[theirs] for theirs, ours in NAMES.items() if isinstance(tensors.get(theirs), Tensor)
+    }
+
+
+def _inside(found: Any) -> dict[str, Any]:
+    """Return the parameters by name: gsplat keeps them under "splats", splatfacto under "pipeline" with a prefix."""
+    for key in ("splats", "pipeline"):
+        if isinstance(found, dict) and isinstance(found.get(key), dict):
+            found = found[key]
+    if not isinstance(found, dict):
+        return {}
+    return {str(name).removeprefix(PREFIX): value for name, value in found.items()}

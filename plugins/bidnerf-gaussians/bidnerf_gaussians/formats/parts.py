@@ -1,0 +1,43 @@
+"""What several formats have in common."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from bidnerf_gaussians.gaussians import Gaussians
+
+LARGEST_FILE = 16 * 2**30
+"""Bytes."""
+
+
+def gaussians_of(
+    means: np.ndarray,
+    log_scales: np.ndarray,
+    quaternions: np.ndarray,
+    logits: np.ndarray,
+    harmonics: np.ndarray,
+) -> Gaussians:
+    """Return the Gaussians of arrays, in single precision."""
+    parts = (means, log_scales, quaternions, logits, harmonics)
+    return Gaussians(*(torch.from_numpy(np.array(part, dtype=np.float32)) for part in parts))
+
+
+def logit(opacity: np.ndarray) -> np.ndarray:
+    """Return the logits of opacities of one byte, which may be 0 or 1."""
+    inside = opacity.astype(np.float64).clip(1e-6, 1 - 1e-6)
+    return np.log(inside / (1 - inside))
+
+
+def smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the quaternions (n 4) whose component number ``largest`` (n) is not stored, in the order of the file.
+
+    ``others`` (n 3) are the stored ones as fractions of sqrt(1/2), in [-1, 1].
+    """
+    others = others.astype(np.float32) * np.float32(np.sqrt(0.5))
+    missing = np.sqrt(np.clip(1 - (others**2).sum(-1), 0, None))
+    found = np.empty((len(others), 4), np.float32)
+    for number in range(4):
+        rows = largest == number
+        found[rows] = np.insert(others[rows], number, missing[rows], axis=1)
+    return found

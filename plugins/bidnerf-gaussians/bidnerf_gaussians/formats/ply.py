@@ -1,0 +1,142 @@
+"""PLY files of splats: the layout of the first paper's code, and the compressed one of PlayCanvas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.ply import PlyHeader, read_ply, read_ply_header
+from bidnerf_gaussians.formats.parts import gaussians_of, logit, smallest_three
+from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
+from bidnerf_gaussians.spherical_harmonics import C0
+
+EXPECTED = "a PLY file of Gaussians"
+MEANS, SCALES, TURNS = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), tuple(f"rot_{i}" for i in range(4))
+COLOUR = tuple(f"f_dc_{i}" for i in range(3))
+NEEDED = (*MEANS, *COLOUR, "opacity", *SCALES, *TURNS)
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+CHUNK = 256
+"""Gaussians that share a range in a compressed file."""
+DEGREES = {3 * (count - 1): degree for degree, count in COEFFICIENTS.items()}
+"""Degree of the harmonics by the number of properties ``f_rest_N``."""
+
+
+def recognises(path: Path) -> bool:
+    """Return whether the file is a PLY with the properties of the first paper's code."""
+    header = _header(path)
+    vertex = None if header is None else header.element("vertex")
+    return vertex is not None and {"opacity", "scale_0", "rot_0"} <= set(vertex.names)
+
+
+def recognises_compressed(path: Path) -> bool:
+    """Return whether the file is a compressed PLY of PlayCanvas."""
+    header = _header(path)
+    vertex = None if header is None else header.element("vertex")
+    return vertex is not None and "packed_position" in vertex.names
+
+
+def _header(path: Path) -> PlyHeader | None:
+    if path.suffix.lower() != ".ply" or not path.is_file():
+        return None
+    try:
+        return read_ply_header(path)
+    except InputError:
+        return None
+
+
+def read(path: Path) -> Gaussians:
+    """Return the Gaussians of a PLY: logarithms of the scales, logits of the opacities, quaternions w, x, y, z."""
+    vertices = read_ply(path, EXPECTED)["vertex"]
+    names = vertices.dtype.names or ()
+    missing = [name for name in NEEDED if name not in names]
+    if missing:
+        raise InputError(f"{path}: has no property {', '.join(missing)}, expected {EXPECTED}")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    harmonics = _columns(vertices, COLOUR)[:, None]
+    if rest:
+        harmonics = np.concatenate([harmonics, _rest(vertices, rest, path)], axis=1)
+    return gaussians_of(
+        _columns(vertices, MEANS), _columns(vertices, SCALES), _columns(vertices, TURNS),
+        vertices["opacity"], harmonics,
+    )  # fmt: skip
+
+
+def _rest(rows: np.ndarray, count: int, path: Path) -> np.ndarray:
+    """Return the harmonics (n k 3) above degree 0, which are stored channel by channel."""
+    if count not in DEGREES or any(f"f_rest_{i}" not in (rows.dtype.names or ()) for i in range(count)):
+        raise InputError(
+            f"{path}: has {count} properties f_rest_N, expected 0, 9, 24 or 45 (degree 0 to 3 of the harmonics)"
+        )
+    return _columns(rows, tuple(f"f_rest_{i}" for i in range(count))).reshape(len(rows), 3, -1).swapaxes(1, 2)
+
+
+def _columns(rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    return np.stack([rows[name].astype(np.float32) for name in names], axis=-1)
+
+
+def write(path: Path, gaussians: Gaussians) -> None:
+    """Write a PLY file in the layout of the first paper's code."""
+    count = gaussians.harmonics.shape[1] - 1
+    rest = gaussians.harmonics[:, 1:].mT.reshape(len(gaussians), -1)
+    names = (
+        *MEANS, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(3 * count)), "opacity", *SCALES, *TURNS
+    )  # fmt: skip
+    columns = torch.cat(
+        [
+            gaussians.means, torch.zeros_like(gaussians.means), gaussians.harmonics[:, 0], rest,
+            gaussians.logits[:, None], gaussians.log_scales, gaussians.quaternions,
+        ],
+        dim=-1,
+    )  # fmt: skip
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    header += [f"property float {name}" for name in names] + ["end_header", ""]
+    write_file(path, "\n".join(header).encode() + columns.cpu().numpy().astype("<f4").tobytes())
+
+
+def read_compressed(path: Path) -> Gaussians:
+    """Return the Gaussians of a compressed PLY: numbers of a few bits, within the range of their chunk."""
+    elements = read_ply(path, EXPECTED)
+    vertices, chunks = elements["vertex"], elements.get("chunk")
+    names = vertices.dtype.names or ()
+    missing = [name for name in PACKED if name not in names]
+    if missing or chunks is None or len(chunks) * CHUNK < len(vertices):
+        found = f"no property {', '.join(missing)}" if missing else "too few chunks"
+        raise InputError(f"{path}: has {found}, expected a compressed PLY file of PlayCanvas")
+    position, turn, scale, colour = (vertices[name].astype(np.uint32) for name in PACKED)
+    chunk = np.arange(len(vertices)) // CHUNK
+
+    def within(fractions: np.ndarray, suffixes: tuple[str, ...]) -> np.ndarray:
+        low, high = (_columns(chunks, tuple(f"{end}_{s}" for s in suffixes))[chunk] for end in ("min", "max"))
+        return low + fractions * (high - low)
+
+    bytes_ = np.stack([(colour >> shift) & 255 for shift in (24, 16, 8, 0)], axis=-1) / np.float32(255)
+    rgb = bytes_[:, :3]
+    if "min_r" in (chunks.dtype.names or ()):
+        rgb = within(rgb, ("r", "g", "b"))
+    harmonics = ((rgb - 0.5) / C0)[:, None]
+    extra = elements.get("sh")
+    if extra is not None and len(extra) == len(vertices):
+        found = _rest(extra, len(extra.dtype.names or ()), path)
+        harmonics = np.concatenate([harmonics, (found - 127.5) / 32], axis=1)
+    return gaussians_of(
+        within(_unpacked(position), MEANS),
+        within(_unpacked(scale), ("scale_x", "scale_y", "scale_z")),
+        smallest_three(turn >> 30, _tens(turn) * np.float32(2) - 1),
+        logit(bytes_[:, 3]),
+        harmonics,
+    )
+
+
+def _unpacked(packed: np.ndarray) -> np.ndarray:
+    """Return three fractions of 11, 10 and 11 bits."""
+    parts = ((packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047)
+    return np.stack(parts, axis=-1).astype(np.float32)
+
+
+def _tens(packed: np.ndarray) -> np.ndarray:
+    """Return three fractions of 10 bits."""
+    return np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=-1) / np.float32(1023)

@@ -1,0 +1,159 @@
+"""SOG of PlayCanvas: images (WebP) of quantized numbers beside a ``meta.json``, in a folder or a zip archive ``.sog``."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.json import parse_json
+from bidnerf_gaussians.formats.parts import gaussians_of, logit, smallest_three
+from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
+
+META = "meta.json"
+EXPECTED = "a SOG folder or archive"
+LARGEST_MEMBER = 512 * 2**20
+"""Bytes of an unpacked member of an archive."""
+LARGEST_IMAGE = 64 * 2**20
+"""Pixels: one for each Gaussian."""
+PALETTE_WIDTH = 64
+"""Entries of the palette of harmonics in a row of its image."""
+
+Member = Callable[[str], bytes]
+
+
+def recognises(path: Path) -> bool:
+    """Return whether the path is a .sog archive, a ``meta.json`` that names images of means, or a folder with one."""
+    if path.suffix.lower() == ".sog":
+        return path.is_file()
+    folder = path.parent if path.name == META else path
+    return path.exists() and (folder / META).is_file() and (folder / "means_l.webp").is_file()
+
+
+def read(path: Path) -> Gaussians:
+    """Return the Gaussians of a folder or archive of version 2. Raises ``InputError`` for another, and where it is damaged."""
+    with _opened(path) as member:
+        meta = parse_json(member(META), f"{path}: {META}", EXPECTED)
+        try:
+            return _decoded(meta, member, path)
+        except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"{path}: is damaged ({type(error).__name__}: {error}), expected {EXPECTED}"
+            ) from error
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Member]:
+    """Give a function that returns the content of a member, whose size is checked before it is unpacked."""
+    if path.suffix.lower() != ".sog":
+        folder = path.parent if path.name == META else path
+
+        def of_folder(name: str) -> bytes:
+            if Path(name).name != name:
+                raise InputError(f"{path}: names a file {name!r}, expected one beside {META}")
+            return read_file(folder / name, f"a part of {EXPECTED}", LARGEST_MEMBER)
+
+        yield of_folder
+        return
+    try:
+        archive = zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, OSError) as error:
+        raise InputError(f"{path}: is no zip archive ({error}), expected {EXPECTED}") from error
+    with archive:
+
+        def of_archive(name: str) -> bytes:
+            try:
+                size = archive.getinfo(name).file_size
+                if size > LARGEST_MEMBER:
+                    raise InputError(
+                        f"{path}: {name} unpacks to {size / 2**20:,.0f} MiB, expected at most 512"
+                    )
+                with archive.open(name) as file:
+                    return file.read(LARGEST_MEMBER)
+            except (KeyError, zipfile.BadZipFile, OSError) as error:
+                raise InputError(
+                    f"{path}: has no readable {name} in it ({error}), expected {EXPECTED}"
+                ) from error
+
+        yield of_archive
+
+
+def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:
+    if meta.get("version") != 2:
+        raise InputError(f"{path}: version {meta.get('version')!r} of its {META}, expected 2")
+    count = meta["count"]
+    if type(count) is not int or not 0 < count <= LARGEST_IMAGE:
+        raise InputError(f"{path}: declares {count!r} Gaussians, expected 1 to {LARGEST_IMAGE:,}")
+
+    def pixels(part: str, number: int = 0) -> np.ndarray:
+        name = meta[part]["files"][number]
+        found = _image(member(name), f"{path}: {name}").reshape(-1, 4)
+        if len(found) < count:
+            raise InputError(f"{path}: {name} has {len(found):,} pixels, too few for {count:,} Gaussians")
+        return found[:count]
+
+    def book(part: str) -> np.ndarray:
+        values = np.array(meta[part]["codebook"], dtype=np.float32)
+        if values.shape != (256,):
+            raise InputError(f"{path}: a codebook of {values.shape} in {part}, expected 256 numbers")
+        return values
+
+    low, high = (np.array(meta["means"][end], dtype=np.float32) for end in ("mins", "maxs"))
+    steps = pixels("means", 0)[:, :3] + 256 * pixels("means", 1)[:, :3].astype(np.int32)
+    logarithm = low + (high - low) * (steps / np.float32(65535))
+    turn = pixels("quats")
+    colour = pixels("sh0")
+    harmonics = book("sh0")[colour[:, :3]][:, None]
+    if "shN" in meta:
+        harmonics = np.concatenate([harmonics, _rest(meta["shN"], book("shN"), pixels, member, path)], axis=1)
+    return gaussians_of(
+        np.sign(logarithm) * np.expm1(np.abs(logarithm)),
+        book("scales")[pixels("scales")[:, :3]],
+        smallest_three(turn[:, 3].astype(np.int32) - 252, turn[:, :3] / np.float32(127.5) - 1),
+        logit(colour[:, 3] / np.float32(255)),
+        harmonics,
+    )
+
+
+def _rest(
+    meta: Any, book: np.ndarray, pixels: Callable[[str, int], np.ndarray], member: Member, path: Path
+) -> np.ndarray:
+    """Return the harmonics (n k 3) above degree 0: each Gaussian names an entry of a palette."""
+    count = COEFFICIENTS[meta["bands"]] - 1
+    labels = pixels("shN", 1).astype(np.int32)
+    entry = labels[:, 0] + 256 * labels[:, 1]
+    palette = _image(member(meta["files"][0]), f"{path}: {meta['files'][0]}")
+    if palette.shape[1] != PALETTE_WIDTH * count:
+        raise InputError(f"{path}: a palette {palette.shape[1]} wide, expected {PALETTE_WIDTH * count}")
+    entries = palette[..., :3].reshape(-1, count, 3)  # row by row, ``PALETTE_WIDTH`` a row
+    if int(entry.max()) >= len(entries):
+        raise InputError(f"{path}: names entry {int(entry.max())} of a palette of {len(entries)}")
+    return book[entries[entry]]
+
+
+def _image(content: bytes, where: str) -> np.ndarray:
+    """Return the pixels (h w 4) of an image, whose size is checked before it is decoded."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(io.BytesIO(content), formats=("WEBP", "PNG"))
+            if image.width * image.height > LARGEST_IMAGE:
+                raise InputError(
+                    f"{where}: has {image.width} x {image.height} pixels, expected at most {LARGEST_IMAGE:,}"
+                )
+            return np.asarray(image.convert("RGBA"))
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"{where}: is no image that can be read ({error}), expected a lossless WebP"
+        ) from error

@@ -1,0 +1,35 @@
+"""``.splat`` files: 32 bytes a Gaussian, without a header and without dependence on direction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import read_file
+from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, logit
+from bidnerf_gaussians.gaussians import Gaussians
+from bidnerf_gaussians.spherical_harmonics import C0
+
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
+
+
+def recognises(path: Path) -> bool:
+    """Return whether the name ends in .splat: the file has no header."""
+    return path.suffix.lower() == ".splat" and path.is_file()
+
+
+def read(path: Path) -> Gaussians:
+    """Return the Gaussians of a file: scales themselves, colours and opacities of a byte, quaternions (b - 128) / 128."""
+    content = read_file(path, "a .splat file", LARGEST_FILE)
+    if not content or len(content) % ROW.itemsize:
+        raise InputError(f"{path}: has {len(content):,} bytes, expected a multiple of 32: one Gaussian each")
+    rows = np.frombuffer(content, ROW)
+    rgba = rows["rgba"] / np.float32(255)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales = np.log(rows["scales"])
+    quaternions = (rows["turn"].astype(np.float32) - 128) / 128
+    return gaussians_of(
+        rows["means"], log_scales, quaternions, logit(rgba[:, 3]), ((rgba[:, :3] - 0.5) / C0)[:, None]
+    )

@@ -1,0 +1,136 @@
+"""A set of Gaussians as a file holds it, before it is a field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_gaussians.quaternions import product, quaternion_of
+from bidnerf_gaussians.spherical_harmonics import rotated
+
+COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
+"""Number of spherical harmonics up to each degree."""
+LARGEST = 1e12
+"""Scene units: largest coordinate and size of a Gaussian."""
+LARGEST_LOGIT = 14.0
+"""Logit of the opacity at which alpha is 1 in single precision, for all that matters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """The parameters of n Gaussians, in the terms of the first paper's code (Kerbl et al. 2023)."""
+
+    means: Float[Tensor, "n 3"]  # scene units, world
+    log_scales: Float[Tensor, "n 3"]  # logarithms of the standard deviations along the axes
+    quaternions: Float[
+        Tensor, "n 4"
+    ]  # w, x, y, z of the rotation that takes the axes to the world; not normalized
+    logits: Float[Tensor, "n"]  # opacity is their sigmoid
+    harmonics: Float[
+        Tensor, "n k 3"
+    ]  # coefficients of the colour's spherical harmonics, minus a colour of 0.5
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+        return Gaussians(*(getattr(self, part.name)[index] for part in fields(self)))
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        return next(degree for degree, count in COEFFICIENTS.items() if count == self.harmonics.shape[1])
+
+    @property
+    def opacities(self) -> Float[Tensor, "n"]:
+        """Opacities, in [0, 1]."""
+        return self.logits.sigmoid()
+
+    def similar(
+        self, scale: float, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
+    ) -> Gaussians:
+        """Return the Gaussians moved by ``x -> rotation @ (scale * x) + translation``; colours turn with them."""
+        R = rotation.double()
+        means = (scale * self.means.double()) @ R.mT + translation.double()
+        turn = quaternion_of(R).to(self.quaternions)
+        is_turned = bool((R - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-9)
+        return Gaussians(
+            means.float(),
+            self.log_scales + float(torch.tensor(scale).log()),
+            product(turn.expand_as(self.quaternions), self.quaternions) if is_turned else self.quaternions,
+            self.logits,
+            rotated(self.harmonics, R) if is_turned else self.harmonics,
+        )
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """How many Gaussians of a file were left out, and why."""
+
+    not_finite: int = 0  # a number of theirs is NaN or infinite, or too large
+    without_rotation: int = 0  # their quaternion is zero
+    invisible: int = 0  # their opacity is below what is ever rendered
+
+    def __str__(self) -> str:
+        parts = [
+            f"{count:,} {what}"
+            for count, what in (
+                (self.not_finite, "with numbers that are not finite or too large"),
+                (self.without_rotation, "with a quaternion of zero"),
+                (self.invisible, "that are transparent"),
+            )
+            if count
+        ]
+        return ", ".join(parts)
+
+
+LEAST_OPACITY = 1 / 255
+"""Opacity below which a Gaussian is never seen; also of alpha along a ray, as in the first paper's code."""
+
+
+def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
+    """Return the Gaussians that can be rendered, and how many were left out.
+
+    Raises ``InputError`` where none is left; ``where`` begins the message.
+    """
+    if found.harmonics.shape[1] not in COEFFICIENTS.values():
+        raise InputError(
+            f"{where}: {found.harmonics.shape[1]} spherical harmonics, expected 1, 4, 9 or 16 (degree 0 to 3)"
+        )
+    finite = _finite(found)
+    turned = found.quaternions.abs().amax(-1) > 1e-12
+    visible = found.logits.sigmoid() >= LEAST_OPACITY
+    kept = finite & turned & visible
+    dropped = Dropped(
+        int((~finite).sum()), int((finite & ~turned).sum()), int((finite & turned & ~visible).sum())
+    )
+    if not bool(kept.any()):
+        what = f": {dropped}" if len(found) else ""
+        raise InputError(
+            f"{where}: none of its {len(found):,} Gaussians can be rendered{what}, expected one or more"
+        )
+    few = found if bool(kept.all()) else found[kept]
+    return Gaussians(
+        few.means.float(),
+        few.log_scales.float(),
+        torch.nn.functional.normalize(few.quaternions.float(), dim=-1),
+        few.logits.float().clamp(max=LARGEST_LOGIT),
+        few.harmonics.float(),
+    ), dropped
+
+
+def _finite(found: Gaussians) -> Bool[Tensor, "n"]:
+    opaque = found.logits == torch.inf  # an opacity of 1, which some writers store
+    finite = found.logits.isfinite() | opaque
+    for value, most in (
+        (found.means, LARGEST),
+        (found.log_scales, torch.tensor(LARGEST).log().item()),
+        (found.quaternions, LARGEST),
+        (found.harmonics.flatten(1), LARGEST),
+    ):
+        finite = finite & (value.abs() <= most).all(-1)  # False for NaN
+    return finite

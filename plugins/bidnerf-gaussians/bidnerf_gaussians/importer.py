@@ -1,0 +1,163 @@
+"""The importer of files of Gaussians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures.cameras import StoredCamera
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.json import parse_record
+from bidnerf_core.maps.importers import UNMOVED, ImportedField, bounds_about
+from bidnerf_core.settings import NotNegative, Range, Settings
+from bidnerf_gaussians.field import GaussiansField
+from bidnerf_gaussians.formats import Format, format_of
+from bidnerf_gaussians.gaussians import Gaussians, cleaned
+from bidnerf_gaussians.recipe import GaussiansConfig
+
+DILATION = 0.3
+"""Square pixels that the first paper's code adds to the covariance of each Gaussian in an image."""
+OPAQUE = 0.3
+"""Opacity from which a Gaussian counts as matter, where the extent of a scene is measured."""
+FEWEST = 100
+"""Opaque Gaussians below which all count."""
+UP = (0.0, -1.0, 0.0)
+"""Upwards where y is down, as in COLMAP's and OpenCV's cameras; trained splats follow their first cameras, if anything."""
+
+
+@dataclass(frozen=True)
+class ImportSettings(Settings):
+    """What a file does not say."""
+
+    # angle between neighbouring pixels of the training images (radians), by which the first paper's code widens small Gaussians; 0: not widened
+    pixel_angle: Annotated[float, Range(0, 0.1)] = 0.001
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour (rgb) where a ray meets nothing
+    degree: Annotated[int, Range(0, 3)] = 3  # highest degree of the harmonics that is kept
+    least_opacity: NotNegative = 0.0  # opacity below which Gaussians are left out
+
+
+@dataclass(frozen=True)
+class GaussiansImporter:
+    """Reads files of Gaussians of all formats."""
+
+    summary: str = (
+        "Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, checkpoints of gsplat and splatfacto"
+    )
+    config_type: type = ImportSettings
+
+    def recognises(self, path: Path) -> bool:
+        """Return whether the file is one of the formats."""
+        try:
+            return format_of(path) is not None
+        except OSError:
+            return False
+
+    def read(self, path: Path, config: ImportSettings, placement: Similarity) -> ImportedField:
+        """Return the field of the Gaussians in a file, see ``Importer``."""
+        found = format_of(path)
+        if found is None:
+            raise InputError(f"{path}: no file of Gaussians that can be read, expected {self.summary}")
+        return imported(
+            found.read(path), str(path), config, placement, found, _cameras_beside(path, placement)
+        )
+
+
+def imported(
+    gaussians: Gaussians, where: str, config: ImportSettings = ImportSettings(),
+    placement: Similarity = UNMOVED, of: Format | None = None,
+    cameras: tuple[StoredCamera, ...] = (),
+) -> ImportedField:  # fmt: skip
+    """Return Gaussians of any source as a field. Raises ``InputError`` where none of them can be rendered."""
+    kept, dropped = cleaned(gaussians, where)
+    if config.least_opacity:
+        kept = kept[kept.opacities >= config.least_opacity]
+        if not len(kept):
+            raise InputError(f"{where}: no Gaussian is as opaque as {config.least_opacity:g} (least_opacity)")
+    count = len(gaussians)
+    kept = replace(kept, harmonics=kept.harmonics[:, : (config.degree + 1) ** 2])
+    T = placement.T_target_source
+    moved = kept.similar(placement.scale, T.rotation, T.translation)
+    moved = with_dilation(moved, config.pixel_angle, cameras)
+    opaque = moved.means[moved.opacities > OPAQUE]
+    points = opaque if len(opaque) >= FEWEST else moved.means
+    bounds = bounds_about(points, config.background)
+    settings = GaussiansConfig(gaussians=len(moved), degree=moved.degree, steps=1)
+    field = GaussiansField(settings, bounds)
+    field.assign(moved)
+    facts = [f"{count:,} Gaussians, harmonics of degree {gaussians.degree}" + (f" ({of.name})" if of else "")]
+    if str(dropped):
+        facts.append(f"left out {dropped}")
+    if of is not None:
+        facts.append(f"axes: {of.convention}")
+    up = T.rotation.double() @ torch.tensor(UP, dtype=torch.float64)
+    return ImportedField(
+        "gaussians", settings, dict(field.state_dict()), bounds, tuple(facts), settings.steps, points, cameras,
+        (float(up[0]), float(up[1]), float(up[2])),
+    )  # fmt: skip
+
+
+def with_dilation(
+    gaussians: Gaussians, pixel_angle: float, cameras: tuple[StoredCamera, ...] = ()
+) -> Gaussians:
+    """Return the Gaussians as wide as a renderer of images shows them: no narrower than about half a pixel.
+
+    The first paper's code adds ``DILATION`` square pixels to the covariance in the image, and Gaussians are trained with it. A
+    ray has no width, so the Gaussians themselves are widened by what a pixel covers at their distance from the nearest camera
+    or, where no camera is known, from half the scene's diameter away (as in the 3D filter of Yu et al. 2024).
+    """
+    if pixel_angle == 0:
+        return gaussians
+    width = math.sqrt(DILATION) * pixel_angle * _distances(gaussians.means, cameras)
+    square = (2 * gaussians.log_scales).exp() + width.square()[:, None]
+    return replace(gaussians, log_scales=0.5 * square.log())
+
+
+def _distances(means: Float[Tensor, "n 3"], cameras: tuple[StoredCamera, ...]) -> Float[Tensor, "n"]:
+    if not cameras:
+        middle = means.median(0).values
+        away = torch.linalg.vector_norm(means - middle, dim=-1)
+        return torch.maximum(away, away.median()).clamp(
+            max=float(away.quantile(0.9) if len(away) < 2**24 else away.max())
+        )
+    eyes = torch.stack([camera.pose.translation for camera in cameras]).to(means)
+    return torch.cat([torch.cdist(some, eyes).amin(1) for some in means.split(65536)])
+
+
+def _cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
+    """Return the cameras in the ``cameras.json`` that the first paper's code writes at the top of its output."""
+    folders = [path.parent, *list(path.parent.parents)[:2]]
+    file = next((folder / "cameras.json" for folder in folders if (folder / "cameras.json").is_file()), None)
+    if file is None:
+        return ()
+    record = parse_record(str(file), b'{"cameras":' + read_file(file, "cameras.json") + b"}")
+    cameras = []
+    for entry in record.items("cameras") or []:
+        try:
+            camera = Intrinsics(
+                float(entry["fx"]), float(entry["fy"]), entry["width"] / 2, entry["height"] / 2,
+                int(entry["width"]), int(entry["height"]),
+            )  # fmt: skip
+            rotation = torch.tensor(entry["rotation"], dtype=torch.float64)
+            position = placement.apply(torch.tensor(entry["position"], dtype=torch.float64))
+            pose = SE3(placement.T_target_source.rotation.double() @ rotation, position)
+            rows = tuple((r[0], r[1], r[2], r[3]) for r in pose.matrix().tolist())
+            cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{file}: camera {len(cameras)} is not readable ({error}), expected Inria's layout"
+            ) from error
+    return tuple(cameras)
+
+
+importer = GaussiansImporter()
+"""Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, checkpoints of gsplat and splatfacto"""

@@ -1,0 +1,48 @@
+"""Densification with a fixed number: Gaussians that are hardly seen are put where others carry much."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Generator
+
+from bidnerf_gaussians.field import GaussiansField
+from bidnerf_gaussians.quaternions import matrices
+
+MOST_MOVED = 0.05
+"""Largest share of the Gaussians that is moved at once."""
+NARROWED = 1.6
+"""Factor by which the two Gaussians that replace one are narrower, as in the first paper's code."""
+
+
+@torch.no_grad()
+def relocate(field: GaussiansField, least_opacity: float, generator: Generator) -> int:
+    """Split opaque and wide Gaussians, each with one that is nearly transparent, and return how many were moved.
+
+    The split ones are drawn by opacity times the area that they cover. Both parts have the opacity with which two behind each other
+    are as opaque as the one was (Kheradmand et al. 2024, eq. 9), and lie about its middle as its own density does.
+    """
+    opacity = field.logits.sigmoid().cpu()
+    dead = (opacity < least_opacity).nonzero()[:, 0]
+    dead = dead[torch.randperm(len(dead), generator=generator)[: int(MOST_MOVED * len(opacity))]]
+    area = torch.exp(field.log_scales.cpu().sort(dim=-1).values[:, 1:].sum(-1))
+    weight = torch.where(opacity < least_opacity, 0, opacity * area).double()
+    alive = int((weight > 0).sum())
+    count = min(len(dead), alive)
+    if not count:
+        return 0
+    chosen = torch.multinomial(weight, count, generator=generator)
+    offsets = torch.randn((count, 3), generator=generator)
+    device = field.means.device
+    dead, chosen, offsets = dead[:count].to(device), chosen.to(device), offsets.to(device)
+    turn = matrices(torch.nn.functional.normalize(field.quaternions[chosen], dim=-1))
+    offset = (turn @ (field.log_scales[chosen].exp() * offsets)[..., None])[..., 0] / 2
+    share = 1 - (1 - field.logits[chosen].sigmoid()).clamp(min=1e-6).sqrt()
+    logit = share.clamp(least_opacity, 1 - 1e-6).logit()
+    middle, width = field.means[chosen], field.log_scales[chosen] - math.log(NARROWED)
+    turns, harmonics = field.quaternions[chosen], field.harmonics[chosen]
+    for index, place in ((chosen, middle + offset), (dead, middle - offset)):
+        field.means[index], field.log_scales[index], field.logits[index] = place, width, logit
+        field.quaternions[index], field.harmonics[index] = turns, harmonics
+    return count

@@ -1,0 +1,9 @@
+"""The contract's tests of the backend."""
+
+from bidnerf_core.testing import BackendContract
+from bidnerf_gaussians import GaussiansConfig
+
+
+class TestGaussians(BackendContract):
+    name = "gaussians"
+    config = GaussiansConfig(gaussians=600, steps=40, rays_per_step=512, relocate_every=15, degree=1)

@@ -1,0 +1,146 @@
+"""The field: what rays meet is what every Gaussian by itself gives, in order of depth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bidnerf_core.devices import without_waiting
+from bidnerf_core.fields.contract import Rays, SceneBounds
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_gaussians import Gaussians, GaussiansConfig, GaussiansField, quaternions
+from bidnerf_gaussians import index as boxes
+from bidnerf_gaussians.gaussians import LEAST_OPACITY
+from bidnerf_gaussians.spherical_harmonics import colours
+
+BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.01, 10.0)
+
+
+def field_of(gaussians: Gaussians) -> GaussiansField:
+    field = GaussiansField(GaussiansConfig(gaussians=len(gaussians), degree=gaussians.degree), BOUNDS)
+    field.assign(gaussians)
+    return field.requires_grad_(False)
+
+
+def rays(count: int = 60, seed: int = 3) -> Rays:
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=-1)
+    origins = -3 * directions + 0.4 * torch.randn((count, 3), generator=generator)
+    return Rays(origins, directions, torch.full((count,), 0.01), torch.full((count,), 10.0))
+
+
+def by_each(gaussians: Gaussians, along: Rays) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return colour, mean distance and opacity of rays, by the precisions of all Gaussians, in float64."""
+    R = quaternions.matrices(gaussians.quaternions.double())
+    P = R @ torch.diag_embed((-2 * gaussians.log_scales.double()).exp()) @ R.mT
+    d, o = along.directions.double()[:, None], along.origins.double()[:, None]
+    away = gaussians.means.double() - o
+    Pd = torch.einsum("nij,rnj->rni", P, d.expand_as(away))
+    t = (Pd * away).sum(-1) / (Pd * d).sum(-1)
+    x = t[..., None] * d - away
+    alpha = gaussians.logits.double().sigmoid() * torch.exp(-0.5 * torch.einsum("rni,nij,rnj->rn", x, P, x))
+    alpha = torch.where((alpha >= LEAST_OPACITY) & (t > along.near[:, None]), alpha, 0)
+    order = t.argsort(dim=1)
+    alpha, t = alpha.gather(1, order), t.gather(1, order)
+    seen = colours(gaussians.harmonics.double()[order], d.expand(*t.shape, 3))
+    weight = alpha * torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)[:, :-1]], dim=1)
+    return (weight[..., None] * seen).sum(1), (weight * t).sum(1), weight.sum(1)
+
+
+@pytest.mark.parametrize("count", [1, 3, 500])
+def test_rays_see_all_gaussians_in_order_of_depth(some: Callable[..., Gaussians], count: int) -> None:
+    gaussians = some(count, degree=2)
+    found = render(field_of(gaussians), rays())
+    rgb, distance, opacity = by_each(gaussians, rays())
+    # light that is lost behind what stops all but one ten-thousandth of it is not looked for
+    for value, expected in ((found.rgb, rgb), (found.distance, distance), (found.opacity, opacity)):
+        assert torch.allclose(value.double(), expected, atol=1e-3)
+    assert count < 500 or float(opacity.max()) > 0.5
+
+
+def test_one_gaussian_alone() -> None:
+    """Through its middle, alpha is the opacity; a standard deviation beside it, exp(-1/2) of that."""
+    alone = Gaussians(
+        torch.zeros(1, 3), torch.tensor([[0.1, 0.2, 0.4]]).log(), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([0.0]),
+        torch.ones(1, 1, 3),
+    )  # fmt: skip
+    origins = torch.tensor([[0.0, 0, -3], [0.1, 0, -3], [0, 0.2, -3], [-3, 0, 0.4]])
+    directions = torch.tensor([[0.0, 0, 1]] * 3 + [[1.0, 0, 0]])
+    hits = field_of(alone).hits(Rays(origins, directions, torch.zeros(4), torch.full((4,), 10.0)))
+    side = 0.5 * math.exp(-0.5)
+    assert torch.allclose(hits.alpha[:, 0], torch.tensor([0.5, side, side, side]), atol=1e-6)
+    assert torch.allclose(hits.distance[:, 0], torch.full((4,), 3.0), atol=1e-5)
+
+
+def test_moved_with_the_rays_nothing_changes(some: Callable[..., Gaussians]) -> None:
+    gaussians, along = some(200, degree=3), rays()
+    T = SE3.exp(torch.tensor([0.3, -0.8, 0.5, 0.7, -1.9, 0.4], dtype=torch.float64))
+    moved = gaussians.similar(2.5, T.rotation, T.translation)
+    there = Rays(
+        T.apply(2.5 * along.origins.double()).float(), T.rotate(along.directions.double()).float(), along.near,
+        2.5 * along.far,
+    )  # fmt: skip
+    before, after = render(field_of(gaussians), along), render(field_of(moved), there)
+    assert torch.allclose(before.rgb, after.rgb, atol=2e-3)
+    assert torch.allclose(2.5 * before.distance, after.distance, atol=1e-2)
+
+
+def test_in_known_shapes_the_same_is_seen(
+    some: Callable[..., Gaussians], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field, along = field_of(some(300)), rays()
+    expected = render(field, along)
+    points = rays(50, 5).at(torch.full((50, 1), 3.0))[:, 0]
+    density = field.query(points, along.directions[:50])
+    monkeypatch.setattr("bidnerf_gaussians.field.may_wait", lambda device: False)
+    with without_waiting():
+        found = render(field, along)
+        again = field.query(points, along.directions[:50])
+    assert torch.allclose(found.rgb, expected.rgb, atol=1e-3)
+    assert torch.allclose(again.density, density.density, atol=1e-3 * float(density.density.max()))
+
+
+def test_many_boxes_are_tested_in_parts(
+    some: Callable[..., Gaussians], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field, along = field_of(some(300)), rays()
+    expected = field.hits(along)
+    monkeypatch.setattr(boxes, "MOST_PAIRS", 400)
+    found = field.hits(along)
+    assert torch.equal(found.alpha, expected.alpha)
+
+
+def test_transparent_gaussians_are_not_met(some: Callable[..., Gaussians]) -> None:
+    gaussians = some(50)
+    gone = replace(gaussians, logits=torch.full((50,), -20.0))
+    assert field_of(gone).hits(rays()).alpha.shape[-1] == 0
+    seen = render(field_of(gone), rays(), (0.1, 0.2, 0.3))
+    assert torch.allclose(seen.rgb, torch.tensor([0.1, 0.2, 0.3]).expand_as(seen.rgb))
+
+
+def test_harmonics_are_orthonormal() -> None:
+    from bidnerf_gaussians.spherical_harmonics import basis
+
+    directions = torch.nn.functional.normalize(
+        torch.randn((200_000, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64), dim=-1
+    )
+    values = basis(directions, 16)
+    found = 4 * math.pi * values.mT @ values / len(values)
+    assert torch.allclose(found, torch.eye(16, dtype=torch.float64), atol=0.03)
+
+
+def test_quaternions_turn_as_their_matrices() -> None:
+    q = torch.nn.functional.normalize(
+        torch.randn((20, 4), generator=torch.Generator().manual_seed(1), dtype=torch.float64), dim=-1
+    )
+    v = torch.randn((20, 3), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    R = quaternions.matrices(q)
+    assert torch.allclose(quaternions.turned_back(q, v), (R.mT @ v[..., None])[..., 0])
+    assert torch.allclose(quaternions.matrices(quaternions.product(q, q.flip(0))), R @ R.flip(0))
+    for each in R:
+        assert torch.allclose(quaternions.matrices(quaternions.quaternion_of(each)), each)

@@ -1,0 +1,342 @@
+"""Files of Gaussians: what is written is read again, known bytes have known values, and what is damaged is told."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import os
+import pickle
+import struct
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+from PIL import Image
+
+from bidnerf_core.errors import InputError
+from bidnerf_gaussians import Gaussians, read_gaussians, write_gaussians
+from bidnerf_gaussians.formats import format_of, spz
+from bidnerf_gaussians.gaussians import cleaned
+from bidnerf_gaussians.quaternions import matrices
+
+Some = Callable[..., Gaussians]
+C0 = 0.28209479177387814
+
+
+def differences(a: Gaussians, b: Gaussians) -> dict[str, float]:
+    """Return the largest differences of the parameters; of rotations that of their matrices."""
+
+    def turn(g: Gaussians) -> torch.Tensor:
+        return matrices(torch.nn.functional.normalize(g.quaternions, dim=-1))
+
+    found = {
+        name: float((getattr(a, name) - getattr(b, name)).abs().max())
+        for name in ("means", "log_scales", "logits", "harmonics")
+    }
+    return found | {"rotation": float((turn(a) - turn(b)).abs().max())}
+
+
+def test_a_written_ply_is_read_again(tmp_path: Path, some: Some) -> None:
+    for degree in range(4):
+        path = tmp_path / f"{degree}.ply"
+        write_gaussians(path, some(20, degree))
+        assert max(differences(read_gaussians(path), some(20, degree)).values()) < 1e-6
+
+
+def test_a_written_spz_is_read_again_to_within_its_bytes(tmp_path: Path, some: Some) -> None:
+    for degree in range(4):
+        path = tmp_path / f"{degree}.spz"
+        g = some(200, degree)
+        g.harmonics.clamp_(-0.98, 0.98)  # the range of a byte
+        write_gaussians(path, g)
+        found = differences(read_gaussians(path), g)
+        assert found["means"] < 1e-5
+        assert found["log_scales"] < 0.04
+        assert found["rotation"] < 0.01
+        assert found["harmonics"] < 0.02
+        assert found["logits"] < 0.05
+
+
+def test_an_spz_has_other_axes_than_a_ply(tmp_path: Path, some: Some) -> None:
+    """In the file y is up and z is back; here they are as in a PLY."""
+    path = tmp_path / "one.spz"
+    gaussians = replace(some(1, 0), means=torch.tensor([[1.0, 2.0, 3.0]]))
+    write_gaussians(path, gaussians)
+    raw = gzip.decompress(path.read_bytes())
+    bits = raw[13]
+    fixed = [int.from_bytes(raw[16 + 3 * i : 19 + 3 * i], "little", signed=True) / 2**bits for i in range(3)]
+    assert fixed == pytest.approx([1, -2, -3], abs=1e-4)
+
+
+def spz_content(version: int, count: int = 2, degree: int = 0) -> list[bytes]:
+    """Return the sections of a file: positions (1, -2, -3), opacity 0.5, grey, scales exp(-2), no rotation."""
+    if version == 1:
+        position = np.tile(np.array([1, -2, -3], "<f2"), count).tobytes()
+    else:
+        position = b"".join(int(v * 4096).to_bytes(3, "little", signed=True) for v in (1, -2, -3)) * count
+    identity = bytes([128, 128, 128]) if version < 3 else struct.pack("<I", 3 << 30)
+    harmonics = bytes([128]) * (3 * ((degree + 1) ** 2 - 1) * count)
+    return [
+        position,
+        bytes([128]) * count,
+        bytes([128]) * 3 * count,
+        bytes([128]) * 3 * count,
+        identity * count,
+        harmonics,
+    ]
+
+
+def test_all_versions_of_spz(tmp_path: Path) -> None:
+    for version in (1, 2, 3, 4):
+        sections, path = spz_content(version, degree=1), tmp_path / f"{version}.spz"
+        if version < 4:
+            header = struct.pack("<4sIIBBBB", b"NGSP", version, 2, 1, 12, 0, 0)
+            path.write_bytes(gzip.compress(header + b"".join(sections)))
+        else:
+            packed = [zstandard.ZstdCompressor().compress(part) for part in sections]
+            sizes = b"".join(
+                struct.pack("<QQ", len(a), len(b)) for a, b in zip(packed, sections, strict=True)
+            )
+            header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 2, 1, 12, 0, 6, 32)
+            path.write_bytes(header + sizes + b"".join(packed))
+        found = read_gaussians(path)
+        assert found.means.tolist() == [[1, 2, 3]] * 2, version
+        assert torch.allclose(found.log_scales, torch.tensor(-2.0))
+        assert found.degree == 1
+        assert float(found.opacities[0]) == pytest.approx(0.5, abs=0.01)
+        turned = matrices(torch.nn.functional.normalize(found.quaternions, dim=-1))
+        assert torch.allclose(turned.abs(), torch.eye(3), atol=0.02), version
+
+
+def test_known_bytes_of_a_splat_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.splat"
+    path.write_bytes(struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 128, 128, 255, 128, 128, 128))
+    found = read_gaussians(path)
+    assert found.means.tolist() == [[1, 2, 3]]
+    assert torch.allclose(found.log_scales.exp(), torch.tensor([[0.1, 0.2, 0.3]]))
+    assert torch.allclose(0.5 + C0 * found.harmonics[0, 0], torch.tensor([1.0, 0, 128 / 255]), atol=1e-6)
+    assert found.quaternions[0, 0] > 0.9
+    assert float(found.quaternions[0, 1:].abs().max()) == 0
+
+
+def compressed_ply(counts: tuple[int, int] = (1, 2)) -> bytes:
+    """Return a compressed file of one chunk from -1 to 1, with one Gaussian in a corner and one in the middle."""
+    ranges = ("x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b")
+    order = [
+        f"{end}_{name}"
+        for part in (ranges[:3], ranges[3:6], ranges[6:])
+        for end in ("min", "max")
+        for name in part
+    ]
+    header = ["ply", "format binary_little_endian 1.0", f"element chunk {counts[0]}"]
+    header += [f"property float {name}" for name in order] + [f"element vertex {counts[1]}"]
+    header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    limits = {"x": (-1, 1), "y": (-1, 1), "z": (-1, 1), "r": (0, 1), "g": (0, 1), "b": (0, 1)}
+    chunk = [limits.get(n.split("_", 1)[1], (-4, -2))[n.startswith("max")] for n in order]
+    middle = 512 << 20 | 512 << 10 | 512
+    rows = (
+        (2**32 - 1, middle, 0, 0xFF0000FF),
+        (1024 << 21 | 512 << 11 | 1024, middle, 2**32 - 1, 0x80808080),
+    )
+    body = struct.pack("<18f", *chunk) + b"".join(struct.pack("<4I", *row) for row in rows)
+    return "\n".join([*header, "end_header", ""]).encode() + body
+
+
+def test_known_bits_of_a_compressed_ply(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(compressed_ply())
+    found = read_gaussians(path)
+    assert torch.allclose(found.means, torch.tensor([[1.0, 1, 1], [0, 0, 0]]), atol=1e-3)
+    assert torch.allclose(found.log_scales, torch.tensor([[-4.0] * 3, [-2] * 3]))
+    assert torch.allclose(0.5 + C0 * found.harmonics[0, 0], torch.tensor([1.0, 0, 0]), atol=1e-6)
+    assert float(found.opacities[0]) > 0.999
+    assert float(found.quaternions[0, 0]) > 0.999
+
+
+def sog_parts(count: int = 3) -> dict[str, bytes]:
+    """Return the members of a SOG archive of ``count`` equal Gaussians in an image of 2 x 2."""
+
+    def image(*pixel: int, size: tuple[int, int] = (2, 2)) -> bytes:
+        content = io.BytesIO()
+        Image.new("RGBA", size, pixel).save(content, "WEBP", lossless=True, exact=True)
+        return content.getvalue()
+
+    book = np.linspace(-4, 4, 256).tolist()
+    files = {
+        "means": ["means_l.webp", "means_u.webp"], "quats": ["quats.webp"], "scales": ["scales.webp"],
+        "sh0": ["sh0.webp"], "shN": ["centroids.webp", "labels.webp"],
+    }  # fmt: skip
+    meta = {name: {"files": names, "codebook": book} for name, names in files.items()}
+    meta["means"] |= {"mins": [-1, -1, -1], "maxs": [1, 1, 1]}
+    meta["shN"] |= {"bands": 1, "count": 64}
+    return {
+        "meta.json": json.dumps({"version": 2, "count": count} | meta).encode(),
+        "means_l.webp": image(255, 0, 255, 255), "means_u.webp": image(255, 0, 127, 255),
+        "quats.webp": image(128, 128, 128, 252), "scales.webp": image(0, 255, 0, 255),
+        "sh0.webp": image(255, 0, 255, 128), "centroids.webp": image(255, 0, 0, 255, size=(64 * 3, 1)),
+        "labels.webp": image(5, 0, 0, 255),
+    }  # fmt: skip
+
+
+def write_sog(path: Path, parts: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    return path
+
+
+def test_known_bytes_of_a_sog_archive_and_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name, content in sog_parts().items():
+        (folder / name).write_bytes(content)
+    for path in (write_sog(tmp_path / "a.sog", sog_parts()), folder, folder / "meta.json"):
+        found = read_gaussians(path)
+        assert len(found) == 3
+        assert found.degree == 1
+        e = np.e - 1
+        assert found.means[0].tolist() == pytest.approx([e, -e, 0], abs=1e-2)
+        assert found.log_scales[0].tolist() == [-4, 4, -4]
+        assert found.harmonics[0].tolist() == [[4, -4, 4]] + [[4, -4, -4]] * 3
+        assert float(found.quaternions[0, 0]) > 0.99
+
+
+def test_checkpoints_of_gsplat_and_splatfacto(tmp_path: Path, some: Some) -> None:
+    g = some(10, 2)
+    names = {"means": g.means, "scales": g.log_scales, "quats": g.quaternions}
+    gsplat = names | {"opacities": g.logits, "sh0": g.harmonics[:, :1], "shN": g.harmonics[:, 1:]}
+    splatfacto = names | {
+        "opacities": g.logits[:, None], "features_dc": g.harmonics[:, 0], "features_rest": g.harmonics[:, 1:]
+    }  # fmt: skip
+    pipeline = {f"_model.gauss_params.{name}": value for name, value in splatfacto.items()}
+    torch.save({"step": 1, "splats": gsplat}, tmp_path / "a.pt")
+    torch.save({"pipeline": pipeline | {"_model.lpips.weight": torch.zeros(2)}}, tmp_path / "b.ckpt")
+    for name in ("a.pt", "b.ckpt"):
+        assert max(differences(read_gaussians(tmp_path / name), g).values()) == 0
+
+
+def test_a_pickle_is_not_executed(tmp_path: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return os.system, (f"touch {tmp_path}/executed",)
+
+    torch.save({"splats": {"means": Trap()}}, tmp_path / "a.pt")
+    (tmp_path / "b.pt").write_bytes(pickle.dumps(Trap()))
+    for name in ("a.pt", "b.pt"):
+        with pytest.raises(InputError):
+            read_gaussians(tmp_path / name)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_gaussians_that_cannot_be_rendered_are_dropped_and_counted(some: Some) -> None:
+    g = some(8)
+    g.means[0, 1] = torch.nan
+    g.log_scales[1, 0] = torch.inf
+    g.quaternions[2] = 0
+    g.logits[3] = -30
+    g.logits[4] = torch.inf  # an opacity of 1
+    g.log_scales[5] = -torch.inf
+    kept, dropped = cleaned(g, "x")
+    assert len(kept) == 3
+    assert (dropped.not_finite, dropped.without_rotation, dropped.invisible) == (3, 1, 1)
+    assert bool(kept.logits.isfinite().all())
+    assert "3 with numbers that are not finite" in str(dropped)
+    with pytest.raises(InputError, match="none of its 1 Gaussians"):
+        cleaned(g[:1], "x")
+    with pytest.raises(InputError, match="spherical harmonics"):
+        cleaned(replace(g, harmonics=torch.zeros(8, 5, 3)), "x")
+
+
+def inria(count: int, rest: int = 0, body: bytes = b"") -> bytes:
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity"]
+    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    return "\n".join([*lines, *(f"property float {n}" for n in names), "end_header", ""]).encode() + body
+
+
+def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -> None:
+    write_gaussians(tmp_path / "good.spz", some(30))
+    good = (tmp_path / "good.spz").read_bytes()
+    unpacked = gzip.decompress(good)
+    parts = sog_parts()
+    no_image = parts | {"quats.webp": b"no image"}
+    huge = json.loads(parts["meta.json"]) | {"count": 10**12}
+    cases: dict[str, tuple[bytes, str]] = {
+        "huge.ply": (inria(10**12), "are too few"),
+        "cut.ply": (inria(3, body=bytes(100)), "are too few"),
+        "degree.ply": (inria(1, 10, bytes(24 * 4)), "properties f_rest_N"),
+        "chunks.ply": (compressed_ply((0, 2)), "too few chunks"),
+        "odd.splat": (bytes(33), "multiple of 32"),
+        "empty.splat": (b"", "multiple of 32"),
+        "cut.spz": (good[: len(good) // 2], "data end after"),
+        "huge.spz": (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2**32 - 1, 3, 12, 0, 0)), "more than its"),
+        "short.spz": (gzip.compress(unpacked[:-10]), "data end after"),
+        "degree.spz": (gzip.compress(unpacked[:12] + b"\x07" + unpacked[13:]), "degree 7"),
+        "version.spz": (gzip.compress(unpacked[:4] + b"\x09" + unpacked[5:]), "version 9"),
+        "huge4.spz": (struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10**9, 0, 12, 0, 5, 32) + bytes(80), "is it truncated"),
+        "none.sog": (b"no archive", "no zip archive"),
+        "text.pt": (b"no checkpoint", "no file of Gaussians"),
+        "mesh.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "no file of Gaussians"),
+    }  # fmt: skip
+    for name, content in (
+        ("noimage.sog", no_image),
+        ("huge.sog", parts | {"meta.json": json.dumps(huge).encode()}),
+    ):
+        write_sog(tmp_path / name, content)
+        cases[name] = (
+            (tmp_path / name).read_bytes(),
+            "no image" if name[0] == "n" else "declares 1000000000000",
+        )
+    for name, (content, message) in cases.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=message) as failure:
+            read_gaussians(path)
+        assert str(path) in str(failure.value)
+        assert "\n" not in str(failure.value)
+
+
+def test_a_zip_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidnerf_gaussians.formats.sog.LARGEST_MEMBER", 2000)
+    path = write_sog(tmp_path / "bomb.sog", sog_parts() | {"quats.webp": bytes(3000)})
+    with pytest.raises(InputError, match="unpacks to"):
+        read_gaussians(path)
+    stream = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2, 0, 12, 0, 0) + bytes(10**7))
+    (tmp_path / "bomb.spz").write_bytes(stream)
+    assert (
+        len(read_gaussians(tmp_path / "bomb.spz")) == 2
+    )  # what is behind the declared Gaussians is left packed
+
+
+def test_other_endings_are_not_written(tmp_path: Path, some: Some) -> None:
+    with pytest.raises(InputError, match="cannot write"):
+        write_gaussians(tmp_path / "a.splat", some())
+    far = replace(some(1), means=torch.full((1, 3), 1e8))
+    with pytest.raises(InputError, match="too far"):
+        spz.write(tmp_path / "a.spz", far)
+
+
+DATA = os.environ.get("BIDNERF_DATA")
+
+
+@pytest.mark.skipif(DATA is None, reason="needs BIDNERF_DATA")
+def test_files_of_others_hold_the_same_scene() -> None:
+    """A compressed PLY and an .spz of one scene, each converted by others, agree to within their precision."""
+    folder = Path(DATA or "") / "gaussian_splats"
+    a, b = (read_gaussians(folder / f"biker.{ending}") for ending in ("compressed.ply", "spz"))
+    assert format_of(folder / "biker.spz") is not None
+    assert len(a) == len(b) == 152_746
+    assert float((a.means - b.means).abs().max()) < 2e-3
+    assert float((a.log_scales - b.log_scales).abs().median()) < 0.05
+    assert float((a.opacities - b.opacities).abs().max()) < 0.01
+    widths = [g.log_scales.exp().square()[:, None] for g in (a, b)]
+    turns = [matrices(torch.nn.functional.normalize(g.quaternions, dim=-1)) for g in (a, b)]
+    first, second = ((R * w) @ R.mT for R, w in zip(turns, widths, strict=True))
+    off = (first - second).flatten(1).norm(dim=1) / first.flatten(1).norm(dim=1)
+    assert float(off.median()) < 0.1
