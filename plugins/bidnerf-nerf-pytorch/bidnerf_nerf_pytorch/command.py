@@ -1,28 +1,24 @@
-"""``bidnerf-import-nerf-pytorch``: conversion of a checkpoint to a map."""
+"""``bidnerf-import-nerf-pytorch``: conversion of a checkpoint to a map without surface and landmarks."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.files import map_folder, save_map
+from bidnerf_core.maps.importers import UNMOVED
 from bidnerf_core.training import TrainingState
-from bidnerf_nerf_pytorch import NerfPytorchConfig, backend, read_checkpoint
+from bidnerf_nerf_pytorch.importer import Box, ImportSettings, importer
 
 NAME = "bidnerf-import-nerf-pytorch"
 DONE, BAD_INPUT, INTERRUPTED = 0, 1, 130
-
-Box = tuple[float, float, float, float, float, float]
 
 
 def import_checkpoint(
@@ -39,7 +35,7 @@ def import_checkpoint(
 ) -> None:
     """Turn a checkpoint of krrish94/nerf-pytorch into a map.
 
-    The map's world is the one that the networks were trained in: for Blender's scenes that of transforms_*.json.
+    'bidnerf import' does so too, and bakes the surface and the landmarks. The map's world is the one that the networks were trained in: for Blender's scenes that of transforms_*.json.
 
     Args:
         checkpoint: file that nerf-pytorch wrote (checkpoint*.ckpt)
@@ -53,19 +49,13 @@ def import_checkpoint(
         octaves: whether frequencies double (nerf-pytorch's log_sampling), which no weight shows
         overwrite: replace the map in --out
     """
-    bounds = SceneBounds(box[:3], box[3:], near, far, background_colour(background))
-    found = read_checkpoint(checkpoint, octaves)
-    config = NerfPytorchConfig(
-        **asdict(found.network), coarse_samples=coarse_samples, fine_samples=fine_samples,
-        steps=max(1, found.steps),
-    )  # fmt: skip
-    field = backend.build(config, bounds)
-    field.load_state_dict(found.tensors)
-    info = MapInfo("nerf-pytorch", to_plain(config, "config"), bounds, found.steps, True, checkpoint.name)
+    settings = ImportSettings(near, far, background, box, coarse_samples, fine_samples, octaves)
+    found = importer.read(checkpoint, settings, UNMOVED)
+    plain = to_plain(found.config, "config")
+    info = MapInfo(found.backend, plain, found.bounds, found.steps, True, checkpoint.name)
     with map_folder(out, overwrite):
-        save_map(out, info, TrainingState(found.steps, dict(field.state_dict()), {}))
-    size = f"{config.layers} layers of {config.width}"
-    print(f"{out}: coarse and fine network of {size}, {found.steps} steps", file=sys.stderr)
+        save_map(out, info, TrainingState(found.steps, found.tensors, {}))
+    print(f"{out}: {'; '.join(found.found)}", file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
