@@ -125,7 +125,7 @@ def bounds_about(
     Where much of the matter is far outside of the box about most of it, the scene is unbounded: the box is then that about its
     dense part, and ``contracted``.
     """
-    inner, outer = robust_box(points, 0.05, 0.25), robust_box(points)
+    inner, outer = robust_box(points, 0.15, 0.25), robust_box(points)
     sides = [float((upper - lower).max()) for lower, upper in (inner, outer)]
     contracted = sides[1] > UNBOUNDED * sides[0]
     lower, upper = inner if contracted else outer

@@ -45,6 +45,8 @@ COMPARED_RAYS = 4096
 SAME_LENGTH = 0.03
 """Relative difference between rendered and measured depth that is not worth a word."""
 FEWEST_COMPARED = 200
+OPAQUE = 0.5
+"""Opacity of a ray whose rendered depth means something."""
 
 
 def import_map(
@@ -113,12 +115,12 @@ def import_map(
 def _read(
     photos: Images | None, split: str, progress: ProgressCallback | None, cancel: Cancel | None
 ) -> tuple[list[View], tuple[float, float, float] | None]:
-    """Return the photos, and the background of those that have an alpha channel."""
+    """Return the photos, and the background over which those of a dataset with an alpha channel were composited."""
     if photos is None:
         return [], None
     read = read_views(photos, split, progress=progress, cancel=cancel)
     has_alpha = any(view.frame.alpha is not None for view in read.views)
-    return read.views, read.background if has_alpha else None
+    return read.views, read.background if has_alpha and read.source else None
 
 
 def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], where: str) -> Any:
@@ -184,7 +186,7 @@ def depth_ratio(field: RadianceField, bounds: SceneBounds, views: Sequence[View]
     count = max(COMPARED_RAYS, len(measured))
     pixels = draw(measured, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
-    both = (pixels.distance > 0) & (seen.opacity > 0.9)
+    both = (pixels.distance > 0) & (seen.opacity > OPAQUE)
     if int(both.sum()) < FEWEST_COMPARED:
         return None
     return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())
