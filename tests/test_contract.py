@@ -16,7 +16,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 import tiny
-from bidnerf_core.fields.contract import FieldValues, Rays, RaySamples, SceneBounds, device_of
+from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds, device_of
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import View
@@ -763,6 +763,15 @@ class Forgetting(WaveBackend):
 )
 def test_stopping_and_resuming_are_judged(backend: Any, said: str) -> None:
     assert said in fault("test_training_stops_and_resumes", backend, config=WaveConfig())
+
+
+def test_hits_that_stop_other_light_than_the_density_are_told() -> None:
+    def opaque(self: Any, rays: Rays) -> RayHits:
+        near = rays.near[..., None]
+        valid = (rays.far > rays.near)[..., None]
+        return RayHits(near, valid.to(near), torch.ones((*near.shape, 3)), valid)
+
+    assert "of the light of rays" in fault("test_hits_agree_with_the_density", with_field(hits=opaque))
 
 
 def test_the_contract_does_not_need_pytest() -> None:

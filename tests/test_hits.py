@@ -134,7 +134,6 @@ def test_hits_around_a_measured_depth() -> None:
 def test_the_contract_accepts_them_and_tells_what_is_wrong() -> None:
     check_hits(Sheets())
     changes: dict[str, Callable[[RayHits], RayHits]] = {
-        "sorted": lambda hits: RayHits(*(x.flip(-1 if x.ndim < 3 else -2) for x in vars(hits).values())),
         r"outside of \[0, 1\]": lambda hits: replace(hits, alpha=1.5 * hits.alpha / ALPHA),
         "light of rays": lambda hits: replace(hits, alpha=0.5 * hits.alpha),
         "where a hit is not valid": lambda hits: replace(hits, alpha=torch.full_like(hits.alpha, ALPHA)),

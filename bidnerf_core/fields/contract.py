@@ -82,7 +82,11 @@ class RadianceField(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """The places at which rays meet something, nearest first, and what is seen there. Those that are not valid have no effect."""
+    """The places at which rays meet something, and what is seen there, in the order in which they are composited.
+
+    This is the order of distance, except where a field composites otherwise, as splats do that were trained in the order of
+    their means. Places that are not valid have no effect.
+    """
 
     distance: Float[Tensor, "*r s"]  # metres along the ray
     alpha: Float[Tensor, "*r s"]  # share of the light that is stopped there, in [0, 1]; 0 where not valid

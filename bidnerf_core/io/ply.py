@@ -74,7 +74,7 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
                 break
             kind = np.dtype([(name, header.order + of) for name, of in element.properties])
             is_text = header.order == "="
-            size = SHORTEST_NUMBER * len(kind) if is_text else kind.itemsize
+            size = SHORTEST_NUMBER * len(element.properties) if is_text else kind.itemsize
             if element.count * size > left + is_text:
                 raise InputError(
                     f"{path}: declares {element.count:,} elements {element.name!r}, for which its {left:,} bytes of data"
@@ -133,17 +133,18 @@ def _with_property(element: PlyElement, words: list[str]) -> PlyElement:
 
 def _text_rows(file: BinaryIO, count: int, kind: np.dtype, path: Path) -> np.ndarray:
     """Return the next ``count`` rows of numbers of a text file."""
+    width = len(kind.names or ())
     lines = [file.readline() for _ in range(count)]
     try:
         rows = (
             np.loadtxt(io.BytesIO(b"".join(lines)), dtype=np.float64, ndmin=2)
             if lines
-            else np.zeros((0, len(kind)))
+            else np.zeros((0, width))
         )
-        if rows.shape != (count, len(kind)):
+        if rows.shape != (count, width):
             raise ValueError(f"{rows.shape[0]} rows of {rows.shape[1]}")
     except ValueError as error:
-        raise InputError(f"{path}: expected {count:,} rows of {len(kind)} numbers ({error})") from error
+        raise InputError(f"{path}: expected {count:,} rows of {width} numbers ({error})") from error
     found = np.empty(count, kind)
     for number, name in enumerate(kind.names or ()):
         found[name] = rows[:, number]

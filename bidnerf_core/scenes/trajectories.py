@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.looking import look_at
+from bidnerf_core.geometry.looking import look_at as look_at
 from bidnerf_core.geometry.se3 import SE3
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))

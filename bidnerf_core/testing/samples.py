@@ -121,7 +121,7 @@ SAME_OPACITY = 0.05
 
 
 def check_hits(field: RadianceField) -> None:
-    """Check the hits of a field that offers them: in order, in range, in [near, far], and as opaque as its density."""
+    """Check the hits of a field that offers them: in range, in [near, far], and as opaque as its density."""
     if not isinstance(field, HitField):
         return
     for of, rays in awkward_rays().items():
@@ -160,9 +160,6 @@ def _check_hits(field: HitField, rays: Rays, of: str) -> None:
     distance, valid = found.distance, found.valid
     within = (distance >= rays.near[..., None] - SLACK) & (distance <= rays.far[..., None] + SLACK)
     require_that(bool(within[valid].all()), f"{who}: a valid hit lies outside [near, far] of its ray")
-    reached = torch.where(valid, distance, -torch.inf).cummax(-1).values if distance.shape[-1] else distance
-    turned = (distance[..., 1:] < reached[..., :-1] - SLACK) & valid[..., 1:]
-    require_that(not bool(turned.any()), f"{who}: hits are not sorted, expected nearest first")
 
 
 def _check_density(field: HitField, rays: Rays) -> None:

@@ -36,6 +36,8 @@ class FieldConfig:
 
     gaussians: Annotated[int, Range(1, 2 * 10**8)] = 30_000  # number of Gaussians
     degree: Annotated[int, Range(0, 3)] = 0  # degree of the spherical harmonics of colours
+    # composite in the order of the means, as image rasterizers do, instead of in that of the peaks along a ray
+    by_means: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,7 @@ class _Peaks:
     """Where lines come nearest to Gaussians, in their metric, and what is seen there."""
 
     distance: Float[Tensor, "*p"]  # metres from the line's origin; may be negative
+    mean: Float[Tensor, "*p"]  # metres: distance of the mean from the line's origin
     alpha: Float[Tensor, "*p"]
     spread: Float[Tensor, "*p"]  # metres: standard deviation of the Gaussian along the line
 
@@ -51,7 +54,7 @@ class GaussiansField(nn.Module):
     """Gaussians that a ray meets at its peak in each, nearest first, as in 3D Gaussian ray tracing (Moenne-Loccoz et al. 2024).
 
     Along a ray with origin o and direction d, a Gaussian of precision P about m is largest at ``t = d'P(m - o) / d'Pd``; its
-    opacity times its value there is alpha. ``hits`` gives these. Their optical thickness ``-log(1 - alpha)``, spread over the
+    opacity times its value there is alpha. ``hits`` gives these, in the order in which they are composited. Their optical thickness ``-log(1 - alpha)``, spread over the
     ray as the Gaussian is, makes the density that ``query`` returns: its integral along a ray gives the same opacity.
     """
 
@@ -110,10 +113,10 @@ class GaussiansField(nn.Module):
         return PeakSampler(self)
 
     def hits(self, rays: Rays) -> RayHits:
-        """Return the peaks along rays, nearest first, with colour and alpha; differentiable in the rays and the parameters."""
+        """Return the peaks along rays with colour and alpha; differentiable in the rays and the parameters."""
         shape = rays.near.shape
         flat = _flattened(rays)
-        gaussian, valid = self.met(flat)
+        gaussian, valid = self.met(flat, self.config.by_means)
         width = gaussian.shape[1]
         place, ray, index = _listed(gaussian, valid)
         directions = flat.directions.index_select(0, ray)
@@ -128,14 +131,17 @@ class GaussiansField(nn.Module):
         return RayHits(torch.where(valid, parts[0], flat.near.reshape(*shape, 1)), alpha, parts[2], valid)
 
     @torch.no_grad()
-    def met(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        """Return the numbers of the Gaussians that rays (r) meet, nearest first, up to where hardly any light is left."""
+    def met(self, rays: Rays, by_means: bool) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+        """Return the numbers of the Gaussians that rays (r) meet, nearest first, up to where hardly any light is left.
+
+        With ``by_means``, that with the nearest mean comes first, and otherwise that with the nearest peak.
+        """
         if not len(rays.near):
             empty = torch.zeros((0, 0), dtype=torch.long, device=self.order.device)
             return empty, empty.bool()
         if not may_wait(rays.near.device):
-            return self._met_in_known_shape(rays)
-        parts = list(self._met_in_parts(rays, RAYS_AT_ONCE))
+            return self._met_in_known_shape(rays, by_means)
+        parts = self._met_in_parts(rays, RAYS_AT_ONCE, by_means)
         width = max(gaussian.shape[1] for gaussian, _ in parts)
         gaussian, valid = (
             torch.cat([torch.nn.functional.pad(part[i], (0, width - part[i].shape[1])) for part in parts])
@@ -143,7 +149,7 @@ class GaussiansField(nn.Module):
         )
         return gaussian, valid
 
-    def _met_in_parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Tensor]]:
+    def _met_in_parts(self, rays: Rays, count: int, by_means: bool) -> list[tuple[Tensor, Tensor]]:
         parts = zip(
             *(getattr(rays, n).split(count) for n in ("origins", "directions", "near", "far")), strict=True
         )
@@ -151,29 +157,30 @@ class GaussiansField(nn.Module):
         for part in parts:
             few = Rays(*part)
             try:
-                found.append(self._met_by_few(few))
+                found.append(self._met_by_few(few, by_means))
             except TooMany:
-                found += self._met_in_parts(few, (len(few.near) + 1) // 2)
+                found += self._met_in_parts(few, (len(few.near) + 1) // 2, by_means)
         return found
 
-    def _met_by_few(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+    def _met_by_few(self, rays: Rays, by_means: bool) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
         ray, index = met(self._lines(rays), self.boxes, self.order)
         peaks = self._peaks(index, rays.origins.index_select(0, ray), rays.directions.index_select(0, ray))
         near, far = (part.index_select(0, ray) for part in (rays.near, rays.far))
         kept = _is_hit(peaks, near, far).nonzero()[:, 0]
-        ray, index, distance, alpha = (
-            part.index_select(0, kept) for part in (ray, index, peaks.distance, peaks.alpha)
-        )
+        key = peaks.mean if by_means else peaks.distance
+        ray, index, key, alpha = (part.index_select(0, kept) for part in (ray, index, key, peaks.alpha))
         count = torch.bincount(ray, minlength=len(rays.near))
         width = int(count.max()) if len(ray) else 0
         place = ray * width + torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
         rows = (len(rays.near), width)
         return _nearest_first(*(
             value.new_full((rows[0] * width,), fill).index_copy(0, place, value).reshape(rows)
-            for value, fill in ((distance, torch.inf), (alpha, 0), (index, 0))
+            for value, fill in ((key, torch.inf), (alpha, 0), (index, 0))
         ))  # fmt: skip
 
-    def _met_in_known_shape(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+    def _met_in_known_shape(
+        self, rays: Rays, by_means: bool
+    ) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
         index, valid = nearest_met(self._lines(rays), self.boxes, self.order)
         ray = torch.arange(len(index), device=index.device)[:, None].expand(index.shape).reshape(-1)
         peaks = self._peaks(
@@ -183,10 +190,11 @@ class GaussiansField(nn.Module):
             _is_hit(peaks, rays.near.index_select(0, ray), rays.far.index_select(0, ray)).reshape(index.shape)
             & valid
         )
-        distance = torch.where(hit, peaks.distance.reshape(index.shape), torch.inf)
-        kept = distance.topk(min(KEPT_HITS, distance.shape[1]), dim=1, largest=False, sorted=True).indices
+        key = peaks.mean if by_means else peaks.distance
+        key = torch.where(hit, key.reshape(index.shape), torch.inf)
+        kept = key.topk(min(KEPT_HITS, key.shape[1]), dim=1, largest=False, sorted=True).indices
         alpha = torch.where(hit, peaks.alpha.reshape(index.shape), 0)
-        return _nearest_first(*(part.gather(1, kept) for part in (distance, alpha, index)))
+        return _nearest_first(*(part.gather(1, kept) for part in (key, alpha, index)))
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return the density whose integral along ``directions`` gives the opacity of ``hits``, and the mean colour."""
@@ -253,14 +261,18 @@ class GaussiansField(nn.Module):
         )
         turns = turns * turns.square().sum(-1, keepdim=True).clamp(min=1e-24).rsqrt()
         # From the point nearest to the mean, so that rounding is that of lengths about the Gaussian.
-        along = ((means - origins) * directions).sum(-1, keepdim=True)
+        away = means - origins
+        along = (away * directions).sum(-1, keepdim=True)
         narrow = (-widths).exp()
-        u = turned_back(turns, origins + along * directions - means) * narrow
+        u = turned_back(turns, along * directions - away) * narrow
         v = turned_back(turns, directions) * narrow
         speed = v.square().sum(-1).clamp(min=1e-30)
         square = torch.linalg.cross(u, v).square().sum(-1) / speed  # of the distance, in standard deviations
         alpha = logits.sigmoid() * torch.exp(-0.5 * square)
-        return _Peaks(along[:, 0] - (u * v).sum(-1) / speed, alpha.clamp(max=LARGEST_ALPHA), speed.rsqrt())
+        distance = along[:, 0] - (u * v).sum(-1) / speed
+        return _Peaks(
+            distance, torch.linalg.vector_norm(away, dim=-1), alpha.clamp(max=LARGEST_ALPHA), speed.rsqrt()
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +288,7 @@ class PeakSampler:
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         shape, flat = rays.near.shape, _flattened(rays)
-        gaussian, valid = self.field.met(flat)
+        gaussian, valid = self.field.met(flat, by_means=False)
         width = gaussian.shape[1]
         ray = torch.arange(len(gaussian), device=gaussian.device)[:, None].expand(gaussian.shape).reshape(-1)
         peaks = self.field._peaks(
@@ -311,14 +323,14 @@ def _is_hit(peaks: _Peaks, near: Float[Tensor, "p"], far: Float[Tensor, "p"]) ->
 
 
 def _nearest_first(
-    distance: Float[Tensor, "r s"], alpha: Float[Tensor, "r s"], index: Int[Tensor, "r s"]
+    key: Float[Tensor, "r s"], alpha: Float[Tensor, "r s"], index: Int[Tensor, "r s"]
 ) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-    """Return the indices in order of distance, and which of them count: those that are reached by any light."""
-    distance, order = distance.sort(dim=1, stable=True)
+    """Return the indices in order of ``key``, and which of them count: those that are reached by any light."""
+    key, order = key.sort(dim=1, stable=True)
     alpha, index = alpha.gather(1, order), index.gather(1, order)
     thickness = -torch.log1p(-alpha)
     before = thickness.cumsum(1) - thickness
-    valid = (distance < torch.inf) & (before < -math.log(STOPPED))
+    valid = (key < torch.inf) & (before < -math.log(STOPPED))
     if may_wait(valid.device):
         width = int(valid.sum(1).max()) if valid.numel() else 0
         return index[:, :width], valid[:, :width]

@@ -32,7 +32,6 @@ OPAQUE = 0.3
 FEWEST = 100
 """Opaque Gaussians below which all count."""
 UP = (0.0, -1.0, 0.0)
-"""Upwards where y is down, as in COLMAP's and OpenCV's cameras; trained splats follow their first cameras, if anything."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +49,7 @@ class ImportSettings(Settings):
 class GaussiansImporter:
     """Reads files of Gaussians of all formats."""
 
-    summary: str = (
-        "Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, checkpoints of gsplat and splatfacto"
-    )
+    summary: str = "Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, .glb, checkpoints of gsplat and splatfacto"
     config_type: type = ImportSettings
 
     def recognises(self, path: Path) -> bool:
@@ -91,7 +88,7 @@ def imported(
     opaque = moved.means[moved.opacities > OPAQUE]
     points = opaque if len(opaque) >= FEWEST else moved.means
     bounds = bounds_about(points, config.background)
-    settings = GaussiansConfig(gaussians=len(moved), degree=moved.degree, steps=1)
+    settings = GaussiansConfig(gaussians=len(moved), degree=moved.degree, by_means=True, steps=1)
     field = GaussiansField(settings, bounds)
     field.assign(moved)
     facts = [f"{count:,} Gaussians, harmonics of degree {gaussians.degree}" + (f" ({of.name})" if of else "")]
@@ -99,7 +96,7 @@ def imported(
         facts.append(f"left out {dropped}")
     if of is not None:
         facts.append(f"axes: {of.convention}")
-    up = T.rotation.double() @ torch.tensor(UP, dtype=torch.float64)
+    up = T.rotation.double() @ torch.tensor(UP if of is None else of.up, dtype=torch.float64)
     return ImportedField(
         "gaussians", settings, dict(field.state_dict()), bounds, tuple(facts), settings.steps, points, cameras,
         (float(up[0]), float(up[1]), float(up[2])),
@@ -160,4 +157,4 @@ def _cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ..
 
 
 importer = GaussiansImporter()
-"""Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, checkpoints of gsplat and splatfacto"""
+"""Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, .glb, checkpoints of gsplat and splatfacto"""

@@ -207,6 +207,62 @@ def test_known_bytes_of_a_sog_archive_and_folder(tmp_path: Path) -> None:
         assert float(found.quaternions[0, 0]) > 0.99
 
 
+def glb(g: Gaussians, **node: object) -> bytes:
+    """Return a file of one mesh of Gaussians in a node."""
+    names = ["POSITION", *(f"KHR_gaussian_splatting:{n}" for n in ("SCALE", "ROTATION", "OPACITY"))]
+    names += [
+        f"KHR_gaussian_splatting:SH_DEGREE_{d}_COEF_{n}"
+        for d in range(g.degree + 1)
+        for n in range(2 * d + 1)
+    ]
+    columns = [g.means, g.log_scales, g.quaternions.roll(-1, 1), g.opacities[:, None], *g.harmonics.unbind(1)]
+    body, views, accessors = b"", [], []
+    for number, column in enumerate(columns):
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": 4 * column.numel()})
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[column.shape[1]]
+        accessors.append({"bufferView": number, "componentType": 5126, "count": len(column), "type": kind})
+        body += column.numpy().astype("<f4").tobytes()
+    primitive = {
+        "attributes": {name: number for number, name in enumerate(names)}, "mode": 0,
+        "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }  # fmt: skip
+    gltf = {
+        "asset": {"version": "2.0"}, "extensionsUsed": ["KHR_gaussian_splatting"], "buffers": [{"byteLength": len(body)}],
+        "bufferViews": views, "accessors": accessors, "meshes": [{"primitives": [primitive]}], "nodes": [{"mesh": 0} | node],
+    }  # fmt: skip
+    text = json.dumps(gltf).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = (
+        struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(body), 0x004E4942) + body
+    )
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def test_gltf(tmp_path: Path, some: Some) -> None:
+    path = tmp_path / "a.glb"
+    path.write_bytes(glb(some(10, 2)))
+    assert max(differences(read_gaussians(path), some(10, 2)).values()) < 1e-5
+    half = np.sqrt(0.5)
+    path.write_bytes(glb(some(10, 1), scale=[2, 2, 2], rotation=[half, 0, 0, half], translation=[1, 0, 0]))
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    expected = some(10, 1).similar(2.0, turn, torch.tensor([1.0, 0, 0]))
+    assert max(differences(read_gaussians(path), expected).values()) < 1e-5
+    for change, message in (
+        ({"scale": [1, 2, 1]}, "stretches or mirrors"),
+        ({"scale": [-1, 1, 1]}, "stretches or mirrors"),
+    ):
+        path.write_bytes(glb(some(3), **change))
+        with pytest.raises(InputError, match=message):
+            read_gaussians(path)
+    for old, new in ((b'"count": 3', b'"count": 9'), (b'"buffers"', b'"bufferz"'), (b'"VEC4"', b'"VEC9"')):
+        path.write_bytes(glb(some(3)).replace(old, new))
+        with pytest.raises(InputError, match=r"is too short|is damaged"):
+            read_gaussians(path)
+    path.write_bytes(glb(some(3))[:-20])
+    with pytest.raises(InputError, match="is cut off"):
+        read_gaussians(path)
+
+
 def test_checkpoints_of_gsplat_and_splatfacto(tmp_path: Path, some: Some) -> None:
     g = some(10, 2)
     names = {"means": g.means, "scales": g.log_scales, "quats": g.quaternions}

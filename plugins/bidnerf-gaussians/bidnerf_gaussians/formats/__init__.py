@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bidnerf_core.errors import InputError
-from bidnerf_gaussians.formats import checkpoint, ply, sog, splat, spz
+from bidnerf_gaussians.formats import checkpoint, gltf, ply, sog, splat, spz
 from bidnerf_gaussians.gaussians import Gaussians
 
 
@@ -19,6 +19,7 @@ class Format:
     recognises: Callable[[Path], bool]  # looks at the name and the first bytes
     read: Callable[[Path], Gaussians]  # raises InputError where the file is damaged
     convention: str  # of the axes that its writers follow; which way is up is nowhere written
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # as in COLMAP's and OpenCV's cameras, if anything
 
 
 FORMATS = (
@@ -27,6 +28,7 @@ FORMATS = (
     Format(".splat", splat.recognises, splat.read, "as trained, as in a PLY"),
     Format("SPZ", spz.recognises, spz.read, "right, up, back in the file; y and z are turned as for a PLY"),
     Format("SOG", sog.recognises, sog.read, "as trained, as in a PLY"),
+    Format("glTF", gltf.recognises, gltf.read, "y up, as glTF has it; nodes are applied", (0.0, 1.0, 0.0)),
     Format(
         "checkpoint of gsplat or splatfacto", checkpoint.recognises, checkpoint.read, "those of the training"
     ),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
+from torch.nn.functional import pad
 
 from bidnerf_gaussians.gaussians import Gaussians
 
@@ -21,6 +24,16 @@ def gaussians_of(
     """Return the Gaussians of arrays, in single precision."""
     parts = (means, log_scales, quaternions, logits, harmonics)
     return Gaussians(*(torch.from_numpy(np.array(part, dtype=np.float32)) for part in parts))
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """Return the Gaussians of all parts, with harmonics up to the highest degree among them."""
+    count = max(part.harmonics.shape[1] for part in parts)
+    harmonics = [pad(part.harmonics, (0, 0, 0, count - part.harmonics.shape[1])) for part in parts]
+    names = ("means", "log_scales", "quaternions", "logits")
+    return Gaussians(
+        *(torch.cat([getattr(part, name) for part in parts]) for name in names), torch.cat(harmonics)
+    )
 
 
 def logit(opacity: np.ndarray) -> np.ndarray:

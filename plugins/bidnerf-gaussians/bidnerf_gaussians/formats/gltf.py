@@ -1,0 +1,188 @@
+"""glTF 2.0 with the extension ``KHR_gaussian_splatting`` (Khronos, review draft): ``.glb``, or ``.gltf`` with files beside it."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.json import parse_json
+from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, joined, logit
+from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
+
+EXTENSION = "KHR_gaussian_splatting"
+EXPECTED = f"a glTF file with {EXTENSION}"
+MAGIC = b"glTF"
+JSON, BINARY = 0x4E4F534A, 0x004E4942
+"""The kinds of chunks of a .glb file."""
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+LARGEST_HEADER = 1 << 20
+"""Bytes of a file that are searched for the name of the extension."""
+UNEVEN = 1e-3
+"""Relative difference of a node's scales along its axes up to which they count as one."""
+
+
+def recognises(path: Path) -> bool:
+    """Return whether the file is a glTF that names the extension near its beginning."""
+    if path.suffix.lower() not in (".glb", ".gltf") or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return EXTENSION.encode() in file.read(LARGEST_HEADER)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The content of a file."""
+
+    path: Path
+    gltf: dict[str, Any]
+    binary: bytes | None  # of a .glb
+
+    def buffer(self, number: int) -> bytes:
+        entry = self.gltf["buffers"][number]
+        uri = entry.get("uri")
+        if uri is None and self.binary is not None and number == 0:
+            return self.binary
+        if not isinstance(uri, str) or Path(uri).name != uri:
+            raise InputError(f"{self.path}: names a buffer {str(uri)[:40]!r}, expected a file beside it")
+        return read_file(self.path.parent / uri, f"a buffer of {EXPECTED}", LARGEST_FILE)
+
+    def accessor(self, number: int) -> np.ndarray:
+        """Return the numbers (n w) of an accessor, those of normalized integers as fractions."""
+        entry = self.gltf["accessors"][number]
+        if "sparse" in entry or "bufferView" not in entry:
+            raise InputError(f"{self.path}: accessor {number} is sparse or empty, expected plain numbers")
+        view = self.gltf["bufferViews"][entry["bufferView"]]
+        kind, width, count = (
+            np.dtype(COMPONENTS[entry["componentType"]]),
+            WIDTHS[entry["type"]],
+            entry["count"],
+        )
+        start = view.get("byteOffset", 0) + entry.get("byteOffset", 0)
+        stride = view.get("byteStride", width * kind.itemsize)
+        content = self.buffer(view["buffer"])
+        last = start + (count - 1) * stride + width * kind.itemsize
+        if min(start, count, stride - width * kind.itemsize) < 0 or last > len(content):
+            raise InputError(
+                f"{self.path}: accessor {number} declares {count:,} elements, for which its buffer of"
+                f" {len(content):,} bytes is too short"
+            )
+        rows = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).astype(np.float32)
+        if not entry.get("normalized"):
+            return rows
+        return np.maximum(rows / np.float32(np.iinfo(kind).max), -1)
+
+
+def read(path: Path) -> Gaussians:
+    """Return the Gaussians of all nodes of a file, each moved by its node. Raises ``InputError`` for a damaged file."""
+    scene = _opened(path)
+    try:
+        found = [
+            _placed(_gaussians(scene, primitive), matrix, path)
+            for mesh, matrix in _meshes(scene)
+            for primitive in mesh["primitives"]
+            if EXTENSION in primitive.get("extensions", {})
+        ]
+    except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{path}: is damaged ({type(error).__name__}: {error}), expected {EXPECTED}"
+        ) from error
+    if not found:
+        raise InputError(f"{path}: no node shows Gaussians, expected {EXPECTED}")
+    return joined(found)
+
+
+def _opened(path: Path) -> _Scene:
+    content = read_file(path, EXPECTED, LARGEST_FILE)
+    text, binary = content, None
+    if content.startswith(MAGIC):
+        chunks = {}
+        place = 12
+        while place + 8 <= len(content):
+            length, kind = struct.unpack_from("<II", content, place)
+            if place + 8 + length > len(content):
+                raise InputError(f"{path}: a chunk of {length:,} bytes is cut off, expected {EXPECTED}")
+            chunks.setdefault(kind, content[place + 8 : place + 8 + length])
+            place += 8 + length
+        if JSON not in chunks:
+            raise InputError(f"{path}: has no chunk of JSON, expected {EXPECTED}")
+        text, binary = chunks[JSON], chunks.get(BINARY)
+    gltf = parse_json(text, str(path), EXPECTED)
+    if not isinstance(gltf, dict):
+        raise InputError(f"{path}: its JSON is no object, expected {EXPECTED}")
+    return _Scene(path, gltf, binary)
+
+
+def _meshes(scene: _Scene) -> list[tuple[dict[str, Any], np.ndarray]]:
+    """Return the meshes that nodes show, with the matrices that take them to the world."""
+    nodes = scene.gltf.get("nodes", [])
+    parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
+    found = []
+    for number, node in enumerate(nodes):
+        if "mesh" not in node:
+            continue
+        matrix, at, seen = _local(node), parents.get(number), {number}
+        while at is not None and at not in seen:
+            matrix, seen = _local(nodes[at]) @ matrix, seen | {at}
+            at = parents.get(at)
+        found.append((scene.gltf["meshes"][node["mesh"]], matrix))
+    return found
+
+
+def _local(node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T  # column by column
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)))
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
+    names = primitive["attributes"]
+    if "extensions" in primitive["extensions"][EXTENSION]:
+        further = ", ".join(primitive["extensions"][EXTENSION]["extensions"])
+        raise InputError(f"{scene.path}: its Gaussians are compressed ({further}), which is not read")
+    harmonics = []
+    for degree in COEFFICIENTS:
+        of_degree = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for n in range(2 * degree + 1)]
+        if degree and of_degree[0] not in names:
+            break
+        harmonics += [scene.accessor(names[name]) for name in of_degree]
+    opacity = scene.accessor(names[f"{EXTENSION}:OPACITY"])[:, 0]
+    return gaussians_of(
+        scene.accessor(names["POSITION"]),
+        scene.accessor(names[f"{EXTENSION}:SCALE"]),
+        np.roll(scene.accessor(names[f"{EXTENSION}:ROTATION"]), 1, axis=-1),
+        logit(opacity),
+        np.stack(harmonics, axis=1),
+    )
+
+
+def _placed(gaussians: Gaussians, matrix: np.ndarray, path: Path) -> Gaussians:
+    """Return the Gaussians moved by a node. Raises ``InputError`` where it stretches or mirrors them."""
+    scales = np.linalg.norm(matrix[:3, :3], axis=0)
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    if not scale > 0 or float(np.ptp(scales)) > UNEVEN * scale:
+        raise InputError(
+            f"{path}: a node stretches or mirrors its Gaussians, expected one scale for all axes"
+        )
+    rotation = torch.from_numpy(matrix[:3, :3] / scale)
+    return gaussians.similar(scale, rotation, torch.from_numpy(matrix[:3, 3].copy()))
