@@ -37,6 +37,9 @@ GROUPS: Mapping[str, str] = {
 }
 """What can be registered, and the noun for one of it. The entry-point group has the prefix ``bidnerf.``."""
 
+ONLY_STRANGERS = frozenset({"importers"})
+"""The groups of which nothing is bundled."""
+
 BUNDLED = "bidnerf"
 """The distribution whose plugins are bundled."""
 UNREADABLE = "?"
@@ -453,9 +456,9 @@ def _described(error: BaseException) -> str:
 def _unknown(group: str, name: str) -> str:
     infos, noun = _declared(group), GROUPS[group]
     names = plugin_names(group)
-    if not any(info.is_bundled for info in infos):
+    if group not in ONLY_STRANGERS and not any(info.is_bundled for info in infos):
         return f"no {noun} {name!r}: the metadata of the installed bidnerf names no {group}; install bidnerf anew"
     hint = spelling_hint(str(name).lower(), names)
-    message = f"no {noun} {name!r}{hint}; installed: {', '.join(sorted(names))}"
+    message = f"no {noun} {name!r}{hint}; installed: {', '.join(sorted(names)) or 'none'}"
     unread = [f"{x.distribution} {x.version}: {x.fault}" for x in infos if x.name == UNREADABLE]
     return "; ".join([message, *unread])

@@ -111,6 +111,8 @@ def test_the_jacobian_of_hits_is_that_of_finite_differences() -> None:
 
     pivot = SE3(start.rotation[None], start.translation[None])
     exact = linearize(Sheets(), moved(start), observed, residual, pivot, (0.0, 0.0, 0.0))  # type: ignore[arg-type]
+    assert not exact.rgb.requires_grad
+    assert not exact.residuals.requires_grad
     for axis in range(6):
         step = torch.zeros(6, dtype=torch.float64)
         step[axis] = 1e-6

@@ -79,7 +79,7 @@ def linearize(
     jacobian = _by_update(rays, T_world_pivot, by_origin, by_direction)
     steepness = torch.linalg.vector_norm(by_origin, dim=-1)
     return Linearization(
-        residuals.reshape(*shape, count), rendering.rgb.reshape(*shape, 3), steepness, jacobian
+        residuals.reshape(*shape, count), rendering.rgb.detach().reshape(*shape, 3), steepness, jacobian
     )
 
 

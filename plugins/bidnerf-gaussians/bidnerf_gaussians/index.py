@@ -23,7 +23,7 @@ MORTON_BITS = 16
 """Bits of each coordinate on the Morton curve."""
 LEAST_COMPONENT = 1e-9
 """Of a direction, along each axis; smaller ones are replaced by it."""
-MOST_PAIRS = 2**21
+MOST_PAIRS = 2**22
 """Largest number of pairs of a ray and a box that are tested at once: some 300 MB."""
 KEPT_NODES = 128
 """Nodes on each level that a ray may meet where their number must be known beforehand; the nearest ones are kept."""
