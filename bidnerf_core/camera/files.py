@@ -1,39 +1,38 @@
-"""Files of intrinsics: the JSON of NeRF and nerfstudio, and COLMAP's ``cameras.txt``; pixel centres are at +0.5 like ours."""
+"""Files of intrinsics.
+
+Known are the JSON of NeRF, nerfstudio, Open3D and 3D Gaussian Splatting, COLMAP's ``cameras.txt``, hloc's lists of images with
+cameras, and the YAML that ``calibrations`` reads. Pixel centres are at +0.5 where a file does not follow OpenCV.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera.intrinsics import Intrinsics, focal_length
+from bidnerf_core.camera.calibrations import (
+    calibrated_camera,
+    gaussian_splatting_camera,
+    read_yaml_camera,
+)
+from bidnerf_core.camera.colmap_models import MODELS, colmap_camera
+from bidnerf_core.camera.intrinsics import Intrinsics, focal_length, question_focal
+from bidnerf_core.camera.lenses import (
+    LENS_MODELS,
+    PANORAMA,
+    Camera,
+    CentralLens,
+    PanoramaFace,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import Record, parse_record
+from bidnerf_core.io.json import Record, parse_json, parse_record
 from bidnerf_core.io.rows import Row, parse_rows
 
-PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
+FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
-COLMAP_MODELS: dict[str, tuple[int, ...]] = {
-    # Indices of fx, fy, cx, cy and the distortion (in OpenCV's order) among the parameters; -1 is a coefficient of 0.
-    "SIMPLE_PINHOLE": (0, 0, 1, 2),
-    "PINHOLE": (0, 1, 2, 3),
-    "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1, -1, -1),
-    "RADIAL": (0, 0, 1, 2, 3, 4, -1, -1),
-    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
-    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
-}
-"""Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html). Its pixel centres are at +0.5 as well."""
-COLMAP_MODEL_IDS = {
-    0: "SIMPLE_PINHOLE",
-    1: "PINHOLE",
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    6: "FULL_OPENCV",
-}
-"""The ids of these models in ``cameras.bin``."""
 
 
 @dataclass(frozen=True)
@@ -50,53 +49,86 @@ class CameraRecord:
     cx: float | None
     cy: float | None
     distortion: tuple[float, ...]
+    lens: str | None = (
+        None  # the model of a lens that is not perspective; its coefficients are ``distortion``
+    )
+    face: str | None = None  # of a panorama
 
-    def intrinsics(self, width: int, height: int) -> Intrinsics:
+    def intrinsics(self, width: int, height: int) -> Camera:
         """Return the camera of an image of this size; a principal point that is not given is in the middle.
 
         Raises ``InputError`` for numbers that no camera has.
         """
+        try:
+            if self.lens == PANORAMA:
+                return PanoramaFace(self.face or "front", width, height)
+            return self._central(width, height)
+        except InputError as error:
+            raise self.record.error(str(error)) from error
+
+    def _central(self, width: int, height: int) -> Camera:
         fx = self.focal_x if self.angle_x is None else focal_length(width, self.angle_x)
         fy = self.focal_y if self.angle_y is None else focal_length(height, self.angle_y)
         assert fx is not None  # camera_record ensures it
         cx = width / 2 if self.cx is None else self.cx
         cy = height / 2 if self.cy is None else self.cy
-        try:
-            return Intrinsics(fx, fx if fy is None else fy, cx, cy, width, height, self.distortion)
-        except InputError as error:
-            raise self.record.error(str(error)) from error
+        question_focal(fx, width, height)
+        fy = fx if fy is None else fy
+        if self.lens is None:
+            return Intrinsics(fx, fy, cx, cy, width, height, self.distortion)
+        model, places = LENS_MODELS[self.lens]
+        return CentralLens(
+            model, fx, fy, cx, cy, width, height, self.distortion[: len(places) - 4], self.lens
+        )
 
 
 def camera_record(record: Record) -> CameraRecord:
     """Read the intrinsics of a frame or of a whole file.
 
-    Raises ``InputError`` for a camera model that is not perspective and for a focal length that is missing or not positive.
+    Raises ``InputError`` for a camera model that is unknown and for a focal length that is missing or not positive.
     """
-    _check_model(record)
+    lens = _lens(record)
+    width, height = record.size("w"), record.size("h")
+    if lens == PANORAMA:
+        return CameraRecord(record, width, height, None, None, None, None, None, None, (), lens)
     focal_x, angle_x = _focal(record, "x")
     focal_y, angle_y = _focal(record, "y")
     if focal_x is None and angle_x is None:
         raise record.error("no focal length, expected fl_x (pixels) or camera_angle_x (radians)")
     return CameraRecord(
         record,
-        record.size("w"),
-        record.size("h"),
+        width,
+        height,
         focal_x,
         focal_y,
         angle_x,
         angle_y,
         record.number("cx"),
         record.number("cy"),
-        _distortion(record),
+        _distortion(record) if lens is None else _coefficients(record),
+        lens,
     )
 
 
-def _check_model(record: Record) -> None:
-    model = record.text("camera_model")
-    if record.value("is_fisheye"):  # some programs write 1 for true
-        model = "fisheye (is_fisheye)"
-    if model is not None and model.upper() not in PERSPECTIVE_MODELS:
-        raise record.error(f"camera_model is {model}, expected one of {', '.join(PERSPECTIVE_MODELS)}")
+def _lens(record: Record) -> str | None:
+    """Return the name of a model that is not perspective, in ``LENS_MODELS`` or ``PANORAMA``; None for perspective ones."""
+    model = (record.text("camera_model") or "").upper()
+    if record.value("is_fisheye") and model in ("", *PERSPECTIVE_MODELS):  # some programs write 1 for true
+        return "OPENCV_FISHEYE"
+    if model in (*LENS_MODELS, PANORAMA):
+        return model
+    if model and model not in PERSPECTIVE_MODELS:
+        expected = ", ".join((*PERSPECTIVE_MODELS, *LENS_MODELS, PANORAMA))
+        raise record.error(f"camera_model is {model}, expected one of {expected}")
+    return None
+
+
+def _coefficients(record: Record) -> tuple[float, ...]:
+    """Return the coefficients of a fisheye or division lens; a single one may be called k."""
+    first, *rest = (record.number(key) for key in FISHEYE_KEYS)
+    if first is None:
+        first = record.number("k")
+    return tuple(value or 0.0 for value in (first, *rest))
 
 
 def _focal(record: Record, axis: str) -> tuple[float | None, float | None]:
@@ -124,61 +156,89 @@ def _distortion(record: Record) -> tuple[float, ...]:
     return values if values[4] else values[:4]
 
 
-def read_camera(path: Path, size: tuple[int, int]) -> Intrinsics:
-    """Read the camera in the header of a ``transforms.json`` or ``cameras.json``, or in COLMAP's ``cameras.txt``.
+def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> Camera:
+    """Read the camera in a file of one of the formats above.
 
-    JSON without ``w`` and ``h`` describes an image of ``size`` (width, height). Raises ``InputError`` for other files, for
-    lenses that are not perspective, and where ``cameras.txt`` holds several different cameras.
+    Files without a size describe an image of ``size`` (width, height). Where a file holds different cameras, that of the image
+    called ``photo`` is taken. Raises ``InputError`` for other files, and where it is not known which camera is meant.
     """
-    content = read_file(path, "a JSON file or COLMAP's cameras.txt")
-    if content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"["):
-        record = camera_record(parse_record(str(path), content))
-        return record.intrinsics(record.width or size[0], record.height or size[1])
-    cameras = _colmap_cameras(path, content)
-    if len(set(cameras.values())) != 1:
-        raise InputError(f"{path}: holds {len(cameras)} cameras, expected one; keep the line of this photo's")
-    return next(iter(cameras.values()))
+    content = read_file(path, "a camera file (JSON, YAML, COLMAP's cameras.txt or a list of images)")
+    start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if start[:1] == b"{":
+        return _json_camera(parse_record(str(path), content), size)
+    if start[:1] == b"[":
+        return _chosen(path, _splat_cameras(path, content), photo)
+    if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
+        return read_yaml_camera(str(path), content, size)
+    return _chosen(path, _text_cameras(path, content), photo)
 
 
-def read_text_cameras(path: Path) -> dict[int, Intrinsics]:
+def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
+    values = record.values
+    views = values.get("parameters")
+    if isinstance(views, list) and views and isinstance(views[0], Mapping):  # Open3D's trajectory
+        found = {calibrated_camera(record.where, view, size) for view in views}
+        if len(found) > 1:
+            raise record.error(f"holds {len(found)} cameras, expected one")
+        return found.pop()
+    if any(key in values for key in ("intrinsic_matrix", "intrinsic", "camera_matrix", "K")):
+        return calibrated_camera(record.where, values, size)
+    camera = camera_record(record)
+    return camera.intrinsics(camera.width or size[0], camera.height or size[1])
+
+
+def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
+    """Read the ``cameras.json`` of 3D Gaussian Splatting: a list, with the names of the images."""
+    entries = parse_json(content, str(path), "a camera, or a list of cameras")
+    found: dict[str, Camera] = {}
+    for number, entry in enumerate(entries):
+        if not isinstance(entry, Mapping):
+            raise InputError(
+                f"{path}: entry {number} is no camera, expected img_name, width, height, fx and fy"
+            )
+        found[str(entry.get("img_name", number))] = gaussian_splatting_camera(
+            f"{path}: entry {number}", entry
+        )
+    return found
+
+
+def _chosen(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Camera:
+    """Return the only camera, or that of a photo by its path, its file name or its stem."""
+    if len(set(cameras.values())) == 1:
+        return next(iter(cameras.values()))
+    asked = None if photo is None else PurePosixPath(photo.replace("\\", "/"))
+    for part in () if asked is None else (str, lambda p: p.name, lambda p: p.stem):
+        fits = {c for name, c in cameras.items() if part(PurePosixPath(name)) == part(asked)}
+        if len(fits) == 1:
+            return fits.pop()
+    raise InputError(
+        f"{path}: holds {len(cameras)} cameras, expected one, or one that is called like the photo; keep the line of this photo's"
+    )
+
+
+def read_text_cameras(path: Path) -> dict[int, Camera]:
     """Read COLMAP's ``cameras.txt`` and return its cameras by their ids. Raises ``InputError``."""
-    return _colmap_cameras(path, read_file(path, "COLMAP's cameras.txt"))
+    content = read_file(path, "COLMAP's cameras.txt")
+    return {int(key): camera for key, camera in _text_cameras(path, content, named=False).items()}
 
 
-def _colmap_cameras(path: Path, content: bytes) -> dict[int, Intrinsics]:
+def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, Camera]:
+    """Read rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's with the name of an image instead of the id."""
     expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it of cameras.bin)"
-    found: dict[int, Intrinsics] = {}
+    found: dict[str, Camera] = {}
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
-        key, camera = _text_camera(row)
+        key, camera = _text_camera(row, named)
         if found.setdefault(key, camera) != camera:
             raise InputError(f"{row.where}: camera {key} again, expected each id once")
     return found
 
 
-def _text_camera(row: Row) -> tuple[int, Intrinsics]:
-    """Read ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``."""
+def _text_camera(row: Row, named: bool) -> tuple[str, Camera]:
     words = row.words
     if len(words) < 5:
         raise row.error(f" has {len(words)} entries")
-    if words[1] not in COLMAP_MODELS:
-        raise InputError(f"{row.where}: camera model {words[1]}, expected one of {', '.join(COLMAP_MODELS)}")
-    number, width, height = (row.integer(words[place]) for place in (0, 2, 3))
-    return number, colmap_camera(row.where, words[1], width, height, row.numbers(words[4:]))
-
-
-def colmap_parameters(model: str) -> int:
-    """Return the number of parameters of one of ``COLMAP_MODELS``."""
-    return max(COLMAP_MODELS[model]) + 1
-
-
-def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Intrinsics:
-    """Return a camera of one of ``COLMAP_MODELS``. Raises ``InputError``, whose message begins with ``where``."""
-    if len(parameters) != colmap_parameters(model):
-        raise InputError(
-            f"{where}: {model} has {len(parameters)} parameters, expected {colmap_parameters(model)}"
-        )
-    fx, fy, cx, cy, *lens = (0.0 if place < 0 else parameters[place] for place in COLMAP_MODELS[model])
-    try:
-        return Intrinsics(fx, fy, cx, cy, width, height, tuple(lens) if any(lens) else ())
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+    if words[1] not in MODELS:
+        raise InputError(f"{row.where}: camera model {words[1]}, expected one of {', '.join(MODELS)}")
+    width, height = (row.integer(words[place]) for place in (2, 3))
+    key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
+    return key, colmap_camera(row.where, words[1], width, height, row.numbers(words[4:]))

@@ -10,7 +10,9 @@ import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Integral, Real
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from kornia.geometry.calibration import distort_points, undistort_points
@@ -26,6 +28,11 @@ SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
 """Limits of focal lengths and of the distance of the principal point, in pixels. Beyond them, float32 overflows."""
 LARGEST_FOCAL = 1000
 """Focal length of a telescope, in sizes of the image: a field of view of 0.06 degrees."""
+SHORTEST_FOCAL, PHOTO = 0.1, 240
+"""Least focal length, in sizes of the image (a view of 157 degrees), of images of at least so many pixels along a side. A shorter one
+is in another unit: of a phone's lens, 4.2 millimetres."""
+SKEW = 1e-6
+"""Largest skew of a camera matrix, as a share of its focal length."""
 LARGEST_COEFFICIENT = 1e6
 """Limit of a distortion coefficient; those of rational models reach some hundreds."""
 ASPECT_TOLERANCE = 0.005
@@ -45,6 +52,8 @@ class Intrinsics:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.distortion, np.ndarray | Tensor):
+            object.__setattr__(self, "distortion", tuple(np.asarray(self.distortion, float).ravel().tolist()))
         self._check_types()
         for name in ("fx", "fy"):
             value = getattr(self, name)
@@ -81,6 +90,7 @@ class Intrinsics:
         _require_size("width", width)
         _require_size("height", height)
         _require("focal length", focal, Real, "a number of pixels")
+        question_focal(focal, width, height)
         if focal > LARGEST_FOCAL * max(width, height):
             raise InputError(
                 f"focal length is {focal} px for an image of {width}x{height}, expected at most {LARGEST_FOCAL} times its longer side"
@@ -101,6 +111,31 @@ class Intrinsics:
             found = f"horizontal field of view is {degrees}, which makes a focal length of {focal:.3g} pixels"
             raise InputError(f"{found}, {_expected_focal(focal)}")
         return Intrinsics.from_focal(focal, width, height)
+
+    @staticmethod
+    def from_opencv(K: Any, distortion: Any = None, size: tuple[int, int] | None = None) -> Intrinsics:
+        """Return the camera that OpenCV and ROS describe by a matrix, distortion coefficients and the image's size.
+
+        ``K`` (3 x 3) and ``distortion`` (4, 5, 8, 12 or 14 coefficients in any shape; None for an ideal lens) are arrays, tensors
+        or lists, and ``size`` is (width, height) in pixels. OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5):
+        half a pixel is added to the principal point. Raises ``InputError`` for what is no camera.
+        """
+        matrix, lens = (
+            _numbers("K", K),
+            () if distortion is None else _numbers("distortion", distortion).ravel(),
+        )
+        if matrix.size != 9:
+            raise InputError(f"K has shape {matrix.shape}, expected the 3 x 3 matrix of a camera")
+        (fx, skew, cx), (zero, fy, cy), last = matrix.reshape(3, 3).tolist()
+        if abs(skew) > SKEW * abs(fx) or zero != 0 or last != [0, 0, 1]:
+            raise InputError(
+                f"K is {matrix.reshape(3, 3).tolist()}, expected rows (fx 0 cx), (0 fy cy), (0 0 1) in pixels"
+            )
+        if size is None or len(size) != 2:
+            raise InputError(f"size is {size!r:.60}, expected (width, height) of the image in pixels")
+        width, height = (_whole(name, value) for name, value in zip(("width", "height"), size, strict=True))
+        question_focal(fx, width, height)
+        return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height, tuple(lens) if any(lens) else ())
 
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
@@ -200,6 +235,33 @@ class Intrinsics:
         """Return the camera matrix (3 3) and the distortion coefficients, where ``points`` lie."""
         rows = (self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0)
         return constant(rows, points).reshape(3, 3), constant(tuple(self.distortion), points)
+
+
+def question_focal(focal: float, width: int, height: int) -> None:
+    """Raise ``InputError`` for a focal length that cannot be in pixels, since such a wide view is that of no lens."""
+    if 0 < focal < SHORTEST_FOCAL * max(width, height) and max(width, height) >= PHOTO:
+        angle = 2 * math.degrees(math.atan(max(width, height) / 2 / focal))
+        raise InputError(
+            f"focal length is {focal:g} px for an image of {width}x{height}, which would see {angle:.0f} degrees: is that"
+            f" millimetres? Expected pixels, usually 0.5 to 2 times the width ({0.5 * width:.0f} to {2 * width:.0f})"
+        )
+
+
+def _numbers(name: str, given: Any) -> np.ndarray:
+    try:
+        array = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {given!r:.60}, expected an array of numbers") from error
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} has values that are NaN or infinite, expected finite numbers")
+    return array
+
+
+def _whole(name: str, value: Any) -> int:
+    _require(name, value, Real, "a whole number of pixels")
+    if value != int(value):
+        raise InputError(f"{name} is {value!r:.60}, expected a whole number of pixels")
+    return int(value)
 
 
 def _require(name: str, value: object, kind: type, expected: str) -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from bidnerf_core.camera.exif import Exif
 from bidnerf_core.camera.files import read_camera
@@ -16,6 +17,7 @@ from bidnerf_core.camera.intrinsics import (
     median_camera,
     same_aspect,
 )
+from bidnerf_core.camera.lenses import Camera, Lens
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.errors import InputError
 
@@ -25,6 +27,7 @@ LEAST_CROP = 0.5
 """Smallest share of the width or of the height at which a cropped photo is assumed to have kept its resolution."""
 CAMERA_FILES = ("camera.json", "cameras.txt")
 """Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""
+CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 NO_EXIF = Exif()
 MIDDLE = "the principal point is assumed in the middle"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
@@ -37,6 +40,27 @@ class FoundCamera:
     intrinsics: Intrinsics
     description: str
     approximate: bool = False  # whether the focal length is a nominal one, as in EXIF
+    lens: Lens | None = None  # from whose images those of ``intrinsics`` are resampled
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the image as it is read: the lens, or the intrinsics."""
+        return self.lens or self.intrinsics
+
+    def at_most(self, largest: int | None) -> FoundCamera:
+        """Return the camera of the image reduced to ``largest`` pixels along its longer side. Raises ``InputError``."""
+        if largest is not None and not (isinstance(largest, int) and largest >= 1):
+            raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
+        camera = self.camera
+        longer = max(camera.width, camera.height)
+        if largest is None or longer <= largest:
+            return self
+        factor = largest / longer
+        size = (max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+        if self.lens is not None:
+            lens = self.lens.resized(*size)
+            return replace(self, intrinsics=lens.pinhole, lens=lens)
+        return replace(self, intrinsics=self.intrinsics.resized(*size))
 
 
 @dataclass(frozen=True)
@@ -57,7 +81,7 @@ class Raster:
         """Width and height of the upright image."""
         return self.orientation.upright_size(self.width, self.height)
 
-    def upright(self, camera: Intrinsics) -> Intrinsics | None:
+    def upright(self, camera: CameraKind) -> CameraKind | None:
         """Return a given camera for the upright image, or None where its aspect ratio fits neither orientation.
 
         A camera that fits the stored image is assumed to describe that (COLMAP ignores EXIF's orientation, too).
@@ -76,7 +100,7 @@ class CameraSource:
     of which one probably took the images whose focal length is unknown.
     """
 
-    camera: Intrinsics | str | Path | None = None
+    camera: Camera | str | Path | None = None
     focal: float | None = None  # pixels of the stored image
     hfov: float | None = None  # degrees across the upright image
     assumed: tuple[Intrinsics, ...] = ()
@@ -109,16 +133,15 @@ class CameraSource:
             raise InputError(f"{where}: {error}") from error
         if camera is None:
             return replace(_found_camera(str(where), raster, exif, self.assumed), approximate=True)
-        given, origin = (
-            (camera, "camera as given")
-            if isinstance(camera, Intrinsics)
-            else (read_camera(Path(camera), size), f"camera of {camera}")
-        )
-        return _fitted(str(where), raster, given, origin)
+        if isinstance(camera, Intrinsics | Lens):
+            return _fitted(str(where), raster, camera, "camera as given")
+        if not isinstance(camera, str | Path):
+            raise InputError(f"{where}: camera is {_of_kind(camera)}")
+        return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
-    def at(self, image: Path) -> Callable[[int, int], Intrinsics]:
+    def at(self, image: Path) -> Callable[[int, int], Camera]:
         """Return the function that finds the camera of the file ``image``, without EXIF, from its width and height."""
-        return lambda width, height: self.find(image, Raster(width, height)).intrinsics
+        return lambda width, height: self.find(image, Raster(width, height)).camera
 
 
 def folder_camera(
@@ -158,13 +181,22 @@ def _described(camera: Intrinsics, origin: str) -> FoundCamera:
     return FoundCamera(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
 
 
-def _fitted(where: str, raster: Raster, given: Intrinsics, origin: str) -> FoundCamera:
+def _of_kind(camera: object) -> str:
+    """Return what was given as a camera, and what is expected."""
+    matrix = getattr(camera, "shape", None) == (3, 3)
+    hint = "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them of a matrix" if matrix else ""
+    return f"a {type(camera).__name__}, expected Intrinsics or the path of a camera file{hint}"
+
+
+def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCamera:
     fitted = raster.upright(given)
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
         raise InputError(
             f"{where}: image is {size}, its camera is for {given.width}x{given.height}; expected one of the same aspect ratio"
         )
+    if isinstance(fitted, Lens):
+        return FoundCamera(fitted.pinhole, f"{origin}: {fitted.sentence}", lens=fitted)
     return FoundCamera(fitted, f"{origin}: {_focal(fitted)}")
 
 

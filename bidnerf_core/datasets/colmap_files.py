@@ -19,13 +19,9 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera.files import (
-    COLMAP_MODEL_IDS,
-    colmap_camera,
-    colmap_parameters,
-    read_text_cameras,
-)
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.colmap_models import MODEL_IDS, colmap_camera, colmap_parameters
+from bidnerf_core.camera.files import read_text_cameras
+from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import read_file
@@ -88,7 +84,7 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
     return _text_images(images), _together(points, _text_points(points))
 
 
-def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Intrinsics]]:
+def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]]:
     """Read the images of the model in ``folder``, and their cameras by id; its points may be missing.
 
     Raises ``InputError`` where there is no model, where a file is damaged, and for a camera that is not perspective.
@@ -118,12 +114,12 @@ def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
     )
 
 
-def _binary_camera(file: _Bytes) -> tuple[int, Intrinsics]:
+def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
     number, model, width, height = file.take(CAMERA_RECORD)
     where = f"{file.path}: camera {number}"
-    name = COLMAP_MODEL_IDS.get(model)
+    name = MODEL_IDS.get(model)
     if name is None:
-        expected = ", ".join(COLMAP_MODEL_IDS.values())
+        expected = ", ".join(MODEL_IDS.values())
         raise InputError(
             f"{where} is of the model {model}, expected one of {expected}; undistort the images with COLMAP"
         )

@@ -18,11 +18,11 @@ reconstruction is scaled. COLMAP records no times: a sequence is in the order of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.lenses import PANORAMA_FACES, Camera, PanoramaFace
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.colmap_depth import depth_map_of, read_colmap_depth
 from bidnerf_core.datasets.colmap_files import (
@@ -34,6 +34,7 @@ from bidnerf_core.datasets.colmap_files import (
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import FileNames, posix_name
 from bidnerf_core.datasets.incomplete import present, remark
+from bidnerf_core.datasets.panoramas import panorama_pose
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -68,7 +69,7 @@ class ColmapFrame:
 
     name: PurePosixPath  # below the folder of images
     image: Path
-    camera: Intrinsics
+    camera: Camera
     T_world_camera: SE3  # in units of the model
     depth: Path | None  # of a dense reconstruction
 
@@ -76,7 +77,21 @@ class ColmapFrame:
 
     @property
     def stem(self) -> str:
-        return self.name.stem
+        face = f"_{self.camera.face}" if isinstance(self.camera, PanoramaFace) else ""
+        return f"{self.name.stem}{face}"
+
+    def faces(self) -> list[ColmapFrame]:
+        """Return the pinhole views of a panorama; the frame itself where it is none."""
+        if not isinstance(self.camera, PanoramaFace):
+            return [self]
+        return [
+            replace(
+                self,
+                camera=replace(self.camera, face=face),
+                T_world_camera=self.T_world_camera @ panorama_pose(face),
+            )
+            for face in PANORAMA_FACES
+        ]
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -100,7 +115,12 @@ class ColmapReader(Reader):
 
     def _open(self, path: Path, options: ReadOptions) -> ColmapDataset:
         model = _largest(path, _models(path))
-        return ColmapDataset(Splits(path, hold_out(_frames(path, model))), options.background)
+        splits = hold_out(_frames(path, model))
+        views = {id(frame): frame.faces() for group in splits.values() for frame in group}
+        cut = {
+            split: [view for frame in group for view in views[id(frame)]] for split, group in splits.items()
+        }
+        return ColmapDataset(Splits(path, cut), options.background)
 
 
 class ColmapDataset(SplitDataset[ColmapFrame]):
@@ -191,7 +211,7 @@ def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> No
         remark(folder, f"{text}, the first is {others[0].relative_to(folder)}")
 
 
-def _frame(model: Path, image: ModelImage, file: Path, cameras: dict[int, Intrinsics]) -> ColmapFrame:
+def _frame(model: Path, image: ModelImage, file: Path, cameras: dict[int, Camera]) -> ColmapFrame:
     if image.camera not in cameras:
         raise InputError(f"{model}: image {image.name!r} has the camera {image.camera}, which cameras lacks")
     name = PurePosixPath(posix_name(image.name))

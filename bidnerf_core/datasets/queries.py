@@ -207,6 +207,8 @@ def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Pat
 
     Raises ``UsageError`` where depth files can be assigned in neither way.
     """
+    if not depth:
+        return {}
     by_stem = {photo.stem: photo for photo in photos}
     stems = [file.stem.removesuffix(DEPTH_STEM) for file in depth]
     if len(by_stem) == len(photos) and len(set(stems)) == len(stems) and set(stems) <= set(by_stem):

@@ -6,12 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from jaxtyping import Bool
+from torch import Tensor
+
+from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.camera.source import Raster
 from bidnerf_core.depth.images import DepthImage
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import fit_depth
+from bidnerf_core.frames.photos import fit_depth, pinhole_of
+from bidnerf_core.frames.resampling import Images
 from bidnerf_core.io.images import read_compact_image, read_header
 
 
@@ -30,14 +34,16 @@ class DepthFile:
 def read_rgbd(
     name: str,
     image: Path,
-    camera_of: Callable[[int, int], Intrinsics],
+    camera_of: Callable[[int, int], Camera],
     background: Sequence[float],
     depth: DepthFile | None = None,
+    hidden_of: Callable[[int, int], Bool[Tensor, "h w"] | None] = lambda width, height: None,
 ) -> Frame:
     """Read the image file ``image``, laid over ``background`` (rgb) where it has an alpha channel, and its depth.
 
     ``camera_of`` returns the camera of an image of a width and height, or raises ``InputError`` where that is not the size
-    expected; it is called before any pixel is decoded. Registered depth may be of any size: each pixel has that of the nearest
+    expected; it is called before any pixel is decoded. The images of a ``Lens`` are resampled to its pinhole camera.
+    ``hidden_of`` returns the pixels that are not to be used, of an image of that size. Registered depth may be of any size: each pixel has that of the nearest
     measurement. Raises ``InputError`` for a file that is not readable, and for registered depth of another aspect ratio.
     """
     header = read_header(image)
@@ -47,8 +53,9 @@ def read_rgbd(
     if depth is not None:
         measured = depth.read(depth.path, depth.unit)
         if depth.sensor is not None:
-            metres = depth.sensor.registered(measured.metres, camera, depth.path)
+            metres = depth.sensor.registered(measured.metres, pinhole_of(camera, depth.path), depth.path)
         else:
             raster = Raster(rgb.shape[1], rgb.shape[0])
             metres = fit_depth(measured, raster, raster.size, f"{depth.path}: depth")
-    return Frame(name, rgb, camera, metres, alpha)
+    hidden = hidden_of(header.width, header.height)
+    return Frame.taken(name, camera, Images(rgb, metres, alpha, hidden))

@@ -13,7 +13,8 @@ from the file's), ``transform_matrix``, ``depth_file_path`` or instant-ngp's ``d
 and of any size; each pixel has the depth of the nearest measurement; see ``depth_image`` for values that count as not measured),
 ``mask_path`` (an image whose black pixels are not used). Where ``dynamic_mask_NAME.png`` of instant-ngp lies beside ``NAME.png``,
 its white pixels are not used.
-Frames whose image is missing are left out, and missing depth images too, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
+The images of fisheye and division lenses (``camera_model`` as in COLMAP, or ``is_fisheye``, with ``k1`` to ``k4``) are undistorted
+on reading; a panorama (EQUIRECTANGULAR) becomes six frames, see ``PANORAMA_FACES``. Frames whose image is missing are left out, and missing depth images too, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
 not undone, so the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or
 by the number that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
 
@@ -25,7 +26,12 @@ from __future__ import annotations
 from functools import cached_property
 from pathlib import Path
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import same_aspect
+from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
@@ -81,6 +87,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         self._read_depth = DepthReader()
         self._depth_unit = depth_unit
         self._by_images = background is None
+        self._scaled: set[tuple[int, int, int, int]] = set()  # sizes of images and cameras that were reported
         self._first: tuple[str, int, int] | None = (
             None  # file, width and height of the first image whose camera has no size
         )
@@ -103,39 +110,53 @@ class TransformsDataset(SplitDataset[FrameRecord]):
             unit = frame.depth_unit if self._depth_unit is None else self._depth_unit
             depth = DepthFile(self._files.depth[frame], unit, self._read_depth)
 
-        def camera_of(width: int, height: int) -> Intrinsics:
-            self._check_size(frame, path, width, height)
-            return frame.camera.intrinsics(width, height)
+        def camera_of(width: int, height: int) -> Camera:
+            whole = self._size_of_camera(frame, path, width, height)
+            camera = frame.camera.intrinsics(*whole)
+            return camera if whole == (width, height) else camera.resized(width, height)
 
-        return self._masked(frame, path, read_rgbd(name, path, camera_of, self.background, depth))
+        def hidden_of(width: int, height: int) -> Bool[Tensor, "h w"] | None:
+            return self._hidden(frame, path, (width, height))
 
-    def _masked(self, frame: FrameRecord, image: Path, read: Frame) -> Frame:
-        """Return the frame with what its masks hide: black in nerfstudio's ``mask_path``, white in instant-ngp's."""
+        return read_rgbd(name, path, camera_of, self.background, depth, hidden_of)
+
+    def _hidden(self, frame: FrameRecord, image: Path, size: tuple[int, int]) -> Bool[Tensor, "h w"] | None:
+        """Return what the frame's masks hide: black in nerfstudio's ``mask_path``, white in instant-ngp's."""
         masks: list[tuple[Path, HiddenColour]] = []
         if frame in self._files.masks:
             masks.append((self._files.masks[frame], "black"))
         beside = image.with_name(f"{DYNAMIC_MASK}{image.stem}.png")
         if is_file(beside):
             masks.append((beside, "white"))
-        size = (read.intrinsics.width, read.intrinsics.height)
-        for path, hides in masks:
-            read = read.with_hidden(read_mask(path, Raster(*size), size, hides))
-        return read
+        found = [read_mask(path, Raster(*size), size, hides) for path, hides in masks]
+        return torch.stack(found).any(0) if found else None
 
     def _pose(self, frame: FrameRecord) -> SE3:
         return frame.T_world_camera
 
-    def _check_size(self, frame: FrameRecord, path: Path, width: int, height: int) -> None:
-        """Compare with the camera's size or, where it has none, with the first such image, taken with the same lens."""
+    def _size_of_camera(self, frame: FrameRecord, path: Path, width: int, height: int) -> tuple[int, int]:
+        """Return the size of the image that the camera describes: that of the file, or the same reduced or enlarged.
+
+        Raises ``InputError`` for another one. A camera without a size is that of the first such image, taken with the same lens.
+        """
         camera = frame.camera
         expected, whose = (camera.width or width, camera.height or height), "w and h say"
         if camera.width is None and camera.height is None:
             self._first = self._first or (path.name, width, height)
             expected, whose = self._first[1:], f"{self._first[0]} is"
+        elif (width, height) != expected and same_aspect((width, height), expected):
+            if (width, height, *expected) not in self._scaled:
+                self._scaled.add((width, height, *expected))
+                remark(
+                    frame.record.where,
+                    f"{path.name} is {width}x{height}, w and h say {expected[0]}x{expected[1]}; cameras are scaled to the images",
+                )
+            return expected
         if (width, height) != expected:
             raise frame.record.error(
                 f"{path.name} is {width}x{height}, expected {expected[0]}x{expected[1]} as {whose}"
             )
+        return expected
 
     def _has_alpha(self, frame: FrameRecord) -> bool:
         try:

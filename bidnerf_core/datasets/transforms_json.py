@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from bidnerf_core.camera.files import CameraRecord, camera_record
+from bidnerf_core.camera.lenses import PANORAMA, PANORAMA_FACES
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.incomplete import remark
+from bidnerf_core.datasets.panoramas import panorama_pose
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError
@@ -42,7 +44,25 @@ class FrameRecord:
     @property
     def stem(self) -> str:
         known = self.file_path.suffix.lower() in IMAGE_SUFFIXES
-        return self.file_path.stem if known else self.file_path.name  # "r_0.5" may have no extension
+        stem = self.file_path.stem if known else self.file_path.name  # "r_0.5" may have no extension
+        return stem if self.camera.face is None else f"{stem}_{self.camera.face}"
+
+    def faces(self) -> list[FrameRecord]:
+        """Return the pinhole views of a panorama; the frame itself where it is none. Raises ``InputError`` for its depth."""
+        if self.camera.lens != PANORAMA:
+            return [self]
+        if self.depth_path is not None:
+            raise self.record.error(
+                "an equirectangular image has depth, expected none, or pinhole images with depth"
+            )
+        return [
+            replace(
+                self,
+                camera=replace(self.camera, face=face),
+                T_world_camera=self.T_world_camera @ panorama_pose(face),
+            )
+            for face in PANORAMA_FACES
+        ]
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -54,9 +74,15 @@ def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
     """Read the frames of each split of the folder ``path``. Raises ``InputError`` for a description that is not usable."""
     files = {split: path / file_of(split) for split in SPLITS if (path / file_of(split)).is_file()}
     if files:
-        return {split: read_frames(read_record(file)) for split, file in files.items()}
+        return _cut({split: read_frames(read_record(file)) for split, file in files.items()})
     record = read_record(path / "transforms.json")
-    return split_frames(record, read_frames(record))
+    return _cut(split_frames(record, read_frames(record)))
+
+
+def _cut(splits: dict[str, list[FrameRecord]]) -> dict[str, list[FrameRecord]]:
+    """Return the splits with panoramas cut into pinhole views; splits may share frames."""
+    views = {id(frame): frame.faces() for group in splits.values() for frame in group}
+    return {split: [view for frame in group for view in views[id(frame)]] for split, group in splits.items()}
 
 
 def read_frames(file: Record) -> list[FrameRecord]:

@@ -22,6 +22,7 @@ from bidnerf_core.datasets.sequence import TimedFrame
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.colours import as_floats
 from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.resampling import Images
 from bidnerf_core.io.files import open_binary
 from bidnerf_core.io.images import LARGEST_IMAGE, reason
 
@@ -69,8 +70,8 @@ class Video:
     def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
         rgb = as_floats(torch.from_numpy(pixels))  # at once, as a tracker reads them often
         found = self.camera.find(self.path, Raster(pixels.shape[1], pixels.shape[0]))
-        return Frame(
-            f"{number:06d}", rgb, found.intrinsics, camera_source=found.description,
+        return Frame.taken(
+            f"{number:06d}", found.camera, Images(rgb), camera_source=found.description,
             focal_is_approximate=found.approximate,
         )  # fmt: skip
 

@@ -45,7 +45,12 @@ class DepthCamera:
             raise record.error(
                 f"no {EXTRINSICS}, expected the 4x4 pose of the depth camera in the colour camera"
             )
-        return DepthCamera(read_camera(path, (0, 0)), rigid_of_rows(record, EXTRINSICS, rows))
+        camera = read_camera(path, (0, 0))
+        if not isinstance(camera, Intrinsics):
+            raise record.error(
+                "is of a lens that is not perspective, expected the intrinsics of the depth camera"
+            )
+        return DepthCamera(camera, rigid_of_rows(record, EXTRINSICS, rows))
 
     def registered(
         self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.lenses import Camera, Lens
 from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.depth.images import depth_image
 from bidnerf_core.depth.registration import DepthCamera
@@ -23,6 +24,7 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames.colours import HELD, LAST, Colours, as_bytes
 from bidnerf_core.frames.masks import HiddenColour, WhollyHidden, read_mask
 from bidnerf_core.frames.photos import fit_depth, read_photo
+from bidnerf_core.frames.resampling import Images
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import (
     Background,
@@ -164,12 +166,29 @@ class Frame:
             warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=3)
         found, hidden = photo.camera, None
         if mask is not None:
-            size = (found.intrinsics.width, found.intrinsics.height)
+            size = (found.camera.width, found.camera.height)
             hidden = read_mask(Path(mask), photo.raster, size, mask_hides)
-        return Frame(
-            path.stem, photo.rgb, found.intrinsics, photo.depth, photo.alpha, found.description,
-            found.approximate, hidden=hidden if hidden is not None and bool(hidden.any()) else None,
-        )  # fmt: skip
+        images = Images(photo.rgb, photo.depth, photo.alpha, hidden)
+        return Frame.taken(
+            path.stem,
+            found.camera,
+            images,
+            camera_source=found.description,
+            focal_is_approximate=found.approximate,
+        )
+
+    @staticmethod
+    def taken(name: str, camera: Camera, images: Images, **about: Any) -> Frame:
+        """Return the frame of upright images that ``camera`` took; those of a ``Lens`` are resampled to its pinhole camera.
+
+        ``about`` holds other attributes of the frame, as for its constructor.
+        """
+        intrinsics = camera
+        if isinstance(camera, Lens):
+            intrinsics, images = camera.pinhole, images.as_pinhole(camera)
+            about = {"camera_source": camera.sentence} | about
+        hidden = images.hidden if images.hidden is not None and bool(images.hidden.any()) else None
+        return Frame(name, images.rgb, intrinsics, images.depth, images.alpha, hidden=hidden, **about)  # type: ignore[arg-type]
 
     def with_hidden(self, hidden: Bool[Tensor, "h w"] | None) -> Frame:
         """Return the frame with more pixels hidden; the frame itself where ``hidden`` is None or false everywhere.
@@ -208,6 +227,7 @@ class Frame:
             found = type(given).__name__
             raise InputError(
                 f"{where}: camera is a {found}, expected Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...)"
+                " or, of a matrix, Intrinsics.from_opencv(K, distortion, (width, height))"
             )
         colour, cover = split_alpha(pixel_array(rgb, f"{where}: rgb"))
         if alpha is not None:

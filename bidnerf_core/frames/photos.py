@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.exif import read_exif
-from bidnerf_core.camera.intrinsics import same_aspect
+from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
+from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.camera.source import CameraSource, FoundCamera, Raster
 from bidnerf_core.depth.images import DepthImage, read_depth_image
 from bidnerf_core.depth.registration import DepthCamera
@@ -61,7 +62,8 @@ def read_photo(
     raster = Raster(header.width, header.height, exif.orientation)
     found = camera.find(path, raster, exif)
     measured = None if depth is None else read_depth_image(depth, depth_unit)
-    found, size = _limited(found, largest)
+    found = found.at_most(largest)
+    size = (found.camera.width, found.camera.height)
     rgb, alpha = read_image(path, colour_behind, exif.orientation.upright_size(*size))
     rgb = exif.orientation.upright(rgb)
     alpha = None if alpha is None else exif.orientation.upright(alpha)
@@ -70,9 +72,18 @@ def read_photo(
     fitted = (
         fit_depth(measured, raster, size, f"{depth}: depth")
         if sensor is None
-        else sensor.registered(measured.metres, found.intrinsics, depth)
+        else sensor.registered(measured.metres, pinhole_of(found.camera, depth), depth)
     )
     return Photo(rgb, alpha, found, fitted, measured.remark(depth_unit is None), raster)
+
+
+def pinhole_of(camera: Camera, depth: Path) -> Intrinsics:
+    """Return a camera to which depth can be registered. Raises ``InputError`` for a lens whose images are resampled."""
+    if not isinstance(camera, Intrinsics):
+        raise InputError(
+            f"{depth}: depth cannot be registered to {camera.sentence}, expected undistorted images"
+        )
+    return camera
 
 
 def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what: str) -> Float[Tensor, "h w"]:
@@ -124,15 +135,3 @@ def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sort key that compares digits as numbers."""
     parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]
-
-
-def _limited(source: FoundCamera, largest: int | None) -> tuple[FoundCamera, tuple[int, int]]:
-    """Return the camera and the size (width, height) of an image whose longer side has at most ``largest`` pixels."""
-    camera = source.intrinsics
-    if largest is not None and not (isinstance(largest, int) and largest >= 1):
-        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
-    longer = max(camera.width, camera.height)
-    if largest is None or longer <= largest:
-        return source, (camera.width, camera.height)
-    camera = camera.scaled(largest / longer)
-    return replace(source, intrinsics=camera), (camera.width, camera.height)

@@ -1,0 +1,308 @@
+"""Lenses that no pinhole camera with a polynomial describes. Their images are resampled to those of pinhole cameras on reading.
+
+Fisheye and division lenses become one pinhole camera each, panoramas (equirectangular images) six, see ``PANORAMA_FACES``. The models are COLMAP's (https://colmap.github.io/cameras.html), whose fisheye model of four coefficients is OpenCV's (Kannala and
+Brandt 2006). Pixel centres are at +0.5.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Self, TypeAlias
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from bidnerf_core.camera.intrinsics import LARGEST_COEFFICIENT, Intrinsics, same_aspect
+from bidnerf_core.camera.orientation import UPRIGHT, Orientation
+from bidnerf_core.errors import InputError
+
+WIDEST = math.radians(60)
+"""Largest angle from the optical axis to the middle of a side of an undistorted image: beyond it, pixels are stretched."""
+FISHEYE, DIVISION, PANORAMA = "OPENCV_FISHEYE", "DIVISION", "EQUIRECTANGULAR"
+LENS_MODELS: dict[str, tuple[str, tuple[int, ...]]] = {
+    # Our model, and the indices of fx, fy, cx, cy and its coefficients among the parameters; -1 is a coefficient of 0.
+    "OPENCV_FISHEYE": (FISHEYE, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "SIMPLE_RADIAL_FISHEYE": (FISHEYE, (0, 0, 1, 2, 3, -1, -1, -1)),
+    "RADIAL_FISHEYE": (FISHEYE, (0, 0, 1, 2, 3, 4, -1, -1)),
+    "SIMPLE_FISHEYE": (FISHEYE, (0, 0, 1, 2, -1, -1, -1, -1)),
+    "FISHEYE": (FISHEYE, (0, 1, 2, 3, -1, -1, -1, -1)),
+    "SIMPLE_DIVISION": (DIVISION, (0, 0, 1, 2, 3)),
+    "DIVISION": (DIVISION, (0, 1, 2, 3, 4)),
+}
+"""COLMAP's models of such lenses."""
+LENS_MODEL_IDS = {
+    5: "OPENCV_FISHEYE",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    12: "SIMPLE_DIVISION",
+    13: "DIVISION",
+    14: "SIMPLE_FISHEYE",
+    15: "FISHEYE",
+    17: "EQUIRECTANGULAR",
+}
+"""The ids of these models in ``cameras.bin``."""
+
+
+PANORAMA_FACES = {  # name: yaw to the right and pitch upwards, degrees
+    "front": (0, 0), "right": (90, 0), "back": (180, 0), "left": (270, 0), "up": (0, 90), "down": (0, -90),
+}  # fmt: skip
+"""The pinhole views, of 90 degrees each, into which a panorama is cut: the faces of a cube."""
+
+
+class Lens(ABC):
+    """A camera whose images are resampled on reading to those of a ``pinhole`` camera at the same pose, or turned from it.
+
+    Images are upright by the time they are resampled: ``orientation`` turns the stored image, which the numbers of the lens
+    are given for, upright.
+    """
+
+    stored_width: int
+    stored_height: int
+    orientation: Orientation
+
+    @property
+    def width(self) -> int:
+        """Columns of the upright image."""
+        return self.orientation.upright_size(self.stored_width, self.stored_height)[0]
+
+    @property
+    def height(self) -> int:
+        """Rows of the upright image."""
+        return self.orientation.upright_size(self.stored_width, self.stored_height)[1]
+
+    @abstractmethod
+    def resized(self, width: int, height: int) -> Self:
+        """Return the lens of the same upright image resampled to another size."""
+
+    @abstractmethod
+    def upright(self, orientation: Orientation) -> Self:
+        """Return the lens of the upright image; this one is of the image as it is stored."""
+
+    @property
+    @abstractmethod
+    def flat(self) -> Intrinsics:
+        """The pinhole camera of the resampled image, before that is turned upright."""
+
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The pinhole camera of the resampled upright image."""
+        return self.flat.upright(self.orientation)
+
+    @abstractmethod
+    def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Return the pixels (u, v) of the stored image that show points of the plane z = 1 of the pinhole camera."""
+
+    def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
+        """Return an upright image (h, w) or (h, w, c) as the ``pinhole`` camera sees it.
+
+        Values are interpolated, and repeated beyond the borders, or they are those of the ``nearest`` pixel, and 0 beyond.
+        """
+        u, v = _lookup(self)
+        method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
+        found: np.ndarray = cv2.remap(image, u, v, method, borderMode=border)
+        return found
+
+    def unseen(self) -> np.ndarray:
+        """Return which pixels of the resampled image the lens did not see."""
+        u, v = _lookup(self)
+        return ~((u >= -0.5) & (u <= self.width - 0.5) & (v >= -0.5) & (v <= self.height - 0.5))
+
+    @property
+    @abstractmethod
+    def sentence(self) -> str:
+        """What is done with the image, for people."""
+
+
+Camera: TypeAlias = Intrinsics | Lens
+
+
+@dataclass(frozen=True)
+class CentralLens(Lens):
+    """A fisheye or division lens: focal lengths, principal point and size in pixels of the image as stored."""
+
+    model: str  # FISHEYE or DIVISION
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    stored_width: int
+    stored_height: int
+    coefficients: tuple[float, ...]
+    name: str  # of the model, as its file has it
+    orientation: Orientation = UPRIGHT
+
+    def __post_init__(self) -> None:
+        Intrinsics(
+            self.fx, self.fy, self.cx, self.cy, self.stored_width, self.stored_height
+        )  # checks the numbers
+        if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.coefficients):
+            raise InputError(
+                f"coefficients of {self.name} are {self.coefficients}, expected those of a real lens"
+            )
+        if not all(map(math.isfinite, self._angles)):
+            raise InputError(
+                f"{self.name} with coefficients {self.coefficients} maps no ray to a side of its image, expected a real lens's"
+            )
+
+    def resized(self, width: int, height: int) -> CentralLens:
+        stored = self.orientation.upright_size(width, height)  # a transposition is its own inverse
+        x, y = stored[0] / self.stored_width, stored[1] / self.stored_height
+        return replace(
+            self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, stored_width=stored[0],
+            stored_height=stored[1],
+        )  # fmt: skip
+
+    def upright(self, orientation: Orientation) -> CentralLens:
+        return replace(self, orientation=orientation)
+
+    @property
+    def flat(self) -> Intrinsics:
+        """A camera of the same focal length that sees as far to each side as the lens does in the middle of that side, but at
+        most 60 degrees from the axis.
+        """
+        left, right, top, bottom = (math.tan(min(angle, WIDEST)) for angle in self._angles)
+        width, height = (math.ceil(size) for size in (self.fx * (left + right), self.fy * (top + bottom)))
+        return Intrinsics(self.fx, self.fy, self.fx * left, self.fy * top, width, height)
+
+    @property
+    def _angles(self) -> tuple[float, ...]:
+        """The angles (radians) from the axis to the left, right, top and bottom sides; NaN where no ray meets a side."""
+        w, h = self.stored_width, self.stored_height
+        sides = (self.cx / self.fx, (w - self.cx) / self.fx, self.cy / self.fy, (h - self.cy) / self.fy)
+        return tuple(self._angle(radius) for radius in sides)
+
+    def _angle(self, radius: float) -> float:
+        """Return the angle at which rays meet the image ``radius`` (over the focal length) from the principal point."""
+        if radius <= 0:
+            return math.nan
+        if self.model == DIVISION:
+            stretch = 1 + self.coefficients[0] * radius**2
+            return math.atan(radius / stretch) if stretch > 0 else WIDEST
+        angles = np.linspace(0, math.pi, 2049)
+        found = self._fisheye_radius(angles)
+        falling = np.diff(found) <= 0
+        rising = int(falling.argmax()) if falling.any() else len(found) - 1
+        return float(np.interp(radius, found[: rising + 1], angles[: rising + 1])) if rising else math.nan
+
+    def _fisheye_radius(self, angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        k1, k2, k3, k4 = self.coefficients
+        squared = angle * angle
+        return angle * (1 + squared * (k1 + squared * (k2 + squared * (k3 + squared * k4))))
+
+    def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        radius = np.linalg.norm(points, axis=-1)
+        if self.model == DIVISION:  # the smaller root of k r d^2 - d + r = 0, d being the distorted radius
+            inside = 1 - 4 * self.coefficients[0] * radius * radius
+            ratio = np.where(inside >= 0, 2 / (1 + np.sqrt(np.maximum(inside, 0))), np.nan)
+        else:
+            ratio = self._fisheye_radius(np.arctan(radius)) / np.maximum(radius, 1e-12)
+            ratio = np.where(radius > 1e-9, ratio, 1.0)
+        found: np.ndarray = points * ratio[..., None] * (self.fx, self.fy) + (self.cx, self.cy)
+        return found
+
+    @property
+    def sentence(self) -> str:
+        flat = self.pinhole
+        return (
+            f"{self.name} undistorted to a pinhole camera of {flat.width}x{flat.height}, fx {flat.fx:.0f} px"
+        )
+
+
+@dataclass(frozen=True)
+class PanoramaFace(Lens):
+    """One of ``PANORAMA_FACES`` of an equirectangular image, whose middle shows what is in front of the camera."""
+
+    face: str
+    stored_width: int
+    stored_height: int
+    orientation: Orientation = UPRIGHT
+
+    def __post_init__(self) -> None:
+        if not same_aspect((self.stored_width, self.stored_height), (2, 1)):
+            size = f"{self.stored_width}x{self.stored_height}"
+            raise InputError(f"equirectangular image is {size}, expected twice as many columns as rows")
+
+    def resized(self, width: int, height: int) -> PanoramaFace:
+        return replace(self, stored_width=width, stored_height=height)
+
+    def upright(self, orientation: Orientation) -> PanoramaFace:
+        if orientation != UPRIGHT:
+            raise InputError("an equirectangular image cannot be rotated, expected an upright one")
+        return self
+
+    @property
+    def flat(self) -> Intrinsics:
+        """A camera of 90 degrees with the resolution of the panorama at its horizon."""
+        focal = self.stored_width / (2 * math.pi)
+        side = max(1, round(2 * focal))
+        return Intrinsics(side / 2, side / 2, side / 2, side / 2, side, side)
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """The axes of the face in the camera of the panorama: R_panorama_face, OpenCV axes."""
+        yaw, pitch = map(math.radians, PANORAMA_FACES[self.face])
+        turn = np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
+        tilt = np.array(
+            [[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]]
+        )
+        return turn @ tilt
+
+    def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        rays = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ self.rotation.T
+        x, y, z = np.moveaxis(rays, -1, 0)
+        longitude, latitude = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))  # downwards
+        u, v = longitude / (2 * math.pi) + 0.5, latitude / math.pi + 0.5
+        return np.stack([u * self.stored_width, v * self.stored_height], axis=-1)
+
+    def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
+        """Return the face; the left and right edges of the panorama continue each other."""
+        u, v = _lookup(self)
+        method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        wrapped = cv2.copyMakeBorder(image, 0, 0, 1, 1, cv2.BORDER_WRAP)
+        found: np.ndarray = cv2.remap(wrapped, u + 1, v, method, borderMode=cv2.BORDER_REPLICATE)
+        return found
+
+    @property
+    def sentence(self) -> str:
+        flat = self.pinhole
+        return f"the {self.face} of an equirectangular image, as a pinhole camera of {flat.width}x{flat.height}, 90 degrees"
+
+
+@lru_cache(maxsize=2)
+def _lookup(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Return column and row, in OpenCV's pixels, of the upright image that each pixel of the resampled image shows."""
+    flat, turn = lens.flat, lens.orientation
+    columns, rows = (np.arange(size) + 0.5 for size in (flat.width, flat.height))
+    places = np.stack(np.meshgrid((columns - flat.cx) / flat.fx, (rows - flat.cy) / flat.fy), axis=-1)
+    u, v = np.moveaxis(lens.project(places), -1, 0)
+    u = lens.stored_width - u if turn.mirrors_columns else u
+    v = lens.stored_height - v if turn.mirrors_rows else v
+    axes = [axis for axis, flips in ((0, turn.mirrors_rows), (1, turn.mirrors_columns)) if flips]
+    u, v = (np.flip(part, axes) if axes else part for part in (u, v))
+    if turn.transposes:
+        u, v = v.T, u.T
+    found = [np.ascontiguousarray(np.nan_to_num(part - 0.5, nan=-9.0), dtype=np.float32) for part in (u, v)]
+    return found[0], found[1]
+
+
+def lens_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Lens:
+    """Return a camera of one of ``LENS_MODELS``, or the front of a panorama.
+
+    Raises ``InputError``, whose message begins with ``where``.
+    """
+    try:
+        if model == PANORAMA:
+            return PanoramaFace("front", width, height)
+        ours, places = LENS_MODELS[model]
+        if len(parameters) != max(places) + 1:
+            raise InputError(f"{model} has {len(parameters)} parameters, expected {max(places) + 1}")
+        fx, fy, cx, cy, *rest = (0.0 if place < 0 else float(parameters[place]) for place in places)
+        return CentralLens(ours, fx, fy, cx, cy, width, height, tuple(rest), model)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
