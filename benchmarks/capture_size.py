@@ -2,8 +2,8 @@
 
     python benchmarks/capture_size.py --work DIR [--photos 20 100 1000] [--steps 200]
 
-Photos of twelve megapixels are drawn of a textured room, as JPEG files with a ``transforms.json``, into DIR; then each of
-``bidnerf train``, ``bake`` and ``localize`` runs as a process of its own. Its resident memory is read every 50 ms: ``resident``
+Photos of twelve megapixels are drawn of a textured room, as JPEG files with a ``transforms.json``, into DIR; then ``bidnerf train``
+(which bakes as well), ``localize`` and ``bake`` run, each as a process of its own. Its resident memory is read every 50 ms: ``resident``
 includes the pages of mapped files, which the system may drop, ``anonymous`` does not. Photos and measurements that exist
 already are not made again, so that an interrupted run goes on.
 """
@@ -28,7 +28,7 @@ from _lab import RESULTS, parser, record
 
 SIZE = (4032, 3024)
 FOCAL = 3000.0  # pixels at that size
-DRAWN = 2  # photos are drawn at SIZE / DRAWN, and enlarged
+DRAWN = 4  # photos are drawn at SIZE / DRAWN, and enlarged
 ROOM = (5.0, 4.0, 3.0)  # metres
 WALLS = (  # corner, and the two edges from it
     ((0, 0, 0), (1, 0, 0), (0, 0, 1)), ((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((1, 1, 0), (-1, 0, 0), (0, 0, 1)),
@@ -44,25 +44,31 @@ def main() -> None:
     for number in range(max(args.photos) + 1):
         draw(folder / f"{number:04d}.jpg", number, textures)
     rows = {tuple(row["key"]): row for row in stored(args.rows)}
-    for count in args.photos:
-        data, place = dataset(args.work, folder, count), args.work / f"map_{count}"
-        commands = {
-            "train": ["train", str(data), "--out", str(place), "--overwrite", "--no-bake", "--steps", str(args.steps)],
-            "bake": ["bake", str(place), "--data", str(data)],
-            "localize": ["localize", str(place), str(folder / f"{max(args.photos):04d}.jpg"), "--focal", str(FOCAL)],
-        }  # fmt: skip
-        for name, command in commands.items():
-            key = (count, name)
+    for command in ("train", "localize", "bake"):
+        for count in args.photos:
+            key = (count, command)
             if key not in rows:
-                rows[key] = {"key": list(key), **measured(command, args.work)}
+                data = dataset(args.work, folder, count)
+                row = measured(arguments_of(command, args, data, args.work / f"map_{count}"), args.work)
+                rows[key] = {"key": list(key), **row}
                 with args.rows.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(rows[key]) + "\n")
             print(*key, rows[key], flush=True)
-    chosen = [rows[count, name] for count in args.photos for name in commands]
-    table = {
-        f"{row['key'][1]} {row['key'][0]}": {k: v for k, v in row.items() if k != "key"} for row in chosen
-    }
-    record(args.name, {"size": list(SIZE), "steps": args.steps, "measurements": table})
+            table = {
+                f"{command} {count}": {k: v for k, v in row.items() if k != "key"}
+                for (count, command), row in sorted(rows.items())
+            }
+            record(args.name, {"size": list(SIZE), "steps": args.steps, "measurements": table})
+
+
+def arguments_of(command: str, args: argparse.Namespace, data: Path, place: Path) -> list[str]:
+    """Return the arguments of a command of bidnerf: ``train`` bakes the map as well, ``bake`` does it anew."""
+    if command == "train":
+        return ["train", str(data), "--out", str(place), "--overwrite", "--steps", str(args.steps)]
+    if command == "bake":
+        return ["bake", str(place), "--data", str(data)]
+    photo = data.parent / "photos" / f"{max(args.photos):04d}.jpg"
+    return ["localize", str(place), str(photo), "--focal", str(FOCAL)]
 
 
 def arguments() -> argparse.Namespace:

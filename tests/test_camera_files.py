@@ -105,7 +105,7 @@ def test_a_matrix_of_opencv_gives_the_camera_with_the_half_pixel() -> None:
             assert (found.cx, found.cy, found.fx) == pytest.approx((311.0, 240.75, 500.0))
     assert Intrinsics.from_opencv(K, np.zeros((5, 1)), np.array(SIZE)) == IDEAL
     assert Intrinsics.from_opencv(K, size=SIZE) == IDEAL
-    points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) + [0, 0, 3]
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(D))
     pixels = CAMERA.project(torch.from_numpy(points)).numpy() - 0.5  # OpenCV's: the first pixel is (0, 0)
     np.testing.assert_allclose(pixels, expected[:, 0], atol=1e-9)

@@ -14,12 +14,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from PIL import Image, features
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.frames.colours import as_floats
+from bidnerf_core.frames.photos import photos_in
 from bidnerf_core.io import files
 from bidnerf_core.io.images import (
     IMAGE_SUFFIXES,
@@ -29,6 +32,7 @@ from bidnerf_core.io.images import (
     open_image,
     over,
     pixel_array,
+    read_compact_image,
     read_header,
     read_image,
     reduced,
@@ -101,6 +105,51 @@ def test_palettes_become_colours(tmp_path: Path) -> None:
     assert alpha is not None
     assert alpha.equal((torch.from_numpy(np.array(image)) != 0).float())
     assert read_header(path).has_alpha
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3)])
+def test_sixteen_bits_have_the_range_that_the_sensor_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: int, shape: tuple[int, ...]
+) -> None:
+    values = np.random.default_rng(0).integers(0, 2**bits, shape, dtype=np.uint16)
+    values.flat[0] = 2**bits - 1
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), values if values.ndim == 2 else values[..., ::-1])
+    expected = torch.from_numpy(values.reshape(20, 30, -1).astype(np.float32) / (2**bits - 1)).expand(
+        20, 30, 3
+    )
+    monkeypatch.setattr("bidnerf_core.io.images.STRIP", 90)
+    for read in (read_image, read_compact_image):
+        found, alpha = read(path)
+        assert alpha is None
+        torch.testing.assert_close(found, expected)
+    if values.ndim == 2:
+        assert decode(path).dtype == np.uint16, "depth images keep their values"
+
+
+def test_eight_bits_stay_bytes(tmp_path: Path) -> None:
+    for mode in ("L", "RGB", "CMYK", "RGBA", "P"):
+        path = tmp_path / f"{mode}.{'jpg' if mode == 'CMYK' else 'png'}"
+        image = Image.fromarray(noise(16, 24)).convert("RGB").resize((48, 32))
+        (image.quantize(16) if mode == "P" else image.convert(mode)).save(path)
+        compact, alpha = read_compact_image(path, (1.0, 1.0, 1.0))
+        floats, expected = read_image(path, (1.0, 1.0, 1.0))
+        assert (alpha is None) == (expected is None)
+        assert (compact.dtype == torch.uint8) == (mode in ("L", "RGB", "CMYK"))
+        assert torch.equal(as_floats(compact), floats)
+
+
+def test_the_first_bytes_count_not_the_name(tmp_path: Path) -> None:
+    pixels = noise(16, 24)
+    for name, kind in (("a.heic", "JPEG"), ("b.jpg", "PNG"), ("c", "JPEG"), ("d.JPG", "WEBP"), ("e", "TIFF")):
+        Image.fromarray(pixels).save(tmp_path / name, format=kind)
+        assert read_image(tmp_path / name)[0].shape == (16, 24, 3)
+    (tmp_path / "notes.txt").write_text("BMW: no image")
+    (tmp_path / "empty").write_bytes(b"")
+    photos, others = photos_in(tmp_path)
+    assert [photo.name for photo in photos] == ["a.heic", "b.jpg", "c", "d.JPG", "e"]
+    assert {other.name for other in others} == {"notes.txt", "empty"}
 
 
 # Files.

@@ -173,3 +173,33 @@ def test_a_missing_extra_is_named(clip: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"needs the extra 'video' \(pip install 'bidnerf\[video\]'\)"):
         open_sequence(clip, focal=50)
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixels", "space"),
+    [
+        ("libx264", "yuv420p10le", 9),
+        ("libx264", "yuv420p10le", 10),
+        ("libx264", "yuv422p10le", 14),
+        ("prores_ks", "yuv422p10le", 9),
+    ],
+)
+def test_ten_bits_and_the_colour_spaces_of_hdr(codec: str, pixels: str, space: int, tmp_path: Path) -> None:
+    """Colours are those of the file but for rounding, or those of the nearest colour space that FFmpeg converts."""
+    image = np.full((HEIGHT, WIDTH, 3), 40, np.uint8)
+    image[:, WIDTH // 2 :] = 200
+    with av.open(str(tmp_path / "hdr.mov"), "w") as container:
+        stream = container.add_stream(codec, rate=RATE)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
+        stream.codec_context.color_trc, stream.codec_context.color_primaries = 16, 9
+        stream.codec_context.colorspace = space
+        for number in range(3):
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=pixels)
+            picture.pts, picture.time_base = number, Fraction(1, RATE)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    frames = [timed.frame for timed in open_sequence(tmp_path / "hdr.mov", hfov=60)]
+    assert len(frames) == 3
+    left, right = frames[1].rgb[:, :20] * 255, frames[1].rgb[:, -20:] * 255
+    assert 30 < float(left.mean()) < 50
+    assert 190 < float(right.mean()) < 210

@@ -115,7 +115,7 @@ class Frame:
     ) -> Frame:
         """Read a photo, turn it upright according to its EXIF orientation, and find its camera.
 
-        The camera is ``camera`` (intrinsics, or a file: ``transforms.json``, ``cameras.json``, COLMAP's ``cameras.txt``),
+        The camera is ``camera`` (intrinsics, or a file, see ``bidnerf_core.camera.files``; photos of fisheye lenses are undistorted),
         or has the focal length ``focal`` (pixels of the image file), or the horizontal field of view ``hfov`` (degrees, of
         the upright image); at most one of them. Without them it comes from the focal length in EXIF or, where there is none,
         from the ``assumed`` cameras, for instance those of a map's landmarks (``map.landmarks.cameras``). A camera of another

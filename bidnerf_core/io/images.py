@@ -34,8 +34,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".p
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
 """Brands in the first bytes of HEIF files (ISO/IEC 23008-12)."""
-MAGIC = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8", b"BM")
-"""First bytes of PNG, JPEG, TIFF (both byte orders), GIF and BMP; WebP, AVIF and HEIF name themselves further on."""
+MAGIC = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8")
+"""First bytes of PNG, JPEG, TIFF (both byte orders) and GIF; BMP, WebP, AVIF and HEIF name themselves further on."""
 DEPTHS = (10, 12, 14)
 """Bits of sensors whose values are stored in 16 bits: an image whose largest value fits one of them has that range."""
 NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -372,8 +372,10 @@ def looks_like_image(path: Path) -> bool:
             head = file.read(12)
     except InputError:
         return False
-    named = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
-    return head.startswith(MAGIC) or named or is_heif(head) or head[4:12] in (b"ftypavif", b"ftypavis")
+    webp = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
+    bitmap = head[:2] == b"BM" and head[6:10] == bytes(4)
+    avif = head[4:12] in (b"ftypavif", b"ftypavis")
+    return head.startswith(MAGIC) or webp or bitmap or avif or is_heif(head)
 
 
 def _register_heif(path: Path) -> None:
