@@ -286,14 +286,14 @@ def test_colmaps_cameras_project_as_pycolmap_does(tmp_path: Path) -> None:
 
 
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
-    "missing": (lambda path: None, "no such file, expected a JSON file or COLMAP's cameras.txt"),
+    "missing": (lambda path: None, "no such file, expected a camera file (JSON, YAML, COLMAP's cameras.txt"),
     "folder": (lambda path: path.mkdir(), "is a folder"),
     "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not text"),
     "empty": (lambda path: path.write_text("# nothing\n"), "holds 0 cameras, expected one"),
     "short": (lambda path: path.write_text("1 PINHOLE 3 4\n"), "line 1 has 4 entries, expected CAMERA_ID"),
     "fisheye": (
-        lambda path: path.write_text("1 OPENCV_FISHEYE 4 3 1 1 2 2 0 0 0 0\n"),
-        "line 1: camera model OPENCV_FISHEYE, expected one of SIMPLE_PINHOLE",
+        lambda path: path.write_text("1 THIN_PRISM_FISHEYE 4 3 1 1 2 2 0 0 0 0 0 0 0 0\n"),
+        "line 1: camera model THIN_PRISM_FISHEYE, expected one of SIMPLE_PINHOLE",
     ),
     "count": (
         lambda path: path.write_text("\n1 PINHOLE 4 3 1 1 2\n"),
@@ -312,8 +312,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "JSON list": (lambda path: path.write_text("[]"), "holds [], expected a JSON object"),
     "no focal length": (lambda path: path.write_text("{}"), "no focal length, expected fl_x"),
     "is_fisheye": (
-        lambda path: path.write_text('{"fl_x": 3, "is_fisheye": 1}'),
-        "camera_model is fisheye (is_fisheye)",
+        lambda path: path.write_text('{"fl_x": 3000, "is_fisheye": 1, "cx": -5}'),
+        "maps no ray to a side of its image",
     ),
     "far cx": (
         lambda path: path.write_text('{"fl_x": 3, "cx": 1e308}'),

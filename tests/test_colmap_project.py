@@ -277,8 +277,8 @@ def replaced(name: str, old: str, new: str) -> Callable[[Path], None]:
 
 BROKEN: dict[str, tuple[Callable[[Path], None], str]] = {
     "fisheye": (
-        replaced("cameras.txt", "5 OPENCV 16 12 20 20 8 6 0.1 -0.02 0.001 0.002", "5 OPENCV_FISHEYE 16 12 20 20 8 6 0 0 0 0"),
-        r"cameras\.txt: line 4: camera model OPENCV_FISHEYE, expected one of",
+        replaced("cameras.txt", "5 OPENCV 16 12 20 20 8 6 0.1 -0.02 0.001 0.002", "5 THIN_PRISM_FISHEYE 16 12 20 20 8 6 0 0 0 0"),
+        r"cameras\.txt: line 4: camera model THIN_PRISM_FISHEYE, expected one of",
     ),
     "parameters": (replaced("cameras.txt", "8.5 6.25", "8.5"), r"cameras\.txt: line 2: PINHOLE has 3 parameters, expected 4"),
     "camera twice": (replaced("cameras.txt", "2 SIMPLE", "1 SIMPLE"), r"cameras\.txt: line 3: camera 1 again"),
@@ -313,9 +313,9 @@ def test_a_binary_camera_that_is_not_perspective(project: Path) -> None:
     to_binary(project)
     file = project / "sparse" / "0" / "cameras.bin"
     content = bytearray(file.read_bytes())
-    struct.pack_into("<i", content, 12, 5)  # the model of the first camera: OPENCV_FISHEYE
+    struct.pack_into("<i", content, 12, 10)  # the model of the first camera: THIN_PRISM_FISHEYE
     file.write_bytes(content)
     with pytest.raises(
-        InputError, match=r"cameras\.bin: camera \d is of the model 5, expected one of SIMPLE_PINHOLE"
+        InputError, match=r"cameras\.bin: camera \d is of the model 10, expected one of SIMPLE_PINHOLE"
     ):
         open_dataset(project)

@@ -538,11 +538,11 @@ BAD_DESCRIPTIONS: dict[str, tuple[Callable[[Json], Any], str]] = {
     "size of none": (edit_file(w=0), "w is 0, expected a positive whole number of pixels"),
     "size broken": (edit_file(h=7.5), "h is 7.5, expected a positive whole number of pixels"),
     "fisheye": (
-        edit_file(camera_model="OPENCV_FISHEYE"),
-        "camera_model is OPENCV_FISHEYE, expected one of PINHOLE, SIMPLE_PINHOLE, OPENCV",
+        edit_file(camera_model="FISHEYE624"),
+        "camera_model is FISHEYE624, expected one of PINHOLE, SIMPLE_PINHOLE, OPENCV",
     ),
-    "fisheye flag": (edit_file(is_fisheye=True), "camera_model is fisheye (is_fisheye), expected one of"),
-    "fisheye flag as a number": (edit_file(is_fisheye=1), "camera_model is fisheye (is_fisheye), expected"),
+    "fisheye flag": (edit_file(is_fisheye=True, cx=-5), "maps no ray to a side of its image"),
+    "fisheye flag as a number": (edit_file(is_fisheye=1, cx=-5), "maps no ray to a side of its image"),
     "far principal point": (
         edit_frame(cx=1e308),
         "frame 1 (images/r_1.png): principal point cx is 1e+308, expected pixels near the image",

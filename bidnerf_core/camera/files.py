@@ -72,10 +72,12 @@ class CameraRecord:
         assert fx is not None  # camera_record ensures it
         cx = width / 2 if self.cx is None else self.cx
         cy = height / 2 if self.cy is None else self.cy
-        question_focal(fx, width, height)
         fy = fx if fy is None else fy
+        lens = self.distortion if self.lens is None else ()
+        flat = Intrinsics(fx, fy, cx, cy, width, height, lens)
+        question_focal(fx, width, height)
         if self.lens is None:
-            return Intrinsics(fx, fy, cx, cy, width, height, self.distortion)
+            return flat
         model, places = LENS_MODELS[self.lens]
         return CentralLens(
             model, fx, fy, cx, cy, width, height, self.distortion[: len(places) - 4], self.lens
@@ -166,8 +168,10 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
     if start[:1] == b"{":
         return _json_camera(parse_record(str(path), content), size)
-    if start[:1] == b"[":
+    if start[:1] == b"[" and start[1:].lstrip()[:1] == b"{":
         return _chosen(path, _splat_cameras(path, content), photo)
+    if start[:1] == b"[":
+        return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
         return read_yaml_camera(str(path), content, size)
     return _chosen(path, _text_cameras(path, content), photo)

@@ -28,9 +28,9 @@ SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
 """Limits of focal lengths and of the distance of the principal point, in pixels. Beyond them, float32 overflows."""
 LARGEST_FOCAL = 1000
 """Focal length of a telescope, in sizes of the image: a field of view of 0.06 degrees."""
-SHORTEST_FOCAL, PHOTO = 0.1, 240
+SHORTEST_FOCAL, PHOTO, MILLIMETRE = 0.1, 240, 1.0
 """Least focal length, in sizes of the image (a view of 157 degrees), of images of at least so many pixels along a side. A shorter one
-is in another unit: of a phone's lens, 4.2 millimetres."""
+of more than a millimetre is that: a phone's lens has 4.2 of them."""
 SKEW = 1e-6
 """Largest skew of a camera matrix, as a share of its focal length."""
 LARGEST_COEFFICIENT = 1e6
@@ -52,8 +52,9 @@ class Intrinsics:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if isinstance(self.distortion, np.ndarray | Tensor):
-            object.__setattr__(self, "distortion", tuple(np.asarray(self.distortion, float).ravel().tolist()))
+        given: Any = self.distortion
+        if isinstance(given, np.ndarray | Tensor):
+            object.__setattr__(self, "distortion", tuple(_numbers("distortion", given).ravel().tolist()))
         self._check_types()
         for name in ("fx", "fy"):
             value = getattr(self, name)
@@ -239,7 +240,7 @@ class Intrinsics:
 
 def question_focal(focal: float, width: int, height: int) -> None:
     """Raise ``InputError`` for a focal length that cannot be in pixels, since such a wide view is that of no lens."""
-    if 0 < focal < SHORTEST_FOCAL * max(width, height) and max(width, height) >= PHOTO:
+    if MILLIMETRE <= focal < SHORTEST_FOCAL * max(width, height) and max(width, height) >= PHOTO:
         angle = 2 * math.degrees(math.atan(max(width, height) / 2 / focal))
         raise InputError(
             f"focal length is {focal:g} px for an image of {width}x{height}, which would see {angle:.0f} degrees: is that"

@@ -284,7 +284,7 @@ def _lookup(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     u = lens.stored_width - u if turn.mirrors_columns else u
     v = lens.stored_height - v if turn.mirrors_rows else v
     axes = [axis for axis, flips in ((0, turn.mirrors_rows), (1, turn.mirrors_columns)) if flips]
-    u, v = (np.flip(part, axes) if axes else part for part in (u, v))
+    u, v = (np.flip(part, tuple(axes)) if axes else part for part in (u, v))
     if turn.transposes:
         u, v = v.T, u.T
     found = [np.ascontiguousarray(np.nan_to_num(part - 0.5, nan=-9.0), dtype=np.float32) for part in (u, v)]

@@ -146,7 +146,7 @@ class CameraSource:
 
 def folder_camera(
     folder: Path,
-    given: Intrinsics | Path | None,
+    given: Camera | Path | None,
     published: Intrinsics | None,
     unknown: str = "",
     ways: str = "a file",

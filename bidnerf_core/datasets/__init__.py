@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.image_folders import open_images
@@ -69,7 +70,7 @@ def open_dataset(
     path: str | Path,
     background: Background | None = None,
     readers: Sequence[Reader] | None = None,
-    camera: Intrinsics | str | Path | None = None,
+    camera: Camera | str | Path | None = None,
     register_depth: DepthRegistration | None = None,
     depth_unit: float | None = None,
     masks: str | Path | MaskFolder | None = None,
@@ -101,7 +102,7 @@ def open_dataset(
 def open_sequence(
     path: str | Path,
     *,
-    camera: Intrinsics | str | Path | None = None,
+    camera: Camera | str | Path | None = None,
     focal: float | None = None,
     hfov: float | None = None,
     assumed: Sequence[Intrinsics] = (),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence, sequence_of
 from bidnerf_core.depth.images import FARTHEST
@@ -34,7 +34,7 @@ class ReadOptions:
     """
 
     background: Background | None = None
-    camera: Intrinsics | Path | None = None
+    camera: Camera | Path | None = None
     register_depth: DepthRegistration | None = None
     depth_unit: float | None = None
 

@@ -30,6 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.camera.source import CameraSource, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import FileNames, posix_name
@@ -166,9 +167,9 @@ def published_camera(folder: Path) -> Intrinsics | None:
     return CAMERAS[found[1]] if found else None
 
 
-def _named_camera(given: Intrinsics | Path) -> Intrinsics | None:
+def _named_camera(given: Camera | Path) -> Intrinsics | None:
     """Return the calibration of a sensor that is given by its name, such as ``freiburg1``, or None."""
-    found = None if isinstance(given, Intrinsics) or given.exists() else SENSOR.fullmatch(str(given))
+    found = None if not isinstance(given, Path) or given.exists() else SENSOR.fullmatch(str(given))
     return CAMERAS[found[1]] if found else None
 
 
