@@ -81,6 +81,15 @@ def run(arguments: list[str]) -> None:
         mask_hides: MaskHides = "black",
         depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
         depth_sensor: DepthSensorName = "unknown",
+        risk: Annotated[
+            float | None,
+            option(
+                "SHARE",
+                "tolerated share of wrong poses among those accepted after a search of the map; it does not apply to the frames"
+                " tracked from there",
+                "accepted as usual",
+            ),
+        ] = None,
         split: Annotated[
             str | None, option("NAME", "take the frames of one split of a dataset only", "all")
         ] = None,
@@ -127,7 +136,7 @@ def run(arguments: list[str]) -> None:
         sensor = ReadOptions(register_depth=registration).sensor(sequence) if follow else None
         begin, settings = (
             None if start is None else read_pose(start),
-            settings_of(USUAL_METHOD, {"depth_sensor": depth_sensor}),
+            settings_of(USUAL_METHOD, {"depth_sensor": depth_sensor, "risk": risk}),
         )
         stored = load_map(map)
         assumed = () if stored.landmarks is None else stored.landmarks.cameras

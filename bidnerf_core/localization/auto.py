@@ -43,6 +43,7 @@ from bidnerf_core.localization.landmarks.propose import confirm
 from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.risk import within_risk
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
 
@@ -70,6 +71,11 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     and there is no start.
     """
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
+    found = _found_behind_occluders(problem, config, seed)
+    return found if config.risk is None else within_risk(found, config.risk)
+
+
+def _found_behind_occluders(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     found = _judged(problem, config, seed)
     if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
         return found
@@ -285,5 +291,6 @@ AUTO = Method(
     depth_sensor=lambda config: config.depth_sensor,
     by_colour=lambda config: config.by_colour,
     rays=lambda config: config.fused_rays,
+    risk=lambda config: config.risk,
     summary="landmarks, then search on the baked surface by depth or colour; no start needed",
 )

@@ -116,6 +116,11 @@ class Localizer:
         return self._method.depth_sensor(self.config)
 
     @property
+    def risk(self) -> float | None:
+        """The tolerated share of wrong answers among the accepted ones; None: answers are accepted as usual."""
+        return self._method.risk(self.config)
+
+    @property
     def by_colour(self) -> ByColourConfig:
         """The settings of refinement by colour alone; methods without such settings have the usual ones."""
         return self._method.by_colour(self.config)

@@ -28,6 +28,10 @@ def _none_rendered(config: Any) -> int:
     return 0
 
 
+def _no_risk(config: Any) -> None:
+    return None
+
+
 def _usual_colour(config: Any) -> ByColourConfig:
     return ByColourConfig()
 
@@ -52,6 +56,8 @@ class Method:
     rays: Callable[[Any], int] = (
         _none_rendered  # how many may be rendered to tell explanations of an image apart
     )
+    # the share of wrong answers among the accepted ones that is tolerated; None: accepted as usual
+    risk: Callable[[Any], float | None] = _no_risk
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:

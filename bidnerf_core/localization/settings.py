@@ -18,6 +18,7 @@ from bidnerf_core.fields.residuals import (
 )
 from bidnerf_core.frames.pixels import DrawerName
 from bidnerf_core.geometry.robust import Robust, RobustName
+from bidnerf_core.localization.risk import least_confidence
 from bidnerf_core.localization.solvers.history import AnswerName
 from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
@@ -237,7 +238,14 @@ class AutoConfig(Settings):
     fused_rays: Annotated[int, Range(0, 10**6)] = 1024
     # what measured the depth: unknown, kinect, realsense, lidar or rendered
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
+    # share of wrong answers among the accepted ones that is tolerated; None: accepted as usual
+    risk: float | None = None
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.risk is not None:
+            least_confidence(self.risk)
 
 
 @dataclass(frozen=True)

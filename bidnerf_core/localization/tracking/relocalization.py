@@ -16,6 +16,7 @@ from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localiza
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.problem import Problem, SceneMap
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.risk import within_risk
 from bidnerf_core.localization.settings import LEAST_POINTS
 
 FIRST_FULL_SEARCH = 4
@@ -50,6 +51,8 @@ def relocalized(
         problem = localizer.problem(frame)
         near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
         found = _recognised(problem, near, localizer.rays, seed)
+        if found is not None and localizer.risk is not None:
+            found = within_risk(found, localizer.risk)
         if (found is not None and found.converged) or not _searched(localizer, frame, lost):
             return found
         return localizer.solved(replace(problem, start=predicted), seed)

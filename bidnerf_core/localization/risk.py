@@ -1,0 +1,47 @@
+"""Tolerated risk: the share of wrong answers among the accepted ones, and the confidence that it requires.
+
+``benchmarks/risk.py`` calibrates the least confidence on answers to images with and without faults; ``confidence.json`` holds it.
+The threshold applies to the final answer, after all other rules of acceptance: these decide how an answer is found, and a
+guarantee holds only for answers found as those of the calibration were.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+from importlib.resources import files
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.settings import Range
+
+
+@lru_cache(maxsize=1)
+def levels() -> tuple[tuple[float, float], ...]:
+    """Return the calibrated risks in increasing order, each with the least confidence of an accepted answer."""
+    stored = json.loads((files(__package__) / "confidence.json").read_text())
+    return tuple((risk, least) for risk, least in stored.get("risk", {}).get("least_confidence", []))
+
+
+def least_confidence(risk: float) -> float:
+    """Return the confidence required by the largest calibrated risk that does not exceed ``risk``.
+
+    Raises ``InputError`` for a risk outside the calibrated range.
+    """
+    if not levels():
+        raise InputError(f"risk is {risk!r}, expected none: no risk was calibrated for this confidence")
+    calibrated = Range(levels()[0][0], levels()[-1][0])
+    if risk not in calibrated:
+        raise InputError(f"risk is {risk!r}, expected {calibrated}, for which the confidence was calibrated")
+    return min(confidence for level, confidence in levels() if level <= risk)
+
+
+def within_risk(found: Localization, risk: float) -> Localization:
+    """Return an answer, as ``uncertain`` if its confidence is less than the risk requires or not known."""
+    least = least_confidence(risk)
+    if not found.converged or (found.confidence is not None and found.confidence >= least):
+        return found
+    said = "not known" if found.confidence is None else f"{found.confidence:.3f}"
+    reason = f"the confidence is {said}, a risk of {risk:g} requires {least:.3f}; {found.reason}"
+    return replace(found, outcome=Outcome.UNCERTAIN, reason=reason)
