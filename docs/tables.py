@@ -359,6 +359,33 @@ def covariance(records: Records) -> str:
 
 
 @table
+def risk(records: Records) -> str:
+    """What a stated risk is worth: the share of wrong answers among the accepted ones, and how many right ones it costs."""
+    record = records["risk"]
+
+    def counted(found: Record) -> str:
+        return f"{found['wrong']} of {found['accepted']}"
+
+    rows = []
+    for risk, halves in record["other_halves"].items():
+        tested, scenes = record["other_faults"], record["scene_left_out"]
+        worst = max(
+            scenes, key=lambda scene: scenes[scene][risk]["wrong"] / max(scenes[scene][risk]["accepted"], 1)
+        )
+        if halves["halves_with_a_threshold"]:
+            rows.append(
+                (f"{float(risk):.1%}", counted(tested[risk]), f"{tested[risk]['right_lost']} of {tested['right']}",
+                 f"{halves['exceeded']} of {halves['halves_with_a_threshold']}",
+                 f"{counted(scenes[worst][risk])} ({SCENES.get(worst, worst)})")
+            )  # fmt: skip
+    head = (
+        "stated risk", "other faults: wrong of accepted", "right answers lost", "halves in which the risk is exceeded",
+        "worst scene when left out: wrong of accepted",
+    )  # fmt: skip
+    return _table(head, rows, records)
+
+
+@table
 def conditions(records: Records) -> str:
     """Queries that differ from the images of the map."""
     titles = {
