@@ -90,7 +90,8 @@ def bake_landmarks(
     source: LandmarkSource = "photos" if views else "rendered images"
     # Only photos show how well the field renders; against its own images it has no error.
     noise = colour_noise(field, info.bounds, views) if views else info.colour_noise
-    images = views or rendered_views(field, info.bounds, cameras_of(info))
+    rendering = counter("rendering", "views", progress, cancel)
+    images = views or rendered_views(field, info.bounds, cameras_of(info), rendering)
     report = counter("landmarks", "steps", progress, cancel)
     tracked = tracked_views(images, info.landmark_features, progress=report) if tracked is None else tracked
     if views and not info.distances:

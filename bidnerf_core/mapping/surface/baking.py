@@ -42,11 +42,15 @@ NOISE_RAYS = 4096
 """Rays on which the colour noise is measured."""
 
 
-def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
+def rendered_views(
+    field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[View]:  # fmt: skip
     """Return images with depth that ``field`` renders from ``cameras``, for a map that came without photos."""
-    every = max(1, math.ceil(len(cameras) / MOST))
-    views = []
-    for number, (intrinsics, T) in enumerate(cameras[::every]):
+    chosen = cameras[:: max(1, math.ceil(len(cameras) / MOST))]
+    views = list[View]()
+    for number, (intrinsics, T) in enumerate(chosen):
+        progress(number, len(chosen))
         small = intrinsics.scaled(min(1.0, KEYFRAME_SIDE / max(intrinsics.width, intrinsics.height)))
         image = render_image(field, small, T, bounds)
         views.append(View(Frame(f"{number:04d}", image.rgb, small, image.depth), T))

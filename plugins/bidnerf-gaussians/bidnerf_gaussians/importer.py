@@ -77,7 +77,7 @@ def imported(
     """Return Gaussians of any source as a field. Raises ``InputError`` where none of them can be rendered."""
     kept, dropped = cleaned(gaussians, where)
     if config.least_opacity:
-        kept = kept[kept.opacities >= config.least_opacity]
+        before, kept = len(kept), kept[kept.opacities >= config.least_opacity]
         if not len(kept):
             raise InputError(f"{where}: no Gaussian is as opaque as {config.least_opacity:g} (least_opacity)")
     count = len(gaussians)
@@ -94,6 +94,8 @@ def imported(
     facts = [f"{count:,} Gaussians, harmonics of degree {gaussians.degree}" + (f" ({of.name})" if of else "")]
     if str(dropped):
         facts.append(f"left out {dropped}")
+    if config.least_opacity:
+        facts.append(f"left out {before - len(kept):,} of an opacity below {config.least_opacity:g}")
     if of is not None:
         facts.append(f"axes: {of.convention}")
     up = T.rotation.double() @ torch.tensor(UP if of is None else of.up, dtype=torch.float64)

@@ -105,7 +105,7 @@ def _opened(path: Path) -> _Scene:
     content = read_file(path, EXPECTED, LARGEST_FILE)
     text, binary = content, None
     if content.startswith(MAGIC):
-        chunks = {}
+        chunks = dict[int, bytes]()
         place = 12
         while place + 8 <= len(content):
             length, kind = struct.unpack_from("<II", content, place)

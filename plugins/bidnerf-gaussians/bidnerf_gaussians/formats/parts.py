@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
@@ -29,11 +30,11 @@ def gaussians_of(
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """Return the Gaussians of all parts, with harmonics up to the highest degree among them."""
     count = max(part.harmonics.shape[1] for part in parts)
-    harmonics = [pad(part.harmonics, (0, 0, 0, count - part.harmonics.shape[1])) for part in parts]
-    names = ("means", "log_scales", "quaternions", "logits")
-    return Gaussians(
-        *(torch.cat([getattr(part, name) for part in parts]) for name in names), torch.cat(harmonics)
-    )
+    full = [
+        replace(part, harmonics=pad(part.harmonics, (0, 0, 0, count - part.harmonics.shape[1])))
+        for part in parts
+    ]
+    return Gaussians(*(torch.cat([getattr(part, of.name) for part in full]) for of in fields(Gaussians)))
 
 
 def logit(opacity: np.ndarray) -> np.ndarray:

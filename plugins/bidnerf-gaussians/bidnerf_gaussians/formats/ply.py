@@ -120,8 +120,8 @@ def read_compressed(path: Path) -> Gaussians:
     harmonics = ((rgb - 0.5) / C0)[:, None]
     extra = elements.get("sh")
     if extra is not None and len(extra) == len(vertices):
-        found = _rest(extra, len(extra.dtype.names or ()), path)
-        harmonics = np.concatenate([harmonics, (found - 127.5) / 32], axis=1)
+        rest = _rest(extra, len(extra.dtype.names or ()), path)
+        harmonics = np.concatenate([harmonics, (rest - 127.5) / 32], axis=1)
     return gaussians_of(
         within(_unpacked(position), MEANS),
         within(_unpacked(scale), ("scale_x", "scale_y", "scale_z")),
