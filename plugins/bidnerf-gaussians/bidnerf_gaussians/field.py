@@ -24,7 +24,8 @@ STOPPED = 1e-4
 """Share of a ray's light that still shines through where nothing behind is looked at, as in the first paper's code."""
 LEAST_EXTENT = 2.0
 """Standard deviations to which at least a Gaussian's box extends, so that ``query`` finds nearly all of its density."""
-RAYS_AT_ONCE = 2048
+RAYS_AT_ONCE = 384
+"""Rays that are looked up together: so few that what they meet stays in the processor's cache."""
 POINTS_AT_ONCE = 2**15
 KEPT_HITS = 64
 """Gaussians along a ray where their number must be known beforehand; the nearest ones are kept."""
