@@ -198,7 +198,8 @@ def test_ten_bits_and_the_colour_spaces_of_hdr(codec: str, pixels: str, space: i
             picture.pts, picture.time_base = number, Fraction(1, RATE)
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
-    frames = [timed.frame for timed in open_sequence(tmp_path / "hdr.mov", hfov=60)]
+    (tmp_path / "hdr.mov").rename(tmp_path / "hdr")  # the first bytes say what it is
+    frames = [timed.frame for timed in open_sequence(tmp_path / "hdr", hfov=60)]
     assert len(frames) == 3
     left, right = frames[1].rgb[:, :20] * 255, frames[1].rgb[:, -20:] * 255
     assert 30 < float(left.mean()) < 50

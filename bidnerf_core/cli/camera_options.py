@@ -25,8 +25,8 @@ CameraFile = Annotated[
     one_camera,
     option(
         "CAMERA.json",
-        "file with intrinsics: transforms.json, cameras.json, COLMAP's cameras.txt; of a folder of TUM RGB-D also freiburg1,"
-        " freiburg2 or freiburg3",
+        "file with intrinsics: of nerfstudio, COLMAP (cameras.txt), ROS or OpenCV (YAML), Open3D, hloc or 3D Gaussian Splatting; of"
+        " a folder of TUM RGB-D also freiburg1, freiburg2 or freiburg3",
         "",
     ),
 ]

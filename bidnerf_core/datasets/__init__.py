@@ -31,7 +31,7 @@ from bidnerf_core.datasets.sequence import (
     sequence_of,
 )
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.datasets.video import VIDEO_SUFFIXES, open_video
+from bidnerf_core.datasets.video import VIDEO_SUFFIXES, is_video, open_video
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, amount
@@ -131,7 +131,7 @@ def open_sequence(
     if not place.exists():
         raise InputError(f"{place}: no such file or folder")
     if not place.is_dir():
-        if place.suffix.lower() not in VIDEO_SUFFIXES:
+        if not is_video(place):
             raise InputError(
                 f"{place}: is a file, expected a video ({', '.join(VIDEO_SUFFIXES)}) or a folder"
             )

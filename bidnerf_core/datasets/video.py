@@ -24,11 +24,13 @@ from bidnerf_core.frames.colours import as_floats
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.resampling import Images
 from bidnerf_core.io.files import open_binary
-from bidnerf_core.io.images import LARGEST_IMAGE, reason
+from bidnerf_core.io.images import LARGEST_IMAGE, looks_like_image, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
 MICROSECONDS = 1_000_000
 """The unit in which a file states its start, per second."""
+MATROSKA = b"\x1aE\xdf\xa3"
+"""First bytes of Matroska and WebM."""
 BT_2020 = 9
 """The matrix from luma and chroma to colours (ITU-T H.273) that stands in for those that FFmpeg lacks."""
 OPTIONS = {"protocol_whitelist": "file"}
@@ -79,6 +81,19 @@ class Video:
         return InputError(
             f"{self.path}: breaks off at frame {number} ({reason(error)}), expected a whole video file"
         )
+
+
+def is_video(path: Path) -> bool:
+    """Return whether a file is a video by its name or by its first bytes; it is not decoded."""
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return True
+    try:
+        with open_binary(path, "a video file") as file:
+            head = file.read(12)
+    except InputError:
+        return False
+    mp4 = head[4:8] == b"ftyp" and not looks_like_image(path)
+    return mp4 or head[:4] == MATROSKA or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
 
 
 def open_video(path: Path, camera: CameraSource) -> Video:

@@ -22,6 +22,8 @@ from bidnerf_core.settings import Range, Settings
 
 NORM = 512.0
 """Length of a quantised descriptor, as is customary for SIFT: it makes good use of the range of a byte."""
+STRIP = 2**22
+"""Pixels that are converted to grey at a time."""
 FIRST_CENTRE = 0.5
 """Offset from OpenCV's pixel coordinates to ours: the centre of the first pixel is (0, 0) there, (0.5, 0.5) here."""
 
@@ -218,8 +220,12 @@ def paired_squared_distances(
 
 
 def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
-    clean = rgb.detach().cpu().float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_()
-    return cv2.cvtColor(clean.to(torch.uint8).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
+    """Return the brightness of an image as bytes (h, w)."""
+    strips = (
+        rgb.detach().cpu().split(max(1, STRIP // rgb.shape[1]))
+    )  # of a phone's photo, a copy takes a gigabyte
+    clean = (part.float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_().to(torch.uint8) for part in strips)
+    return np.concatenate([cv2.cvtColor(part.contiguous().numpy(), cv2.COLOR_RGB2GRAY) for part in clean])
 
 
 def _reduced(grey: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:

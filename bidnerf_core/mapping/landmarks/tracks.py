@@ -55,6 +55,8 @@ def _ranks(count: int, others: int) -> list[int]:
     return [rank for rank in ranks if rank < others] or list(range(others))
 
 
+MANY = 2**16
+"""Descriptors that are converted to floats at a time."""
 ROWS = 1024
 """Views whose dissimilarity to all others is computed at a time: no matrix of all pairs is ever in memory."""
 
@@ -290,9 +292,13 @@ def _mean_descriptors(
     descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int
 ) -> UInt8[Tensor, "n d"]:
     """Return mean descriptors, rescaled to the mean length, since a shorter descriptor is nearer to all others."""
-    values = descriptors.float()
-    mean = _mean(values, point, count)
-    length = _mean(torch.linalg.vector_norm(values, dim=-1, keepdim=True), point, count)
+    total, lengths = torch.zeros((count, descriptors.shape[1])), torch.zeros((count, 1))
+    for rows in torch.arange(len(descriptors)).split(MANY):  # as floats, all of them would take gigabytes
+        values = descriptors[rows].float()
+        total.index_add_(0, point[rows], values)
+        lengths.index_add_(0, point[rows], torch.linalg.vector_norm(values, dim=-1, keepdim=True))
+    number = torch.bincount(point, minlength=count).clamp(min=1)[:, None]
+    mean, length = total / number, lengths / number
     scaled = mean * length / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-9)
     return scaled.round().clamp(0, 255).to(torch.uint8)
 
