@@ -19,6 +19,7 @@ from bidnerf_core.datasets.queries import (
 )
 from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.errors import UsageError
+from bidnerf_core.io.images import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,9 @@ def open_queries(
 
     Raises ``InputError`` where there is nothing of either kind, and ``UsageError`` for options of the other kind.
     """
-    datasets = [path for path in paths if path.is_dir() and find_reader(path) is not None]
+    datasets = [
+        path for path in paths if path.suffix.lower() not in IMAGE_SUFFIXES and find_reader(path) is not None
+    ]
     if frames.names or datasets:
         return _dataset(paths, photos, frames, background, points)
     if frames.window > 1:

@@ -19,6 +19,7 @@ from bidnerf_core.datasets.reader import (
     checked_unit,
     expected_files,
     find_reader,
+    may_hold,
     opened,
     opened_sequence,
 )
@@ -89,9 +90,9 @@ def open_dataset(
     folder = Path(path)
     if not folder.exists():
         raise InputError(f"{folder}: no such folder")
-    if not folder.is_dir():
-        raise InputError(f"{folder}: is a file, expected the folder of a dataset")
     reader = _reader_of(folder, readers)
+    if reader is None and not folder.is_dir():
+        raise InputError(f"{folder}: {_not_a_dataset(folder)}")
     if reader is None:
         raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
     options = _options(reader, folder, CameraSource(camera), background, register_depth, depth_unit)
@@ -130,15 +131,14 @@ def open_sequence(
     place, given = Path(path), CameraSource(camera, focal, hfov, tuple(assumed))
     if not place.exists():
         raise InputError(f"{place}: no such file or folder")
-    if not place.is_dir():
+    reader = _reader_of(place, readers)
+    if reader is None and not place.is_dir():
         if not is_video(place):
-            raise InputError(
-                f"{place}: is a file, expected a video ({', '.join(VIDEO_SUFFIXES)}) or a folder"
-            )
+            video = f", or a video ({', '.join(VIDEO_SUFFIXES)})"
+            raise InputError(f"{place}: {_not_a_dataset(place)}{video}")
         if register_depth is not None:
             raise InputError(f"{place}: is a video, which has no depth to register")
         return open_video(place, given)
-    reader = _reader_of(place, readers)
     if reader is None:
         sensor = ReadOptions(register_depth=register_depth).sensor(place)
         return open_images(place, given, sensor, background, checked_unit(depth_unit))
@@ -174,6 +174,12 @@ def _options(
     )
 
 
+def _not_a_dataset(file: Path) -> str:
+    """Return why a file is no dataset."""
+    packed = file.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
+    return f"is a file, expected the folder of a dataset{'; unpack the archive first' if packed else ''}"
+
+
 def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:
     """Return why a folder is no dataset, and what to do."""
     inside = [
@@ -194,4 +200,6 @@ def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:
 def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
     if readers is None:
         return find_reader(folder)
-    return next((reader for reader in readers if reader.recognises(folder)), None)
+    return next(
+        (reader for reader in readers if may_hold(reader, folder) and reader.recognises(folder)), None
+    )

@@ -75,6 +75,9 @@ class Reader(Protocol):
     registered to its images, "depth_unit" where its depth images may be in another unit. Others are refused before the reader
     is called."""
 
+    suffixes: Collection[str] = ()
+    """The endings (".r3d") of the names of single files that hold a whole dataset; the paths of such files reach the reader."""
+
     @property
     def expected(self) -> str:
         """The files that a folder of this format holds, for error messages."""
@@ -99,7 +102,10 @@ def _defects(reader: Any) -> Iterator[str]:
     yield from interface_defects(reader, ("accepts", "expected"), methods)
 
 
-ORDER = ("transforms", "tum", "seven-scenes", "colmap")
+ORDER = (
+    "transforms", "tum", "twelve-scenes", "seven-scenes", "record3d", "polycam", "stray-scanner", "euroc", "kitti",
+    "reality-capture", "colmap",
+)  # fmt: skip
 """The bundled readers in the order in which they are asked; a folder may hold files of several formats."""
 
 READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)
@@ -113,14 +119,23 @@ def find_reader(folder: Path) -> Reader | None:
     that are not bundled recognise the folder.
     """
     for name in ORDER:
-        if READERS[name].recognises(folder):
+        if may_hold(READERS[name], folder) and READERS[name].recognises(folder):
             return READERS[name]
-    claims = {name: reader for name, reader in _others() if _claims(name, reader, folder)}
+    claims = {
+        name: reader
+        for name, reader in _others()
+        if may_hold(reader, folder) and _claims(name, reader, folder)
+    }
     if len(claims) > 1:
         raise InputError(
             f"{folder}: is recognised by the readers {enumeration(list(claims))}, expected one; uninstall the others"
         )
     return next(iter(claims.values()), None)
+
+
+def may_hold(reader: Reader, path: Path) -> bool:
+    """Return whether ``path`` is a folder, or a file with an ending of the reader's single files."""
+    return path.is_dir() or path.suffix.lower() in getattr(reader, "suffixes", ())
 
 
 def opened(reader: Reader, folder: Path, options: ReadOptions) -> Dataset:

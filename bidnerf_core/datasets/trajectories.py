@@ -43,7 +43,7 @@ KITTI_ROW = 12
 NANOSECONDS = 10**9
 LEAST_NANOSECONDS = 10**14
 """Whole numbers from here on are nanoseconds: as seconds they would be three million years."""
-QUATERNION_COLUMNS = re.compile(r"\bq_?([wxyz])\b", re.IGNORECASE)
+QUATERNION_COLUMNS = re.compile(r"\bq_?(?:\w+_)?([wxyz])\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,11 @@ def read_timed_rows(path: Path, columns: str) -> list[TimedRow]:
     return timed_rows(read_rows(path, "a list of time stamps", f"timestamp {columns}"), path, columns)
 
 
-def timed_rows(rows: Sequence[Row], path: Path, columns: str) -> list[TimedRow]:
-    """Return the rows of the file ``path`` in chronological order, as ``read_timed_rows`` does."""
+def timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool = False) -> list[TimedRow]:
+    """Return the rows of the file ``path`` in chronological order, as ``read_timed_rows`` does.
+
+    Whole numbers are nanoseconds where ``nanoseconds`` says so, and where they are too large for seconds.
+    """
     count = 1 + len(columns.split())
     if not rows:
         raise InputError(f"{path}: has no rows, expected lines of timestamp {columns}")
@@ -79,14 +82,14 @@ def timed_rows(rows: Sequence[Row], path: Path, columns: str) -> list[TimedRow]:
         found = len(_words(rows[-1]))
         remark(rows[-1].where, f"the last row is cut off ({found} of {count} entries) and is left out")
         rows = rows[:-1]
-    return sorted((_timed(row, count) for row in rows), key=lambda row: row.time)
+    return sorted((_timed(row, count, nanoseconds) for row in rows), key=lambda row: row.time)
 
 
 def _words(row: Row) -> list[str]:
     return row.text.replace(",", " ").split()
 
 
-def _timed(row: Row, count: int) -> TimedRow:
+def _timed(row: Row, count: int, nanoseconds: bool) -> TimedRow:
     words = _words(row)
     if len(words) < count:
         raise row.error(f" has {len(words)} of {count} entries")
@@ -96,7 +99,7 @@ def _timed(row: Row, count: int) -> TimedRow:
         raise row.error(f": {words[0]!r} is no time stamp") from error
     if not math.isfinite(time):
         raise row.error(f": the time stamp is {words[0]}")
-    if time >= LEAST_NANOSECONDS and words[0].isdecimal():
+    if words[0].isdecimal() and (nanoseconds or time >= LEAST_NANOSECONDS):
         time = int(words[0]) / NANOSECONDS
     return TimedRow(row, time, tuple(words[1:]), row.text[len(words[0]) :].lstrip(", \t"))
 
@@ -152,13 +155,20 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
     rows = parse_rows(content, path, "a trajectory", f"timestamp {NUMBERS_A_LINE}")
     if rows and all(len(_words(row)) == KITTI_ROW for row in rows):
         return _kitti(path, rows, times)
-    return _timed_trajectory(path, timed_rows(rows, path, NUMBERS_A_LINE), _quaternion_order(content, rows))
+    nanoseconds = any("[ns]" in line for line in _comments(content))
+    timed = timed_rows(rows, path, NUMBERS_A_LINE, nanoseconds)
+    return _timed_trajectory(path, timed, _quaternion_order(content, rows))
+
+
+def _comments(content: bytes) -> list[str]:
+    lines = content.decode("utf-8-sig", "replace").splitlines()
+    return [line for line in lines if line.lstrip().startswith("#")]
 
 
 def _quaternion_order(content: bytes, rows: Sequence[Row]) -> str:
     """Return the order of the quaternion: that which a comment names, else that of EuRoC or of TUM."""
-    for line in content.decode("utf-8-sig", "replace").splitlines():
-        named = "".join(QUATERNION_COLUMNS.findall(line)).lower() if line.lstrip().startswith("#") else ""
+    for line in _comments(content):
+        named = "".join(QUATERNION_COLUMNS.findall(line)).lower()
         if sorted(named) == sorted("xyzw"):
             return named
     is_euroc = rows and "," in rows[0].text and _words(rows[0])[0].isdecimal()
@@ -228,3 +238,17 @@ def _kitti_pose(row: Row) -> SE3:
         if str(error).startswith(str(row.path)):
             raise
         raise InputError(f"{row.where}: the rotation is {error}, expected a rigid transform") from error
+
+
+def read_matrices(path: Path) -> list[SE3]:
+    """Read KITTI's rows of twelve numbers as poses ``T_world_camera``. Raises ``InputError``, with file and line, for others."""
+    rows = read_rows(path, "a file of KITTI's poses", f"{KITTI_ROW} numbers, a 3x4 matrix")
+    if len(rows) > 1 and len(_words(rows[-1])) < KITTI_ROW:
+        remark(rows[-1].where, "the last row is cut off and is left out")
+        rows = rows[:-1]
+    if not rows:
+        raise InputError(f"{path}: has no rows, expected {KITTI_ROW} numbers in each")
+    for row in rows:
+        if len(_words(row)) != KITTI_ROW:
+            raise row.error(f" has {len(_words(row))} entries")
+    return [_kitti_pose(row) for row in rows]

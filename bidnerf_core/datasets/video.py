@@ -53,7 +53,7 @@ class Video:
 
     def __iter__(self) -> Iterator[TimedFrame]:
         number = 0
-        with _opened(self.path) as (container, stream):
+        with opened_video(self.path) as (container, stream):
             decoded = container.decode(stream)
             while True:
                 try:
@@ -98,16 +98,11 @@ def is_video(path: Path) -> bool:
 
 def open_video(path: Path, camera: CameraSource) -> Video:
     """Open a video file. Raises ``InputError`` if it is not one, if there is no camera, and if the extra is missing."""
-    try:
-        import av  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"{path}: reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames to a folder"
-        ) from error
+    require_av(path)
     camera.require(path, "a video does not record its focal length")
     with open_binary(path, "a video file"):
         pass
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         try:
             shown = [
                 packet
@@ -121,8 +116,18 @@ def open_video(path: Path, camera: CameraSource) -> Video:
     return Video(path, camera, len(shown))
 
 
+def require_av(path: Path) -> None:
+    """Raise ``InputError`` where the extra ``video`` is missing, which says what to install."""
+    try:
+        import av  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"{path}: reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames to a folder"
+        ) from error
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a file of which only the first video stream is read. Raises ``InputError`` if it is no video."""
     import av
 
@@ -150,10 +155,14 @@ def _time(container: Any, picture: Any) -> float:
 
 
 def _upright(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
+    return np.ascontiguousarray(np.rot90(stored_pixels(picture), round(picture.rotation / 90)))
+
+
+def stored_pixels(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
     """Return the pixels of a picture, of any bit depth; colours of HDR are as they are coded, without tone mapping."""
     try:
         pixels: np.ndarray = picture.to_ndarray(format="rgb24")
     except OSError:  # FFmpeg does not convert from the colour space that the file names, such as BT.2020 of constant luminance
         picture.colorspace = BT_2020
         pixels = picture.to_ndarray(format="rgb24")
-    return np.ascontiguousarray(np.rot90(pixels, round(picture.rotation / 90)))
+    return pixels

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import re
 import secrets
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -29,12 +31,33 @@ FILE_KINDS = {
 }
 
 
-def open_binary(path: Path, expected: str) -> BinaryIO:
+@dataclass(frozen=True)
+class PackedFile:
+    """A file inside another one, such as a member of a zip archive."""
+
+    where: str  # the archive and the name in it, as messages name it
+    read: Callable[[], bytes]  # returns its content, or raises ``InputError``
+
+    @property
+    def name(self) -> str:
+        return self.where.rpartition("/")[2]
+
+    @property
+    def suffix(self) -> str:
+        return Path(self.name).suffix
+
+    def __str__(self) -> str:
+        return self.where
+
+
+def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     """Open a regular file for reading. ``expected`` describes in a few words what it should be ("an image file").
 
     Raises ``InputError`` where there is no such file, where reading is not permitted, and for folders, pipes and devices:
     reading from a pipe could block forever.
     """
+    if isinstance(path, PackedFile):
+        return io.BytesIO(path.read())
     try:
         mode = path.stat().st_mode
         if stat.S_ISREG(mode):

@@ -18,10 +18,13 @@ from PIL import Image, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin 
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import open_binary
+from bidnerf_core.io.files import PackedFile, open_binary
 
 Background: TypeAlias = str | Sequence[float]
 """A background as users give it: "white", "black" or an rgb triple in [0, 1]."""
+
+ImageSource: TypeAlias = Path | PackedFile
+"""An image file, or one inside an archive."""
 
 LARGEST_IMAGE = 178_000_000
 """Pixels: what Pillow opens, and more than the 108 megapixels of phones. A small file can describe an image of any size, so the
@@ -60,7 +63,7 @@ class ImageHeader:
     has_alpha: bool
 
 
-def read_header(path: Path) -> ImageHeader:
+def read_header(path: ImageSource) -> ImageHeader:
     """Read size and channels, but no pixels. Raises ``InputError`` where ``read_image`` would for the same reason."""
     with open_image(path) as image:
         has_alpha = image.mode in ("LA", "RGBA", "PA") or (image.mode == "P" and image.has_transparency_data)
@@ -68,7 +71,7 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def read_image(
-    path: Path, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
+    path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Read colour in [0, 1] over ``background``, and alpha where there is such a channel.
 
@@ -96,7 +99,7 @@ def read_image(
 
 
 def read_compact_image(
-    path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)
+    path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Read an image as ``read_image`` does, but leave colours as bytes (uint8) where the file has 8 bits and no alpha."""
     rgb = None
@@ -216,7 +219,7 @@ def resampled(image: Shaped[Tensor, "h w"], width: int, height: int) -> Shaped[T
     return image[rows][:, columns]
 
 
-def decode(path: Path) -> np.ndarray:
+def decode(path: ImageSource) -> np.ndarray:
     """Decode the first image of a file as it is stored: (h, w) or (h, w, channels) of the file's own type.
 
     Raises ``InputError`` where the file is not a whole image, and for colour spaces other than grey and RGB.
@@ -225,7 +228,7 @@ def decode(path: Path) -> np.ndarray:
         return _decoded(path, image)
 
 
-def _scaled_strips(path: Path, image: Image.Image) -> Iterator[tuple[int, np.ndarray, int | None]]:
+def _scaled_strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.ndarray, int | None]]:
     """Yield strips as ``_strips`` does, each with the value of white; None is the largest of its type."""
     if not _is_deep(image):
         yield from ((top, strip, None) for top, strip in _strips(path, image))
@@ -260,7 +263,7 @@ def _is_deep_colour(image: Image.Image) -> bool:
     return image.mode in ("LA", "RGB", "RGBA") and isinstance(raw, str) and ";16" in raw
 
 
-def _decoded(path: Path, image: Image.Image) -> np.ndarray:
+def _decoded(path: ImageSource, image: Image.Image) -> np.ndarray:
     """Return the pixels of an open image as they are stored."""
     pixels = None
     if _is_deep_colour(image):
@@ -271,11 +274,12 @@ def _decoded(path: Path, image: Image.Image) -> np.ndarray:
     return pixels
 
 
-def _deep_colours(path: Path) -> np.ndarray:
+def _deep_colours(path: ImageSource) -> np.ndarray:
     """Decode an image of 16 bits a channel by OpenCV."""
     import cv2  # here, as most images have 8 bits
 
-    found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    with open_binary(path, "an image file") as file:
+        found = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
         raise InputError(
             f"{path}: not readable as an image of 16 bits a channel, expected a whole image file"
@@ -283,7 +287,7 @@ def _deep_colours(path: Path) -> np.ndarray:
     return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
-def _strips(path: Path, image: Image.Image) -> Iterator[tuple[int, np.ndarray]]:
+def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the first row and the pixels of one strip of an open image after another, from top to bottom."""
     if image.mode == "LAB":
         raise InputError(f"{path}: image is {image.mode}, expected grey, RGB, RGBA or CMYK")
@@ -311,7 +315,7 @@ def _placed(whole: np.ndarray | None, strip: np.ndarray, top: int, height: int) 
 
 
 @contextlib.contextmanager
-def open_image(path: Path) -> Iterator[Image.Image]:
+def open_image(path: ImageSource) -> Iterator[Image.Image]:
     """Open an image file; its pixels are decoded when they are first used, within the context.
 
     Raises ``InputError`` where there is no such regular file, where it is not readable as an image, and where the image has
@@ -344,19 +348,19 @@ def _formats() -> list[str]:
 
 
 def _why_unreadable(file: BinaryIO, error: Exception) -> str:
-    if os.fstat(file.fileno()).st_size == 0:
+    if file.seek(0, os.SEEK_END) == 0:
         return "the file is empty"
     if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
         return f"its content is of none of the formats {', '.join(FORMATS)}"
     return reason(error)
 
 
-def _check_pixels(path: Path, width: int, height: int) -> None:
+def _check_pixels(path: ImageSource, width: int, height: int) -> None:
     if width * height > LARGEST_IMAGE:
         raise _too_large(path, f"{width}x{height}, {width * height / 1e6:.0f} megapixels")
 
 
-def _too_large(path: Path, size: str) -> InputError:
+def _too_large(path: ImageSource, size: str) -> InputError:
     return InputError(f"{path}: image is {size}, expected at most {LARGEST_IMAGE // 10**6} megapixels")
 
 
@@ -378,7 +382,7 @@ def looks_like_image(path: Path) -> bool:
     return head.startswith(MAGIC) or webp or bitmap or avif or is_heif(head)
 
 
-def _register_heif(path: Path) -> None:
+def _register_heif(path: ImageSource) -> None:
     try:
         import pillow_heif
     except ImportError as error:

@@ -75,12 +75,12 @@ def _timestamps(images: Sequence[PosedImage]) -> list[str]:
 
 def _tum_row(timestamp: str, T_world_camera: SE3) -> str:
     pose = T_world_camera.to("cpu", torch.float64)
-    w, x, y, z = _quaternion(pose.rotation).tolist()
+    w, x, y, z = quaternion_of(pose.rotation).tolist()
     numbers = (*pose.translation.tolist(), x, y, z, w)
     return " ".join((timestamp, *(f"{number:.12g}" for number in numbers))) + "\n"
 
 
-def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+def quaternion_of(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
     """Return the unit quaternion (w, x, y, z) of a rotation with w >= 0."""
     quaternion = torch.nn.functional.normalize(rotation_matrix_to_quaternion(rotation), dim=-1)
     return -quaternion if float(quaternion[0]) < 0 else quaternion
@@ -172,7 +172,7 @@ PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
 """A function that writes poses to a file, whole or not at all."""
 
 POSE_WRITERS: Plugins[PoseWriter] = Plugins(
-    "writers", _defects, first=("transforms.json", ".json", ".txt", ".tum")
+    "writers", _defects, first=("transforms.json", ".json", ".txt", ".tum", ".kitti.txt", ".euroc.csv")
 )
 """Writers by the ending of the file's name; where several match, the longest ending is used."""
 

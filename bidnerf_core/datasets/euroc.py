@@ -1,0 +1,125 @@
+"""Recordings of EuRoC's micro aerial vehicle, and of others in this layout (ASL, TUM-VI): folders with ``mav0``.
+
+``mav0/cam0/data.csv`` lists ``timestamp [ns],filename`` of the images in ``mav0/cam0/data``, ``mav0/cam0/sensor.yaml`` has
+``T_BS`` (4x4, camera to body), ``intrinsics`` (fx, fy, cx, cy), ``distortion_coefficients`` and ``resolution``.
+``mav0/state_groundtruth_estimate0/data.csv`` (or ``mocap0``, ``vicon0``) has the poses of the body: ``timestamp [ns], px, py, pz,
+qw, qx, qy, qz``, metres. They are interpolated at the times of the images and moved to the camera. Images without a pose are in
+the sequence but not in the dataset, and a remark counts them. Principal points count pixels from the centre of the upper left
+one, so half a pixel is added. Every eighth posed image (the first, the ninth ...) is held out as "test", the others are "train".
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import torch
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.posed_images import ImageDataset, ImageFrame, images_posed, images_there
+from bidnerf_core.datasets.reader import OpenQuestion, Reader, ReadOptions
+from bidnerf_core.datasets.sequence import FrameSequence
+from bidnerf_core.datasets.splits import Splits, hold_out
+from bidnerf_core.datasets.trajectories import read_timed_rows, read_trajectory, require_distinct_times
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.pose_rows import rigid_pose
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import is_file, read_file
+
+TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
+NUMBERS = r"\s*:[^\[]*\[([^\]]*)\]"
+"""What follows a key whose value is a list of numbers, perhaps below ``data:`` of a matrix."""
+
+
+class EurocReader(Reader):
+    """The reader of recordings in the layout of EuRoC."""
+
+    accepts: tuple[OpenQuestion, ...] = ("camera",)
+    expected = "mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)"
+
+    def recognises(self, path: Path) -> bool:
+        return _root(path) is not None
+
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        """Read the lists. Raises ``InputError`` where one is missing or not usable, and where no image has a pose."""
+        truth = _truth(path)
+        if truth is None:
+            raise InputError(f"{path}: has no poses, expected mav0/{TRUTHS[0]}/data.csv")
+        frames = images_posed(truth, _frames(path, options))
+        return ImageDataset(Splits(path, hold_out(frames)), options.background)
+
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
+        frames = _frames(path, options)
+        posed = [frame for frame in frames if frame.T_world_camera is not None]
+        others = [frame for frame in frames if frame.T_world_camera is None]
+        return ImageDataset(Splits(path, hold_out(posed) if posed else {}), options.background).sequence(
+            others
+        )
+
+
+def _root(path: Path) -> Path | None:
+    return next((root for root in (path / "mav0", path) if is_file(root / "cam0" / "data.csv")), None)
+
+
+def _truth(path: Path) -> Path | None:
+    root = _root(path) or path
+    return next((root / name / "data.csv" for name in TRUTHS if is_file(root / name / "data.csv")), None)
+
+
+def _frames(path: Path, options: ReadOptions) -> list[ImageFrame]:
+    root, truth = _root(path), _truth(path)
+    assert root is not None  # recognises ensures it
+    rows = read_timed_rows(root / "cam0" / "data.csv", "filename")
+    require_distinct_times(rows)
+    camera, T_body_camera = _sensor(root / "cam0" / "sensor.yaml", options)
+    trajectory = None if truth is None else read_trajectory(truth)
+    frames = []
+    for row in rows:
+        T_world_body = None if trajectory is None else trajectory.at(row.time)
+        pose = None if T_world_body is None else T_world_body @ T_body_camera
+        frames.append(ImageFrame(root / "cam0" / "data" / row.words[0], camera, pose, row.time))
+    return images_there(root / "cam0" / "data.csv", frames)
+
+
+def _sensor(file: Path, options: ReadOptions) -> tuple[CameraSource, SE3]:
+    """Return the camera, as given or as calibrated, and its pose in the body. Raises ``InputError``."""
+    text = read_file(file, "EuRoC's sensor.yaml").decode("utf-8", "replace")
+    matrix = torch.tensor(_numbers(file, text, "T_BS", 16), dtype=torch.float64).reshape(4, 4)
+    try:
+        T_body_camera = rigid_pose(matrix[:3])
+    except InputError as error:
+        raise InputError(f"{file}: the rotation of T_BS is {error}, expected a rigid transform") from error
+    if options.camera is not None:
+        return CameraSource(options.camera), T_body_camera
+    fx, fy, cx, cy = _numbers(file, text, "intrinsics", 4)
+    width, height = _numbers(file, text, "resolution", 2)
+    lens = _numbers(file, text, "distortion_coefficients", 4)
+    model = re.search(r"distortion_model\s*:\s*([\w-]+)", text)
+    if any(lens) and (model is None or model[1] not in ("radial-tangential", "radtan", "plumb_bob")):
+        found = "unknown" if model is None else model[1]
+        raise InputError(
+            f"{file}: distortion_model is {found}, expected radial-tangential; undistort the images"
+        )
+    lens = lens if any(lens) else []
+    try:
+        camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, int(width), int(height), tuple(lens))
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    return CameraSource(camera), T_body_camera
+
+
+def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
+    """Return the ``count`` numbers of a list in YAML, in brackets on one line or several."""
+    found = re.search(rf"^\s*{key}{NUMBERS}", text, re.MULTILINE)
+    try:
+        numbers = [float(word) for word in found[1].replace(",", " ").split()] if found else []
+    except ValueError as error:
+        raise InputError(f"{file}: {key}: {error}, expected {count} numbers") from error
+    if len(numbers) != count:
+        raise InputError(f"{file}: {key} has {len(numbers)} numbers, expected {count} in brackets")
+    return numbers
+
+
+reader = EurocReader()

@@ -1,0 +1,131 @@
+"""Sequences of KITTI's odometry benchmark (https://www.cvlibs.net/datasets/kitti/eval_odometry.php).
+
+``calib.txt`` has the projection matrices ``P0`` to ``P3`` (3x4) of the rectified cameras, ``times.txt`` the times (seconds), and
+``image_2/000000.png`` ... the images of camera 2, the left colour camera; the first of ``image_2``, ``image_0``, ``image_3`` and
+``image_1`` that is there is used. Poses are rows of twelve numbers (3x4, camera 0 to world, OpenCV axes, metres) in
+``poses.txt`` of the folder or, as distributed, in ``../../poses/NN.txt`` for the sequence ``NN``; they are moved to the camera
+whose images are used. Principal points count pixels from the centre of the upper left one, so half a pixel is added. Every
+eighth image (the first, the ninth ...) is held out as "test" and the others are "train".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.incomplete import remark
+from bidnerf_core.datasets.posed_images import ImageDataset, ImageFrame, images_posed
+from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.sequence import FrameSequence
+from bidnerf_core.datasets.splits import Splits, hold_out
+from bidnerf_core.datasets.trajectories import read_matrices
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.frames.photos import natural_order
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import is_file
+from bidnerf_core.io.images import IMAGE_SUFFIXES, read_header
+from bidnerf_core.io.rows import read_rows
+
+CALIBRATION = "calib.txt"
+CAMERAS = (2, 0, 3, 1)
+"""Numbers of the cameras in the order in which their images are looked for."""
+
+
+class KittiReader(Reader):
+    """The reader of sequences of KITTI's odometry benchmark."""
+
+    expected = "calib.txt with image_2 or image_0 (KITTI odometry)"
+
+    def recognises(self, path: Path) -> bool:
+        return is_file(path / CALIBRATION) and _number(path) is not None
+
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        """Read the lists. Raises ``InputError`` where one is not usable, and where there are no poses."""
+        file = _poses(path)
+        if file is None:
+            raise InputError(
+                f"{path}: has no poses, expected poses.txt in it, or ../../poses/{path.resolve().name}.txt"
+            )
+        frames = images_posed(file, _frames(path))
+        return ImageDataset(Splits(path, hold_out(frames)), options.background)
+
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
+        frames = _frames(path)
+        posed = [frame for frame in frames if frame.T_world_camera is not None]
+        others = [frame for frame in frames if frame.T_world_camera is None]
+        return ImageDataset(Splits(path, hold_out(posed) if posed else {}), options.background).sequence(
+            others
+        )
+
+
+def _number(path: Path) -> int | None:
+    """Return the number of the camera whose images are used."""
+    return next((number for number in CAMERAS if (path / f"image_{number}").is_dir()), None)
+
+
+def _poses(path: Path) -> Path | None:
+    name = path.resolve().name
+    places = (
+        path / "poses.txt",
+        path / f"{name}.txt",
+        path.resolve().parent.parent / "poses" / f"{name}.txt",
+    )
+    return next((place for place in places if is_file(place)), None)
+
+
+def _frames(path: Path) -> list[ImageFrame]:
+    number = _number(path)
+    assert number is not None  # recognises ensures it
+    folder = path / f"image_{number}"
+    images = [
+        file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.stem.isdecimal()
+    ]
+    if not images:
+        raise InputError(f"{folder}: has no images, expected 000000.png ...")
+    images.sort(key=lambda file: natural_order(file.name))
+    header = read_header(images[0])
+    camera, T_first_camera = _calibration(path / CALIBRATION, number, header.width, header.height)
+    file = _poses(path)
+    poses = [] if file is None else read_matrices(file)
+    times = _times(path / "times.txt")
+    _remark_missing(path, max(len(poses), len(times)), images)
+    found = []
+    for image in images:  # its name is its number
+        place = int(image.stem)
+        pose = poses[place] @ T_first_camera if place < len(poses) else None
+        time = times[place] if place < len(times) else None
+        found.append(ImageFrame(image, CameraSource(camera), pose, time))
+    return found
+
+
+def _remark_missing(path: Path, listed: int, images: list[Path]) -> None:
+    there = {int(image.stem) for image in images}
+    gone = [number for number in range(listed) if number not in there]
+    if gone:
+        remark(path, f"{len(gone)} of {amount(listed, 'image')} are missing, the first is number {gone[0]}")
+
+
+def _calibration(file: Path, number: int, width: int, height: int) -> tuple[Intrinsics, SE3]:
+    """Return a camera, and its pose in camera 0. Raises ``InputError`` where the file lacks it."""
+    for row in read_rows(file, "KITTI's calib.txt", "P0: 12 numbers"):
+        name, _, text = row.text.partition(":")
+        if name.strip() == f"P{number}":
+            projection = torch.tensor(row.numbers(text.split(), 12), dtype=torch.float64).reshape(3, 4)
+            shift = torch.linalg.solve(projection[:, :3], projection[:, 3])
+            fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+            camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
+            return camera, SE3(torch.eye(3, dtype=torch.float64), -shift)
+    raise InputError(f"{file}: has no row P{number}, expected the projection matrix of image_{number}")
+
+
+def _times(file: Path) -> list[float]:
+    if not is_file(file):
+        return []
+    return [row.numbers(count=1)[0] for row in read_rows(file, "KITTI's times.txt", "a time in seconds")]
+
+
+reader = KittiReader()

@@ -1,0 +1,150 @@
+"""What scans of phones have in common: photos with depth of a lidar of lower resolution, and a pose for each frame.
+
+ARKit's poses are camera to world with OpenGL axes and +y up, its intrinsics count pixels from the centre of the upper left one,
+and its confidence is 0 (low), 1 or 2 (high). Depth is kept where the confidence is high, and up to the range of the lidar;
+beyond it, depth was inferred from the photo. Each pixel has the depth of the nearest measurement. Photos with more than 640
+pixels on the longer side are reduced to that size with their camera: a scan has hundreds of them.
+
+Phones record up to 60 frames a second, far more than a map needs. Of such recordings the dataset has five frames a second, and
+the sequence all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Integer, Shaped
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource, Raster
+from bidnerf_core.datasets.incomplete import remark
+from bidnerf_core.depth.images import DepthImage
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.photos import fit_depth
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import reduced
+
+LARGEST_SIDE = 640
+"""Maximum number of pixels on the longer side of a photo once it is read."""
+LIDAR_RANGE = 5.0
+"""Range of the lidar (metres) according to Apple."""
+HIGH_CONFIDENCE = 2
+CENTRE_OF_PIXEL = 0.5
+"""What is added to principal points that count pixels from the centre of the upper left one."""
+FRAMES_PER_SECOND = 5.0
+"""Largest rate of the frames of a dataset."""
+ROUNDING = 0.005
+"""Seconds by which the times of frames may be early."""
+UNIT_TO = 0.01
+"""How far the length of a quaternion may be from 1."""
+
+
+class Timed(Protocol):
+    @property
+    def time(self) -> float | None: ...
+
+
+T = TypeVar("T", bound=Timed)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Depth of a lidar, and the file that messages name."""
+
+    depth: DepthImage
+    where: str
+
+
+def scan_frame(
+    name: str,
+    rgb: Shaped[Tensor, "h w 3"],
+    camera: Intrinsics,
+    depth: Measured | None,
+    image: Path | str,
+    largest: int = LARGEST_SIDE,
+) -> Frame:
+    """Return a frame of a photo and its depth, reduced to at most ``largest`` pixels on the longer side.
+
+    ``rgb`` is in [0, 1], or bytes as in ``read_compact_image``. ``camera`` is scaled to the photo. Raises ``InputError`` where camera or depth are of another aspect ratio.
+    """
+    raster = Raster(rgb.shape[1], rgb.shape[0])
+    whole = CameraSource(camera).find(image, raster).intrinsics
+    small = whole.scaled(min(1.0, largest / max(raster.size)))
+    pixels = rgb if small.width == raster.width else reduced(rgb, small.width, small.height)
+    size = (small.width, small.height)
+    metres = None if depth is None else fit_depth(depth.depth, raster, size, f"{depth.where}: depth")
+    return Frame(name, pixels, small, metres)
+
+
+def sure_depth(
+    measured: DepthImage,
+    confidence: Integer[np.ndarray, "h w"] | None,
+    where: str,
+    high: int = HIGH_CONFIDENCE,
+) -> DepthImage:
+    """Return depth where its confidence, if there is any, is ``high``, and within the range of the lidar; 0 elsewhere.
+
+    Raises ``InputError`` for a confidence of another size or with values above ``high``; ``where`` begins the message.
+    """
+    metres = torch.where(measured.metres <= LIDAR_RANGE, measured.metres, 0)
+    if confidence is not None:
+        if confidence.shape != tuple(metres.shape):
+            found = "x".join(map(str, confidence.shape[::-1]))
+            raise InputError(
+                f"{where}: is {found}, expected {metres.shape[1]}x{metres.shape[0]} as its depth"
+            )
+        if confidence.max() > high:
+            raise InputError(
+                f"{where}: has values up to {confidence.max()}, expected confidences from 0 to {high}"
+            )
+        metres = torch.where(torch.from_numpy(confidence.astype(np.int64)) == high, metres, 0)
+    return replace(measured, metres=metres)
+
+
+def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
+    """Return ``T_world_camera`` (OpenCV axes) of a quaternion x y z w and a position, or None where they hold no pose.
+
+    The axes of the camera are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
+    """
+    length = math.hypot(*numbers[:4])
+    if not all(map(math.isfinite, numbers)) or length == 0:
+        return None
+    if abs(length - 1) > UNIT_TO:
+        raise InputError(f"{where}: the quaternion has length {length:.3g}, expected 1 (qx qy qz qw)")
+    rotation = torch.from_numpy(Rotation.from_quat(np.array(numbers[:4])).as_matrix())
+    if opengl:
+        rotation = rotation * rotation.new_tensor([1.0, -1.0, -1.0])
+    return SE3(rotation, torch.tensor(list(numbers[4:7]), dtype=torch.float64))
+
+
+def thinned(where: Path, frames: Sequence[T]) -> tuple[list[T], list[T]]:
+    """Return the frames of a dataset, at most ``FRAMES_PER_SECOND``, and the others; a remark counts them.
+
+    ``frames`` are in chronological order. All are kept where one has no time.
+    """
+    times = [frame.time for frame in frames]
+    if any(time is None for time in times):
+        return list(frames), []
+    kept, others, due = list[T](), list[T](), -math.inf
+    for frame, time in zip(frames, times, strict=True):
+        assert time is not None
+        if time >= due:
+            kept.append(frame)
+            due = time + 1 / FRAMES_PER_SECOND - ROUNDING
+        else:
+            others.append(frame)
+    if others:
+        remark(
+            where,
+            f"the dataset has {len(kept)} of {amount(len(frames), 'frame')}, {FRAMES_PER_SECOND:g} a second; the sequence has all",
+        )
+    return kept, others

@@ -1,0 +1,71 @@
+"""Image files with a camera, a pose and perhaps depth each: what many formats come down to once their lists are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.datasets.incomplete import present, remark
+from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
+from bidnerf_core.datasets.splits import SplitDataset
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import is_file
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFrame:
+    """An image file with what a format says about it."""
+
+    image: Path
+    camera: CameraSource
+    T_world_camera: SE3 | None
+    time: float | None = None  # seconds
+    depth: DepthFile | None = None
+
+    @property
+    def stem(self) -> str:
+        return self.image.name.partition(".")[0] if self.image.stem.endswith(".color") else self.image.stem
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return (*self.image.parts[:-1], self.stem)
+
+
+class ImageDataset(SplitDataset[ImageFrame]):
+    """Views of image files; see ``Dataset``."""
+
+    def _frame(self, frame: ImageFrame, name: str) -> Frame:
+        return read_rgbd(name, frame.image, frame.camera.at(frame.image), self._background, frame.depth)
+
+    def _pose(self, frame: ImageFrame) -> SE3 | None:
+        return frame.T_world_camera
+
+
+def images_there(where: Path, frames: Sequence[ImageFrame]) -> list[ImageFrame]:
+    """Return the frames whose image is there; a remark about ``where``, the list that names them, counts the others."""
+    return present(
+        frames,
+        lambda frame: is_file(frame.image),
+        where,
+        lambda frame: frame.image.name,
+        lambda frame: InputError(f"{frame.image}: no such file, expected it as {where} lists it"),
+    )
+
+
+def images_posed(where: Path, frames: Sequence[ImageFrame]) -> list[ImageFrame]:
+    """Return the frames with a pose; a remark about ``where`` counts the others. Raises ``InputError`` where none has one."""
+    posed = [frame for frame in frames if frame.T_world_camera is not None]
+    if not posed:
+        raise InputError(
+            f"{where}: has no pose of any of {amount(len(frames), 'image')}, expected one of some at least"
+        )
+    if len(posed) < len(frames):
+        remark(
+            where,
+            f"{len(frames) - len(posed)} of {amount(len(frames), 'image')} have no pose and are left out",
+        )
+    return posed

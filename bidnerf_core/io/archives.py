@@ -1,0 +1,78 @@
+"""Zip archives whose members are read one at a time, within limits: no archive is unpacked as a whole."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from functools import partial
+from pathlib import Path
+
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.io.files import PackedFile, open_binary
+
+LARGEST_MEMBER = 256 * 2**20
+"""Bytes of an unpacked member. A small archive can hold members that unpack to any size."""
+MOST_MEMBERS = 1_000_000
+
+
+class Archive:
+    """The members of a zip archive by name. Raises ``InputError`` for a file that is no whole zip archive."""
+
+    def __init__(self, path: Path, expected: str = "a zip archive") -> None:
+        self.path, self._expected = path, expected
+        with open_binary(path, expected) as file:
+            begins = file.read(2)
+        try:
+            self._zip = zipfile.ZipFile(path)
+            members = self._zip.infolist()
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError) as error:
+            cut = begins == b"PK"
+            why = "ends too early, as a copy that broke off does" if cut else f"is no zip archive ({error})"
+            raise InputError(f"{path}: {why}, expected {expected}") from error
+        if len(members) > MOST_MEMBERS:
+            raise InputError(
+                f"{path}: holds {len(members)} files, expected {expected} of at most {MOST_MEMBERS}"
+            )
+        self._members = {member.filename: member for member in members}
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the members, in the order of the archive."""
+        return list(self._members)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._members
+
+    def file(self, name: str) -> PackedFile:
+        """Return a member, which is read when it is opened."""
+        return PackedFile(f"{self.path}/{name}", partial(self.read, name))
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a member. Raises ``InputError`` where it is missing, damaged, encrypted or too large."""
+        where, member = f"{self.path}/{name}", self._members.get(name)
+        if member is None:
+            raise InputError(
+                f"{where}: is not in the archive, which holds {amount(len(self._members), 'file')}"
+            )
+        if member.file_size > LARGEST_MEMBER:
+            raise self._too_large(where, member.file_size)
+        try:
+            with self._zip.open(member) as file:
+                content = file.read(LARGEST_MEMBER + 1)
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            OSError,
+            NotImplementedError,
+            RuntimeError,
+            ValueError,
+        ) as error:
+            raise InputError(f"{where}: cannot be unpacked ({error}), expected {self._expected}") from error
+        if len(content) > LARGEST_MEMBER:
+            raise self._too_large(where, len(content))
+        return content
+
+    def _too_large(self, where: str, size: int) -> InputError:
+        found, most = (f"{count / 2**20:,.0f} MiB" for count in (size, LARGEST_MEMBER))
+        return InputError(f"{where}: unpacks to {found}, expected at most {most}")

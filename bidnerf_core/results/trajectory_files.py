@@ -1,0 +1,56 @@
+"""Files of poses for tools of robotics: KITTI's matrices and EuRoC's comma-separated values. evo reads both."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.io.files import write_file
+from bidnerf_core.results.pose_files import PosedImage, quaternion_of
+
+EUROC_HEAD = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
+)
+NANOSECONDS = 10**9
+
+
+def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write KITTI's poses: a row of the twelve numbers of a 3x4 camera-to-world matrix per image, without times."""
+    numbers = [image.number for image in images]
+    if numbers != list(range(len(numbers))):
+        skipped = next(place for place, number in enumerate(numbers) if place != number)
+        warnings.warn(
+            f"{path}: image {skipped} has no pose; rows of KITTI's format do not say which image they belong to, so those that"
+            " follow are shifted (.tum and .euroc.csv have times)",
+            InputWarning,
+            stacklevel=2,
+        )
+    rows = [_matrix(image)[:3].flatten().tolist() for image in images]
+    write_file(path, "".join(" ".join(f"{number:.12g}" for number in row) + "\n" for row in rows).encode())
+
+
+def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write EuRoC's poses: rows of nanoseconds, position and quaternion (w, x, y, z), of the camera and not of a body.
+
+    The time of an image without one is its number, in seconds.
+    """
+    rows = [EUROC_HEAD]
+    for image in images:
+        pose = _matrix(image)
+        time = image.number if image.time is None else image.time
+        numbers = [*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3]).tolist()]
+        rows.append(
+            ",".join([str(round(time * NANOSECONDS)), *(f"{number:.12g}" for number in numbers)]) + "\n"
+        )
+    write_file(path, "".join(rows).encode())
+
+
+def _matrix(image: PosedImage) -> torch.Tensor:
+    matrix = image.T_world_camera.matrix().detach().to("cpu", torch.float64)
+    if not bool(matrix.isfinite().all()):
+        raise InputError(f"the pose of {image.name} is not finite, expected to leave it out, or a .json file")
+    return matrix
