@@ -16,10 +16,10 @@ from bidnerf_core.fields.rendering import render
 from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.geometry.se3 import SE3
 
-SIZE = 256
+SIZE = 192
 """Pixels along each side of an image."""
 FIELD_OF_VIEW = 70.0  # degrees
-VIEWS = 64
+VIEWS = 48
 """Number of viewpoints."""
 PLACES = 400
 """Random places in the box that are tried."""
