@@ -277,6 +277,11 @@ def test_checkpoints_of_gsplat_and_splatfacto(tmp_path: Path, some: Some) -> Non
         assert max(differences(read_gaussians(tmp_path / name), g).values()) == 0
 
 
+def test_checkpoints_of_other_fields_are_not_recognised(tmp_path: Path) -> None:
+    torch.save({"model_coarse_state_dict": {"layer1.weight": torch.zeros(2)}}, tmp_path / "a.ckpt")
+    assert format_of(tmp_path / "a.ckpt") is None
+
+
 def test_a_pickle_is_not_executed(tmp_path: Path) -> None:
     class Trap:
         def __reduce__(self) -> tuple[object, tuple[str]]:

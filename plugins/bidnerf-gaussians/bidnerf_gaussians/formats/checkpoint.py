@@ -30,10 +30,9 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() not in ENDINGS or not path.is_file():
         return False
     try:
-        _parameters(path)
+        return {"means", "log_scales"} <= set(_parameters(path))
     except InputError:
         return False
-    return True
 
 
 def read(path: Path) -> Gaussians:
