@@ -86,6 +86,11 @@ if TYPE_CHECKING:
     from bidnerf_core.results.tracked_path import track as track
     from bidnerf_core.scenes.closed_form_data import closed_form_data as closed_form_data
     from bidnerf_core.scenes.closed_form_data import closed_form_map as closed_form_map
+    from bidnerf_core.service.client import ServiceClient as ServiceClient
+    from bidnerf_core.service.client import ServiceError as ServiceError
+    from bidnerf_core.service.server import serve as serve
+    from bidnerf_core.service.server import service_app as service_app
+    from bidnerf_core.service.settings import ServiceConfig as ServiceConfig
     from bidnerf_core.training import Supervision as Supervision
     from bidnerf_core.training import SupervisionConfig as SupervisionConfig
 
@@ -125,6 +130,9 @@ HOMES = {
     "ResultTable": "evaluation.results",
     "SE3": "geometry.se3",
     "SceneBounds": "fields.contract",
+    "ServiceClient": "service.client",
+    "ServiceConfig": "service.settings",
+    "ServiceError": "service.client",
     "Stratified": "fields.sampling",
     "Supervision": "training",
     "SupervisionConfig": "training",
@@ -153,6 +161,8 @@ HOMES = {
     "render_image": "fields.rendering",
     "rendering_scores": "maps.rendering",
     "resume": "maps.training",
+    "serve": "service.server",
+    "service_app": "service.server",
     "settings_of": "localization",
     "track": "results.tracked_path",
     "train": "maps.training",

@@ -44,11 +44,16 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
-NOT_RUN: dict[tuple[str, str], str] = {}
+NOT_RUN: dict[tuple[str, str], str] = {
+    (
+        "embedding.md",
+        "from bidnerf_core import ServiceClient",
+    ): "asks a running service; tests/test_service.py does"
+}
 """Python blocks that are not executed, by page and first line, each with the reason."""
-TOO_SLOW = {"train", "demo", "evaluate", "compare", "report", "import"}
-"""Commands that are only parsed: they take minutes, or the results of one that does, or files of a plugin's."""
-OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest"}
+TOO_SLOW = {"train", "demo", "evaluate", "compare", "report", "import", "serve"}
+"""Commands that are only parsed: they take minutes, or the results of one that does, files of a plugin's, or run until stopped."""
+OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest", "curl"}
 """Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""
 LANGUAGES = {"python", "sh", "toml", "bibtex", "text"}
 

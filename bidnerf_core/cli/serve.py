@@ -1,0 +1,98 @@
+"""``bidnerf serve``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from bidnerf_core.cli.options import Device, option, parse, require
+from bidnerf_core.cli.output import say
+from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.json import read_record
+from bidnerf_core.service import server
+from bidnerf_core.service.settings import ServiceConfig
+
+TOKEN = "BIDNERF_TOKEN"
+"""The environment variable that may hold the token; an argument would be visible to all users of the machine."""
+
+
+def run(arguments: list[str]) -> None:
+    parse("serve", serve, arguments)
+
+
+def serve(
+    maps: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        option(
+            "MAP...", "folders of maps, or NAME=MAP to choose the name that clients ask for (required)", ""
+        ),
+    ],
+    *,
+    host: Annotated[
+        str | None,
+        option(
+            "ADDRESS",
+            "listen on this address, such as 0.0.0.0; clients then need a token",
+            "this machine only",
+        ),
+    ] = None,
+    port: Annotated[int, option("N", "port to listen on; 0 takes a free one")] = server.PORT,
+    token_file: Annotated[
+        Path | None,
+        option("FILE", f"file with the token; or set {TOKEN}", "with --host one is made up and shown"),
+    ] = None,
+    method: Annotated[str, option("NAME", "how poses are found")] = "auto",
+    settings: Annotated[
+        Path | None, option("FILE", "JSON object with settings of the method by name", "the method's own")
+    ] = None,
+    device: Device = "cpu",
+    config: ServiceConfig = ServiceConfig(),
+) -> None:
+    """Answer over HTTP: POST a photo to /localize, get the JSON of 'bidnerf localize'. Ctrl-C ends it.
+
+    Photos come as the body of a request or in a form, with depth, camera and start if they are known; /geopose answers the GeoPose
+    Protocol. The description of all paths is at /openapi.json. Each request is a line of JSON on stderr.
+    """
+    require("--port", port, 0, 65535)
+    if not maps:
+        raise UsageError("no MAP, expected folders of maps")
+    server.serve(
+        _named(maps), host=host, port=port, token=_token(token_file), config=config, method=method, device=device,
+        settings=None if settings is None else read_record(settings).values, ready=_announce,
+    )  # fmt: skip
+
+
+def _named(maps: tuple[str, ...]) -> dict[str, str | Path]:
+    """Return the folders by name. An argument that is a folder is one, even if there is an equals sign in its name."""
+    found = dict[str, str | Path]()
+    for given in maps:
+        name, equals, folder = given.partition("=")
+        if not equals or Path(given).is_dir():
+            name, folder = Path(given).resolve().name, given
+        if name in found:
+            raise UsageError(f"two maps are named {name!r}, expected a name of its own for each: NAME=MAP")
+        found[name] = folder
+    return found
+
+
+def _token(file: Path | None) -> str | None:
+    if file is None:
+        return os.environ.get(TOKEN)
+    try:
+        token = read_file(file, "a file with a token", 4096).decode().strip()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: is not text, expected a token") from error
+    if not token:
+        raise InputError(f"{file}: is empty, expected a token")
+    return token
+
+
+def _announce(address: str, token: str | None) -> None:
+    say(f"serving at {address}; Ctrl-C ends")
+    if token is not None:
+        say(f"clients need the header  Authorization: Bearer {token}")

@@ -1,0 +1,96 @@
+"""The geographic anchor of a map: the file ``anchor.json`` beside ``map.json``, which says where on the earth the map lies.
+
+It holds ``latitude`` and ``longitude`` (degrees) and ``height`` (metres above the ellipsoid WGS 84) of a point, and
+``T_enu_world``, rows of the 4x4 matrix that takes the map's coordinates, times ``metres_per_unit``, to the frame at that point
+whose axes point east, north and up. ``position_sigma`` (metres, along each axis) and ``orientation_sigma`` (degrees, about each
+axis) say how well the anchor itself is known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.geometry.wgs84 import Geodetic, geodetic
+from bidnerf_core.io.json import from_plain, read_json, to_plain
+
+ANCHOR = "anchor.json"
+IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class GeographicPose:
+    """A camera on the earth: its place, and its rotation into the frame of east, north and up at that place."""
+
+    place: Geodetic
+    rotation: Float[Tensor, "3 3"]  # R_enu_camera, OpenCV camera axes
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Where on the earth a map lies, see the head of this file."""
+
+    latitude: float
+    longitude: float
+    height: float
+    T_enu_world: tuple[tuple[float, ...], ...] = IDENTITY
+    metres_per_unit: float = 1.0
+    position_sigma: float = 0.0  # metres
+    orientation_sigma: float = 0.0  # degrees
+
+    def __post_init__(self) -> None:
+        """Raise ``InputError`` for a place off the earth, a matrix that is no pose, and numbers that are not positive."""
+        self._T_ecef_world  # noqa: B018 (it checks the place and the matrix)
+        if not 0 < self.metres_per_unit < math.inf:
+            raise InputError(f"metres_per_unit is {self.metres_per_unit}, expected a positive number")
+        if not (0 <= self.position_sigma < math.inf and 0 <= self.orientation_sigma < math.inf):
+            raise InputError("position_sigma and orientation_sigma: expected 0 or more")
+
+    def plain(self) -> dict[str, Any]:
+        """Return the anchor as JSON values."""
+        values: dict[str, Any] = to_plain(self)
+        return values
+
+    @cached_property
+    def _T_ecef_world(self) -> SE3:
+        """The map's frame, in metres, in the earth's."""
+        rows = [list(row) for row in self.T_enu_world]
+        if [len(row) for row in rows] != [4] * 4:
+            raise InputError("T_enu_world: expected 4 rows of 4 numbers")
+        T_enu_world = pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_enu_world")
+        return Geodetic(self.latitude, self.longitude, self.height).T_ecef_enu @ T_enu_world
+
+    def geographic(self, T_world_camera: SE3) -> GeographicPose:
+        """Return a camera's place, and its rotation with respect to east, north and up there, not at the anchor."""
+        pose = T_world_camera.to("cpu", torch.float64)
+        T_ecef_camera = self._T_ecef_world @ SE3(pose.rotation, pose.translation * self.metres_per_unit)
+        place = geodetic(T_ecef_camera.translation)
+        return GeographicPose(place, place.T_ecef_enu.rotation.mT @ T_ecef_camera.rotation)
+
+    def T_world_camera(self, pose: GeographicPose) -> SE3:
+        """Return the pose of a camera on the earth in the map; the inverse of ``geographic``."""
+        local = pose.place.T_ecef_enu
+        inside = self._T_ecef_world.inverse() @ SE3(
+            local.rotation @ pose.rotation.double(), local.translation
+        )
+        return SE3(inside.rotation, inside.translation / self.metres_per_unit)
+
+
+def load_anchor(folder: Path) -> Anchor | None:
+    """Return the anchor in the folder of a map, or None where there is none. Raises ``InputError`` for a damaged one."""
+    path = folder / ANCHOR
+    if not path.exists():
+        return None
+    try:
+        return from_plain(Anchor, read_json(path, "the anchor of a map"), str(path))
+    except InputError as error:
+        raise InputError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error

@@ -1,0 +1,85 @@
+"""Who may ask the service: whoever has its token or, without one, programs on this machine."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import json
+from collections.abc import MutableMapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+OPEN = "/health"
+"""The path that needs no token: load balancers ask it, and it says nothing about the maps."""
+
+
+class Access:
+    """Lets requests through that carry the token, or that are addressed to this machine by a program on it.
+
+    A page that a browser shows may send requests to the loopback interface; they are told by their ``Origin`` or, where a name of
+    another site leads to this machine, by their ``Host``.
+    """
+
+    def __init__(self, app: ASGIApp, token: str | None) -> None:
+        self.app, self.token = app, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        refusal = None if scope["type"] != "http" else self._refusal(scope)
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        elif refusal is None:
+            await self.app(scope, receive, send)
+        else:
+            await _refuse(send, *refusal)
+
+    def _refusal(self, scope: MutableMapping[str, Any]) -> tuple[int, str] | None:
+        headers = Headers(scope=scope)
+        if self.token is not None:
+            given = headers.get("authorization", "")
+            if scope["path"] == OPEN or hmac.compare_digest(f"Bearer {self.token}".encode(), given.encode()):
+                return None
+            return 401, "expected the header 'Authorization: Bearer TOKEN' with the token of this service"
+        if not is_loopback(_host_of(f"//{headers.get('host', '')}")):
+            return 403, "without a token the service answers requests to localhost only"
+        origin = headers.get("origin")
+        if origin is not None and not is_loopback(_host_of(origin)):
+            return 403, "requests by pages of other sites are refused"
+        return None
+
+
+async def _refuse(send: Send, status: int, detail: str) -> None:
+    body = json.dumps({"title": "not allowed", "status": status, "detail": detail}).encode()
+    headers = [
+        (b"content-type", b"application/problem+json"),
+        (b"content-length", str(len(body)).encode()),
+        (b"connection", b"close"),
+        *([(b"www-authenticate", b"Bearer")] if status == 401 else []),
+    ]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+def _host_of(address: str) -> str | None:
+    try:
+        return urlsplit(address).hostname
+    except ValueError:
+        return None
+
+
+def is_loopback(host: str | None) -> bool:
+    """Return whether a name or an address is that of this machine for itself."""
+    if host is None:
+        return False
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost" or host.endswith(".localhost")
+
+
+def describe_client(scope: MutableMapping[str, Any]) -> str | None:
+    """Return the address of a request's sender."""
+    client = scope.get("client")
+    return None if client is None else f"{client[0]}:{client[1]}"

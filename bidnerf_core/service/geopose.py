@@ -1,0 +1,229 @@
+"""The GeoPose Protocol of the Open AR Cloud, version 2: a request with a camera reading, and the answer with a geopose.
+
+https://github.com/OpenArCloud/oscp-geopose-protocol. The quaternion rotates from the camera to east, north and up at the camera;
+as in OGC GeoPose 1.0, where a pose without rotation looks east with its left side north, the camera's axes are x forward, y left
+and z up. ``accuracy`` comes from the covariance of the pose and that of the anchor.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from jaxtyping import Float
+from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
+from torch import Tensor
+
+from bidnerf_core.camera.files import COLMAP_MODELS
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.wgs84 import Geodetic
+from bidnerf_core.io.json import Record
+from bidnerf_core.localization import Localization
+from bidnerf_core.maps.anchor import Anchor, GeographicPose
+from bidnerf_core.results.answers import Answer
+from bidnerf_core.service.upload import Upload
+
+R_CAMERA_BODY = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+"""From x forward, y left, z up to OpenCV's axes."""
+RAW_CHANNELS = {"RGBA32": 4, "RGB24": 3, "GRAY8": 1}
+"""Formats without a header, and their bytes in a pixel."""
+NOT_LOCALIZED = 422
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A camera reading."""
+
+    record: Record
+    image: bytes
+    size: tuple[int, int] | None  # width and height
+
+
+def answer(
+    anchor: Anchor | None, body: dict[str, Any], localize: Callable[[Upload], tuple[Answer, dict[str, Any]]]
+) -> dict[str, Any]:
+    """Return the status and the body of the answer to a request of the protocol.
+
+    A map without an anchor answers with a ``localpose`` in place of a ``geopose``: position and quaternion in the map's frame. A
+    pose that was not accepted is never passed on as one. Raises ``InputError`` for a request that cannot be used.
+    """
+    request = Record("request", body)
+    reading = _reading(request)
+    blocks = {"photo": reading.image} | _camera(reading) | _prior(anchor, request)
+    found, plain = localize(Upload({"name": reading.record.text("sensorId") or "camera"}, blocks))
+    localization = found.found
+    if not found.accepted:
+        return {
+            "status": NOT_LOCALIZED, "outcome": plain["outcome"], "extra": {"localization": plain},
+            "detail": f"not localized: {localization.outcome}: {localization.reason}",
+        }  # fmt: skip
+    where = (
+        _local(localization)
+        if anchor is None
+        else _geographic(anchor.geographic(localization.T_world_camera))
+    )
+    answered = {
+        "id": request.text("id") or "", "timestamp": round(time.time() * 1000),
+        "accuracy": accuracy(localization, anchor), "type": "geopose" if anchor else "localpose", **where,
+        "localization": plain,
+    }  # fmt: skip
+    return {"status": 200, "body": answered, "outcome": plain["outcome"]}
+
+
+def accuracy(found: Localization, anchor: Anchor | None) -> dict[str, float] | None:
+    """Return standard deviations: metres along an axis, degrees about one, each the root mean square of the three axes.
+
+    None where the covariance is not known: no number would be true. Without an anchor, metres are units of the map.
+    """
+    if found.covariance is None or not bool(found.covariance.isfinite().all()):
+        return None
+    position, orientation = (
+        float(part.mean().clamp(min=0).sqrt()) for part in found.covariance.diagonal().split(3)
+    )
+    orientation = math.degrees(orientation)
+    if anchor is None:
+        return {"position": position, "orientation": orientation}
+    return {
+        "position": math.hypot(position * anchor.metres_per_unit, anchor.position_sigma),
+        "orientation": math.hypot(orientation, anchor.orientation_sigma),
+    }
+
+
+def _geographic(pose: GeographicPose) -> dict[str, Any]:
+    place = pose.place
+    position = {"lon": place.longitude, "lat": place.latitude, "h": place.height}
+    return {"geopose": {"position": position, "quaternion": _quaternion(pose.rotation)}}
+
+
+def _local(found: Localization) -> dict[str, Any]:
+    pose = found.T_world_camera.to("cpu", torch.float64)
+    position = dict(zip("xyz", pose.translation.tolist(), strict=True))
+    return {"localpose": {"position": position, "quaternion": _quaternion(pose.rotation)}}
+
+
+def _quaternion(R_frame_camera: Float[Tensor, "3 3"]) -> dict[str, float]:
+    """Return the unit quaternion that rotates from the body's axes (x forward, y left, z up) to the frame, with w >= 0."""
+    q = torch.nn.functional.normalize(
+        rotation_matrix_to_quaternion(R_frame_camera.double() @ R_CAMERA_BODY), dim=-1
+    )
+    w, x, y, z = (q if float(q[0]) >= 0 else -q).tolist()
+    return {"x": x, "y": y, "z": z, "w": w}
+
+
+def _reading(request: Record) -> _Reading:
+    """Return the single image of a request."""
+    readings = _object(request, "sensorReadings").items("cameraReadings") or []
+    records = [Record("cameraReadings", reading) for reading in readings if isinstance(reading, dict)]
+    if len(readings) != 1 or not records:
+        raise InputError(f"request: {len(readings)} cameraReadings, expected one")
+    (record,) = records
+    orientation = _object(record, "imageOrientation")
+    if orientation.value("mirrored") or orientation.number("rotation"):
+        raise record.error(
+            "imageOrientation is not that of the image, expected an upright image that is not mirrored"
+        )
+    text = record.text("imageBytes")
+    if not text:
+        raise record.error("no imageBytes, expected an image in base64")
+    try:
+        content = base64.b64decode(
+            text.partition("base64,")[2] if text.startswith("data:") else text, validate=True
+        )
+    except (binascii.Error, ValueError) as error:
+        raise record.error(f"imageBytes is not base64 ({error})") from error
+    size = _size(record)
+    return _Reading(record, _encoded(record, content, size), size)
+
+
+def _object(record: Record, key: str) -> Record:
+    """Return an object inside another one; an empty one where it is missing."""
+    found = record.value(key)
+    if found is not None and not isinstance(found, dict):
+        raise record.error(f"{key} is a {type(found).__name__}, expected an object")
+    return Record(f"{record.where}: {key}", found or {})
+
+
+def _numbers(record: Record, key: str) -> list[float]:
+    return [record.checked_number(value, key) for value in record.items(key) or []]
+
+
+def _size(record: Record) -> tuple[int, int] | None:
+    size = _numbers(record, "size")
+    if not size:
+        return None
+    if len(size) != 2 or not all(1 <= value <= 1e6 and value == int(value) for value in size):
+        raise record.error("size: expected width and height")
+    return int(size[0]), int(size[1])
+
+
+def _encoded(record: Record, content: bytes, size: tuple[int, int] | None) -> bytes:
+    """Return an image file: ``content`` itself, or raw pixels as PNG."""
+    kind = (record.text("imageFormat") or "").upper()
+    if kind == "DEPTH":
+        raise record.error("imageFormat is DEPTH, expected a colour image; /localize takes depth as well")
+    if kind not in RAW_CHANNELS:
+        return content
+    channels = RAW_CHANNELS[kind]
+    if size is None or len(content) != size[0] * size[1] * channels:
+        if content[:2] == b"\xff\xd8" or content[:4] == b"\x89PNG":
+            return content  # the format of the pixels in a file
+        raise record.error(
+            f"{len(content)} bytes of {kind}, expected size and width x height x {channels} bytes"
+        )
+    pixels = np.frombuffer(content, np.uint8).reshape(size[1], size[0], channels)
+    return bytes(
+        iio.imwrite("<bytes>", pixels[..., :3] if channels > 1 else pixels[..., 0], extension=".png")
+    )
+
+
+def _camera(reading: _Reading) -> dict[str, bytes]:
+    """Return the camera as a line of COLMAP's ``cameras.txt``, whose models the protocol has."""
+    params = _object(reading.record, "params")
+    model, numbers = params.text("model") or "UNKNOWN_CAMERA", _numbers(params, "modelParams")
+    if model == "UNKNOWN_CAMERA" or not numbers:
+        return {}
+    if model not in COLMAP_MODELS:
+        raise params.error(f"model is {model!r}, expected one of {', '.join(COLMAP_MODELS)}")
+    if reading.size is None:
+        raise reading.record.error("a camera model without size, expected width and height of its image")
+    width, height = reading.size
+    return {"camera": f"1 {model} {width} {height} {' '.join(map(repr, numbers))}\n".encode()}
+
+
+def _prior(anchor: Anchor | None, request: Record) -> dict[str, bytes]:
+    """Return the last of the prior poses as a start. Without an anchor, geoposes say nothing about the map."""
+    priors = [prior for prior in request.items("priorPoses") or [] if isinstance(prior, dict)]
+    if anchor is None or not priors:
+        return {}
+    pose = _object(Record("priorPoses", priors[-1]), "geopose")
+    position, quaternion = _object(pose, "position"), _object(pose, "quaternion")
+    lat, lon, h = (_required(position, key) for key in ("lat", "lon", "h"))
+    q = torch.tensor([_required(quaternion, key) for key in "wxyz"], dtype=torch.float64)
+    length = float(torch.linalg.vector_norm(q))
+    if not 0.9 < length < 1.1:
+        raise quaternion.error(f"has the length {length:.3g}, expected 1")
+    rotation = quaternion_to_rotation_matrix(q / length) @ R_CAMERA_BODY.mT
+    T_world_camera = anchor.T_world_camera(GeographicPose(Geodetic(lat, lon, h), rotation))
+    return {"start": _matrix(T_world_camera)}
+
+
+def _required(record: Record, key: str) -> float:
+    found = record.number(key)
+    if found is None:
+        raise record.error(f"no {key!r}, expected a number")
+    return found
+
+
+def _matrix(pose: SE3) -> bytes:
+    rows: Mapping[str, Any] = {"T_world_camera": pose.matrix().tolist()}
+    return json.dumps(rows).encode()

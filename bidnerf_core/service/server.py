@@ -1,0 +1,203 @@
+"""The service on a port: ``serve``, which runs until it is stopped."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import re
+import secrets
+import signal
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.service.settings import ChosenMethod, ServiceConfig, checked_token
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+
+PORT = 8000
+LOOPBACK = "127.0.0.1"
+HEAD_SECONDS = 10.0
+"""Time in which the head of a connection's first request must have arrived."""
+CONNECTIONS = 256
+"""Open connections; a further one is closed at once."""
+GRACE = 10
+"""Seconds for requests at work when the service is told to end."""
+ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+NAME = re.compile(r"[\w.-]{1,100}")
+NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
+
+Maps = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
+"""The folders of maps, by their own names or by given ones."""
+
+
+def service_app(
+    maps: Maps,
+    *,
+    config: ServiceConfig | None = None,
+    token: str | None = None,
+    method: str = "auto",
+    settings: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+) -> Starlette:
+    """Return the service of the maps in some folders as an ASGI application, for a server of your own.
+
+    ``method``, with ``settings`` of it by name, finds the poses on ``device``.
+
+    Its workers are processes of one thread each, started at the startup of ASGI's lifespan and ended at its shutdown. Without a
+    ``token`` it answers only requests that are addressed to localhost. Raises ``InputError`` for names and settings that cannot
+    be served, and without the extra ``serve``; a map that cannot be loaded raises it from the startup.
+    """
+    try:
+        from bidnerf_core.service.app import application
+    except ImportError as error:
+        raise InputError(NEEDS) from error
+    return application(
+        named(maps), config or ServiceConfig(), checked_token(token), ChosenMethod(method, settings, device)
+    )
+
+
+def serve(
+    maps: Maps,
+    *,
+    host: str | None = None,
+    port: int = PORT,
+    token: str | None = None,
+    config: ServiceConfig | None = None,
+    method: str = "auto",
+    settings: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    ready: Callable[[str, str | None], None] | None = None,
+    stop: threading.Event | None = None,
+) -> None:
+    """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
+
+    ``maps``: folders of maps, a list of them, or folders by the names under which clients ask for them. Only programs on this
+    machine are answered, unless a ``host``, such as 0.0.0.0, is named: clients then need the ``token``, which is made up where
+    none is given. ``port`` 0 takes a free one. ``ready`` is called with the address and the token once requests are answered.
+    Raises ``InputError`` for maps and settings that cannot be served, and for a port that is taken.
+    """
+    try:
+        import uvicorn
+    except ImportError as error:
+        raise InputError(NEEDS) from error
+    if not hasattr(os, "fork"):
+        raise InputError(
+            "this system has no fork, expected Linux or macOS, where workers share the memory of the maps"
+        )
+    from bidnerf_core.service.access import is_loopback
+
+    token = token or (None if host is None or is_loopback(host) else secrets.token_urlsafe(24))
+    app = service_app(maps, config=config, token=token, method=method, settings=settings, device=device)
+    with _bound(host or LOOPBACK, port) as bound:
+        options = uvicorn.Config(
+            app, http=_patient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
+            server_header=False, proxy_headers=False, timeout_keep_alive=15, timeout_graceful_shutdown=GRACE, backlog=CONNECTIONS,
+        )  # fmt: skip
+        asyncio.run(
+            _run(app, uvicorn.Server(options), bound, lambda address: ready and ready(address, token), stop)
+        )
+
+
+def named(maps: Maps) -> dict[str, Path]:
+    """Return the folders of maps by name, by default their own names. Raises ``InputError`` for names that cannot be served."""
+    if isinstance(maps, str | Path):
+        maps = [maps]
+    pairs = [*maps.items()] if isinstance(maps, Mapping) else [(Path(m).resolve().name, m) for m in maps]
+    if not pairs:
+        raise InputError("no map to serve, expected folders of maps")
+    for name, folder in pairs:
+        if not NAME.fullmatch(name) or name in (".", ".."):
+            raise InputError(
+                f"{folder}: its name is {name!r}, expected letters, digits, '.', '-' and '_'; give it one: NAME=MAP"
+            )
+        if [other for other, _ in pairs].count(name) > 1:
+            raise InputError(
+                f"{folder}: another map is named {name!r} as well; give it a name of its own: NAME=MAP"
+            )
+    return {name: Path(folder) for name, folder in pairs}
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        bound = socket.socket(family, kind, protocol)
+    except (OSError, OverflowError) as error:
+        raise InputError(f"{host}:{port}: no such address ({error})") from error
+    try:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+    except (OSError, OverflowError) as error:
+        bound.close()
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{host}:{port}: cannot be listened on ({reason}); choose another port") from error
+    return bound
+
+
+async def _run(
+    app: Starlette,
+    server: Any,
+    bound: socket.socket,
+    ready: Callable[[str], Any],
+    stop: threading.Event | None,
+) -> None:
+    server.capture_signals = contextlib.nullcontext  # it would raise them again at the end
+    async with app.router.lifespan_context(app), _signals_end(server):
+        serving = asyncio.ensure_future(server.serve(sockets=[bound]))
+        while not server.started and not serving.done():
+            await asyncio.sleep(0.02)
+        host, port = bound.getsockname()[:2]
+        if server.started:
+            ready(f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}")
+        while not serving.done():
+            if stop is not None and stop.is_set():
+                server.should_exit = True
+            await asyncio.wait({serving}, timeout=None if stop is None else 0.1)
+        await serving
+
+
+@contextlib.asynccontextmanager
+async def _signals_end(server: Any) -> AsyncIterator[None]:
+    """Let the signals that ask a program to stop end the service, which is its normal end; the second one ends it at once."""
+
+    def end() -> None:
+        server.force_exit = server.should_exit
+        server.should_exit = True
+
+    loop, before = asyncio.get_running_loop(), dict[int, Any]()
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.getsignal(number) for number in ENDING}
+    ours = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
+    for number in ours:
+        loop.add_signal_handler(number, end)
+    try:
+        yield
+    finally:
+        for number in ours:
+            loop.remove_signal_handler(number)
+            signal.signal(number, before[number])
+
+
+def _patient() -> type[Any]:
+    """Return uvicorn's protocol with limits that it lacks: on the time of a request's head, and on connections."""
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class Limited(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            if len(self.connections) > CONNECTIONS:
+                transport.close()
+                return
+            self.loop.call_later(HEAD_SECONDS, self._close_if_silent)
+
+        def _close_if_silent(self) -> None:
+            asked: Any = self.cycle  # None until the first request
+            if asked is None:
+                self.transport.close()
+
+    return Limited

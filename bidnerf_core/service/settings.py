@@ -1,0 +1,79 @@
+"""The settings of the service: what it serves, and the limits that it holds requests to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bidnerf_core.errors import InputError
+
+MEBIBYTE = 2**20
+LEAST_TOKEN = 16
+"""Characters of a token, below which it could be guessed."""
+
+
+def usual_workers() -> int:
+    """Return the number of cores that this process may use."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return usable or 1
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """How many requests are served at a time, and the limits of each.
+
+    A request counts from the moment when its head has arrived: ``queue`` bounds the memory of uploads as well.
+    """
+
+    workers: int = 0  # processes that localize, each with one thread; 0: one for each core
+    queue: int = (
+        16  # requests that may be uploading or waiting beside those at work; more are answered with 429
+    )
+    timeout: float = 60.0  # seconds from a whole request to its answer; its worker is then stopped
+    upload_timeout: float = 20.0  # seconds in which a whole request must have arrived
+    max_megabytes: float = 32.0  # size of a request (2^20 bytes)
+    max_megapixels: float = 50.0  # size of an image, from its header, before it is decoded
+
+    def __post_init__(self) -> None:
+        """Raise ``InputError`` for numbers out of range."""
+        if self.workers < 0 or self.queue < 0:
+            raise InputError(f"workers is {self.workers} and queue {self.queue}, expected 0 or more")
+        for name in ("timeout", "upload_timeout", "max_megabytes", "max_megapixels"):
+            value = getattr(self, name)
+            if not 0 < value < 1e6:
+                raise InputError(f"{name} is {value}, expected a positive number")
+
+    @property
+    def processes(self) -> int:
+        """The number of worker processes."""
+        return self.workers or usual_workers()
+
+    @property
+    def places(self) -> int:
+        """The number of requests that may be uploading, waiting or at work at a time."""
+        return self.processes + self.queue
+
+    @property
+    def max_bytes(self) -> int:
+        """The largest size of a request in bytes."""
+        return int(self.max_megabytes * MEBIBYTE)
+
+
+@dataclass(frozen=True)
+class ChosenMethod:
+    """How poses are found, and where."""
+
+    name: str = "auto"
+    settings: Mapping[str, Any] | None = None  # of the method, by name; the others have their defaults
+    device: str = "cpu"
+
+
+def checked_token(token: str | None) -> str | None:
+    """Return a token. Raises ``InputError`` for one that is short or that a header cannot hold."""
+    if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
+        raise InputError(
+            f"the token has {len(token)} characters, expected {LEAST_TOKEN} or more of printable ASCII"
+        )
+    return token

@@ -1,0 +1,86 @@
+"""A photo that came with a request: its bytes, and what is known about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.datasets.queries import Photos
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import read_header
+from bidnerf_core.io.tensors import read_array
+from bidnerf_core.localization import Localizer
+from bidnerf_core.results.pose_files import read_pose
+
+NUMPY, HEIF_BRANDS = b"\x93NUMPY", (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"heim", b"heis")
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A photo and what is known about it, as they came with a request: no value is ever the name of a file."""
+
+    parameters: Mapping[str, Any]
+    blocks: Mapping[str, bytes]
+
+    @property
+    def name(self) -> str:
+        """The name of the frame in the answer."""
+        return str(self.parameters.get("name") or "photo")
+
+    def read(self, localizer: Localizer, folder: Path, max_pixels: float) -> tuple[Photos, SE3 | None]:
+        """Write the files into ``folder``, check the sizes in their headers, and return the photo and the start."""
+        photo = _written(folder, "photo", self.blocks["photo"])
+        _check_size(photo, max_pixels)
+        depth = _written(folder, "depth", self.blocks["depth"]) if "depth" in self.blocks else None
+        if depth is not None:
+            _check_size(depth, max_pixels)
+        unit = self.parameters.get("depth_unit")
+        if unit is not None and depth is None:
+            raise InputError(
+                "depth_unit was given without depth, expected the depth image that it belongs to"
+            )
+        scene = localizer.map
+        assumed = (
+            scene.landmarks.cameras if scene.landmarks is not None and localizer.matches_landmarks else ()
+        )
+        camera = CameraSource(
+            self._file(folder, "camera"), self.parameters.get("focal"), self.parameters.get("hfov"), assumed
+        )
+        photos = Photos(
+            [photo], camera, {} if depth is None else {photo: depth}, unit, background=scene.bounds.background
+        )
+        start = self._file(folder, "start")
+        return photos, None if start is None else read_pose(start)
+
+    def _file(self, folder: Path, name: str) -> Path | None:
+        if name not in self.blocks:
+            return None
+        file = folder / name
+        file.write_bytes(self.blocks[name])
+        return file
+
+
+def _written(folder: Path, name: str, content: bytes) -> Path:
+    """Write an image under a name whose ending the readers go by."""
+    ending = ".npy" if content.startswith(NUMPY) else ""
+    if content[4:8] == b"ftyp" and content[8:12] in HEIF_BRANDS:
+        ending = ".heic"
+    file = folder / f"{name}{ending}"
+    file.write_bytes(content)
+    return file
+
+
+def _check_size(file: Path, max_pixels: float) -> None:
+    """Raise ``InputError`` for an image that is too large to be decoded; an array is as large as its file."""
+    if file.suffix == ".npy":
+        read_array(file, "a .npy file")
+        return
+    header = read_header(file)
+    if header.width * header.height > max_pixels:
+        raise InputError(
+            f"{file}: image is {header.width}x{header.height}, expected at most {max_pixels / 1e6:g} megapixels"
+        )

@@ -1,0 +1,119 @@
+"""A worker: reads a photo from the bytes of a request, localizes it in a map, and returns the JSON of ``bidnerf localize``."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization import Localizer, settings_of
+from bidnerf_core.maps.anchor import Anchor, load_anchor
+from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.results.answers import Answer, localize_each
+from bidnerf_core.service import geopose, wire
+from bidnerf_core.service.settings import ChosenMethod
+from bidnerf_core.service.upload import Upload
+
+OK, UNUSABLE, FAULT = 200, 422, 500
+TOLD = ("backend", "cameras", "landmarks", "surfels", "distances", "bounds", "complete", "bidnerf")
+"""The facts about a map that clients may know. The others name photos and folders."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """A map that is served, ready to localize."""
+
+    scene: Map
+    localizer: Localizer
+    anchor: Anchor | None
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What clients may know of the map."""
+        facts = self.scene.describe().plain()
+        return {key: facts[key] for key in TOLD} | {
+            "anchor": None if self.anchor is None else self.anchor.plain()
+        }
+
+
+@dataclass(frozen=True)
+class Worker:
+    """All that is needed to answer requests, loaded before workers are forked."""
+
+    maps: Mapping[str, Served]
+    max_pixels: float
+    folder: Path  # where the files of requests lie, each request's in a folder of its own
+    device: str
+
+    @staticmethod
+    def load(maps: Mapping[str, Path], method: ChosenMethod, max_pixels: float, folder: Path) -> Worker:
+        """Load maps by name. Raises ``InputError`` where one cannot be served.
+
+        On another device than the CPU, a localizer is made by each worker for itself: no accelerator survives a fork.
+        """
+        config = settings_of(method.name, dict(method.settings or {}), "settings")
+        served = dict[str, Served]()
+        for name, place in maps.items():
+            scene = load_map(place)
+            localizer = Localizer(scene, method.name, config, warm_up=method.device == "cpu")
+            served[name] = Served(scene, localizer, load_anchor(place))
+        return Worker(served, max_pixels, folder, method.device)
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """The description of each map by its name."""
+        return {name: served.described for name, served in self.maps.items()}
+
+    def serve(self, connection: socket.socket) -> None:
+        """Answer requests until the connection ends."""
+        try:
+            ready = self._on_device()
+        except (InputError, RuntimeError) as error:
+            wire.send(connection, {"error": str(error)})
+            return
+        wire.send(connection, {"pid": os.getpid()})
+        while (message := wire.receive(connection)) is not None:
+            wire.send(connection, ready.answer(*message))
+
+    def _on_device(self) -> Worker:
+        if self.device == "cpu":
+            return self
+        moved = {
+            name: Served(
+                s.scene, Localizer(s.scene, s.localizer.method, s.localizer.config, self.device), s.anchor
+            )
+            for name, s in self.maps.items()
+        }
+        return Worker(moved, self.max_pixels, self.folder, self.device)
+
+    def answer(self, request: dict[str, Any], blocks: Mapping[str, bytes]) -> dict[str, Any]:
+        """Return the status and the body of the answer to a request."""
+        folder = self.folder / request["id"]
+        try:
+            folder.mkdir(mode=0o700)
+            served = self.maps[request["map"]]
+            if request["kind"] == "geopose":
+                return geopose.answer(
+                    served.anchor, request["body"], lambda query: self._localize(served, query, folder)
+                )
+            answer, plain = self._localize(served, Upload(request["parameters"], blocks), folder)
+            return {"status": OK, "body": plain, "outcome": str(answer.found.outcome)}
+        except InputError as error:
+            return {"status": UNUSABLE, "detail": str(error).replace(f"{folder}{os.sep}", "")}
+        except Exception as error:  # a fault of ours: the worker lives on, and the log says what happened
+            return {"status": FAULT, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _localize(self, served: Served, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
+        """Localize a photo; return the answer, and its JSON values as ``bidnerf localize --json`` prints them."""
+        photos, start = upload.read(served.localizer, folder, self.max_pixels)
+        seed = int(upload.parameters.get("seed") or 0)
+        answers = localize_each(served.localizer, photos, start=lambda _: start, seed=seed)
+        (answer,) = answers.answers
+        return answer, {**answers.plain(answer), "frame": upload.name}

@@ -1,0 +1,517 @@
+"""The HTTP service: its answers are those of the command line, its limits hold, and no request is lost or breaks it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
+pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
+
+import tiny
+from bidnerf_core import (
+    InputError,
+    ServiceClient,
+    ServiceConfig,
+    ServiceError,
+    open_dataset,
+    serve,
+    service_app,
+)
+from bidnerf_core.cli import main
+from bidnerf_core.service.access import Access
+from bidnerf_core.service.description import description
+from bidnerf_core.service.pool import Pool
+from bidnerf_core.service.requests import PARAMETERS
+from bidnerf_core.service.server import named
+from commands import Run
+
+QUICK = {"max_steps": 3, "rays": 64}
+CONFIG = ServiceConfig(
+    workers=1, queue=3, timeout=30.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0
+)
+FORM = "multipart/form-data; boundary=xyz"
+
+
+@dataclass
+class Reply:
+    status: int = 0
+    headers: dict[str, str] = field(default_factory=dict)
+    body: bytes = b""
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class Service:
+    """An application in an event loop of its own, asked as a server would."""
+
+    def __init__(self, app: Any) -> None:
+        self.app, self.loop = app, asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever, daemon=True)
+        self._thread.start()
+        self._life = app.router.lifespan_context(app)
+        self.run(self._life.__aenter__())
+        self.pool: Pool = app.state.pool
+
+    def close(self) -> None:
+        self.run(self._life.__aexit__(None, None, None))
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join()
+
+    def run(self, work: Awaitable[Any]) -> Any:
+        async def waited() -> Any:
+            return await work
+
+        return asyncio.run_coroutine_threadsafe(waited(), self.loop).result(60)
+
+    def post(self, path: str, body: bytes = b"", kind: str = "image/png", **more: Any) -> Reply:
+        return self.run(self.ask("POST", path, [body], {"content-type": kind}, **more))
+
+    def get(self, path: str, method: str = "GET") -> Reply:
+        return self.run(self.ask(method, path, []))
+
+    async def ask(
+        self, method: str, path: str, chunks: list[bytes], headers: dict[str, str] | None = None,
+        leaving: asyncio.Event | None = None, stalls: bool = False,
+    ) -> Reply:  # fmt: skip
+        path, _, query = path.partition("?")
+        given = {"host": "localhost", **(headers or {})}
+        scope = {
+            "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": method, "path": path,
+            "raw_path": path.encode(), "query_string": query.encode(), "root_path": "", "scheme": "http",
+            "headers": [(k.encode(), v.encode("latin-1")) for k, v in given.items()], "client": ("127.0.0.1", 1),
+            "server": ("localhost", 80), "state": {},
+        }  # fmt: skip
+        reply, parts = Reply(), list(chunks)
+
+        async def receive() -> dict[str, Any]:
+            if parts:
+                part = parts.pop(0)
+                return {"type": "http.request", "body": part, "more_body": bool(parts) or stalls}
+            await (leaving or asyncio.Event()).wait()
+            return {"type": "http.disconnect"}
+
+        async def send(message: dict[str, Any]) -> None:
+            if message["type"] == "http.response.start":
+                reply.status = message["status"]
+                reply.headers = {k.decode().lower(): v.decode() for k, v in message["headers"]}
+            else:
+                reply.body += message.get("body", b"")
+
+        await self.app(scope, receive, send)
+        return reply
+
+
+@dataclass(frozen=True)
+class Place:
+    folder: Path
+    photo: bytes
+    start: str
+    answer: dict[str, Any]  # of the command line
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    folder = tmp_path_factory.mktemp("service")
+    tiny.write_dataset(folder / "data")
+    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+    shutil.copy(folder / "data/images/t_0000.png", folder / "photo.png")
+    pose = open_dataset(folder / "data").views("test")[0].T_ref_camera.matrix().tolist()
+    (folder / "start.json").write_text(json.dumps({"T_world_camera": pose}))
+    return Place(folder, (folder / "photo.png").read_bytes(), json.dumps(pose), {})
+
+
+@pytest.fixture(scope="module")
+def service(place: Place) -> Iterator[Service]:
+    shutil.copytree(place.folder / "map", place.folder / "hall")
+    anchor = {"latitude": 47.4, "longitude": 19.0, "height": 120.0, "position_sigma": 0.5}
+    (place.folder / "hall/anchor.json").write_text(json.dumps(anchor))
+    maps = [place.folder / "map", place.folder / "hall"]
+    running = Service(service_app(maps, config=CONFIG, method="bid", settings=QUICK))
+    yield running
+    running.close()
+
+
+def form(**parts: bytes | str) -> bytes:
+    """Return a form; bytes are files."""
+    text = b""
+    for name, value in parts.items():
+        file = f'; filename="{name}.bin"' if isinstance(value, bytes) else ""
+        content = value if isinstance(value, bytes) else value.encode()
+        text += (
+            f'--xyz\r\nContent-Disposition: form-data; name="{name}"{file}\r\n\r\n'.encode()
+            + content
+            + b"\r\n"
+        )
+    return text + b"--xyz--\r\n"
+
+
+def test_answers_are_those_of_the_command_line(service: Service, place: Place, bidnerf: Run) -> None:
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in QUICK.items()]
+    words = ["localize", place.folder / "map", place.folder / "photo.png", "--method=bid", *options]
+    depth = place.folder / "data/depth/t_0000.png"
+    given = [
+        "--start",
+        place.folder / "start.json",
+        "--focal=32",
+        "--depth",
+        depth,
+        "--depth-unit=0.001",
+        "--seed=7",
+    ]
+    expected = json.loads(bidnerf(*words, *given, "--json").out)
+    body = form(
+        photo=place.photo,
+        depth=depth.read_bytes(),
+        start=place.start,
+        focal="32",
+        depth_unit="0.001",
+        seed="7",
+    )
+    reply = service.post("/maps/map/localize", body, FORM)
+    assert reply.status == 200
+    assert list(reply.json) == list(expected)
+    for key in expected.keys() - {"seconds"}:
+        assert reply.json[key] == (
+            pytest.approx(expected[key], rel=1e-6) if key == "loss" else expected[key]
+        ), key
+
+
+def test_a_photo_may_be_the_body(service: Service, place: Place) -> None:
+    reply = service.post(
+        f"/localize?map=map&focal=32&name=%3Cscript%3E&start={place.start.replace(' ', '')}", place.photo
+    )
+    assert reply.status == 200
+    assert reply.json["frame"] == "<script>"
+    assert reply.headers["content-type"] == "application/json"
+    assert reply.headers["x-content-type-options"] == "nosniff"
+
+
+def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
+    part = b'--xyz\r\nContent-Disposition: form-data; name="photo"; filename="../../etc/pass wd.png"\r\n\r\n'
+    body = part + place.photo + b"\r\n" + form(start=place.start, focal="32", map="map")
+    assert service.post("/localize", body, FORM).json["frame"] == "pass wd"
+    for path in (
+        "/maps/..%2f..%2fetc%2fpasswd",
+        "/maps/../map.json",
+        "/maps/map/map.json",
+        "/maps/.",
+        "/etc/passwd",
+    ):
+        assert service.get(path).status == 404, path
+    for text in ("../map", "/etc/passwd", "map\0", "x" * 5000):
+        reply = service.post("/localize", form(photo=place.photo, map=text), FORM)
+        assert reply.status in (400, 404), text
+    assert service.post("/localize?map=map&camera=/etc/passwd", place.photo).status == 422
+    assert "passwd" not in service.get("/metrics").body.decode()
+    folder = service.pool._folder
+    assert folder is not None
+    assert list(Path(folder.name).iterdir()) == []
+
+
+def png(width: int, height: int) -> bytes:
+    """Return a small file that describes a large image of one colour."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    rows = zlib.compress(bytes((width + 7) // 8 + 1) * min(height, 1000), 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_limits_hold_before_anything_is_decoded(service: Service, place: Place) -> None:
+    bomb = service.post("/localize?map=map&focal=32", png(9000, 9000))
+    assert bomb.status == 422
+    assert "9000x9000, expected at most 1 megapixels" in bomb.json["detail"]
+    assert (
+        service.post("/localize?map=map", form(photo=place.photo, depth=png(60000, 60000)), FORM).status
+        == 422
+    )
+    large = service.run(service.ask("POST", "/localize", [b"x"], {"content-length": str(2 * 10**9)}))
+    assert large.status == 413
+    assert large.headers["connection"] == "close"
+    chunks = [bytes(2**18)] * 1000  # no length is announced
+    endless = service.run(service.ask("POST", "/localize", chunks))
+    assert endless.status == 413
+    slow = service.run(service.ask("POST", "/localize?map=map", [b"x"], stalls=True))
+    assert slow.status == 408
+
+
+def test_malformed_requests_are_refused_with_a_reason(service: Service, place: Place) -> None:
+    drawn = random.Random(0)
+    kinds = [
+        FORM,
+        "multipart/form-data",
+        "image/png",
+        "text/html",
+        "application/json",
+        "multipart/form-data; boundary=",
+        "",
+    ]
+    seeds = [
+        place.photo,
+        form(photo=place.photo, focal="32"),
+        b'{"sensorReadings": {"cameraReadings": [{}]}}',
+        b"",
+        png(9, 9),
+    ]
+    paths = [
+        "/localize",
+        "/maps/map/localize",
+        "/maps/hall/geopose",
+        "/geopose?map=hall",
+        "/maps/\xff/localize",
+    ]
+    found = set()
+    for _ in range(250):
+        body = bytearray(drawn.choice(seeds))
+        for _ in range(drawn.randrange(8)):
+            at = drawn.randrange(len(body) + 1)
+            body[at : at + drawn.randrange(9)] = drawn.randbytes(drawn.randrange(9))
+        values = ["", "nan", "-1", "1e999", "\0", "map", "32", "[[]]", "{", "9" * 400]
+        query = "&".join(
+            f"{drawn.choice([*PARAMETERS, 'x'])}={drawn.choice(values)}" for _ in range(drawn.randrange(4))
+        )
+        path = drawn.choice(paths)
+        reply = service.post(f"{path}{'&' if '?' in path else '?'}{query}", bytes(body), drawn.choice(kinds))
+        assert reply.status < 500, (path, query, bytes(body), reply.body)
+        assert reply.json["detail"] if reply.status != 200 else reply.json["outcome"]
+        found.add(reply.status)
+    assert found >= {400, 404, 422}
+    assert service.pool.metrics.restarts["died"] == 0
+
+
+def test_what_is_missing_is_named(service: Service, place: Place) -> None:
+    for path, part in (
+        ("/localize", "expected map as one of map, hall"),
+        ("/localize?map=map&fcal=3", "did you mean 'focal'?"),
+        ("/localize?map=map&focal=x", 'focal is "x", expected a number'),
+        ("/localize?map=map&focal=1&focal=2", "focal is given twice"),
+        ("/localize?map=map&depth_unit=1", "depth_unit was given without depth"),
+        ("/localize?map=map&focal=32", "needs a start"),
+    ):
+        assert part in service.post(path, place.photo).json["detail"]
+    assert service.post("/localize?map=map").json["detail"].startswith("no photo, expected")
+    assert service.get("/localize").status == 405
+    assert service.get("/nothing").json["status"] == 404
+
+
+def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
+    with contextlib.ExitStack() as taken:
+        for _ in range(CONFIG.places):
+            taken.enter_context(service.pool.place())
+        reply = service.post("/localize?map=map", place.photo)
+        assert reply.status == 429
+        assert int(reply.headers["retry-after"]) >= 1
+        assert service.get("/health").status == 200
+    assert service.post("/localize?map=map", place.photo).status == 422
+
+
+def quickly(condition: Callable[[], bool]) -> None:
+    until = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def stopped(service: Service) -> Iterator[int]:
+    """Let the only worker stand still, as one does that computes for long."""
+    quickly(lambda: len(service.pool.alive) == 1)
+    process = service.pool.alive[0].pid
+    os.kill(process, signal.SIGSTOP)
+    yield process
+    quickly(lambda: [worker.pid for worker in service.pool.alive] not in ([], [process]))
+
+
+def request(service: Service, place: Place, leaving: asyncio.Event | None = None) -> Any:
+    path = f"/localize?map=map&focal=32&start={place.start.replace(' ', '')}"
+    return asyncio.run_coroutine_threadsafe(
+        service.ask("POST", path, [place.photo], leaving=leaving), service.loop
+    )
+
+
+def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place) -> None:
+    before = service.pool.metrics.restarts["died"]
+    with stopped(service) as process:
+        waiting = [request(service, place) for _ in range(3)]
+        quickly(lambda: len(service.pool._waiting) == 2)
+        os.kill(process, signal.SIGKILL)
+        assert [reply.result(60).status for reply in waiting] == [200] * 3
+    assert service.pool.metrics.restarts["died"] == before + 1
+
+
+def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, place: Place) -> None:
+    nursery = service.pool._nursery
+    assert nursery is not None
+    with stopped(service) as process:
+        waiting = request(service, place)
+        quickly(lambda: service.pool._taken == 1)
+        nursery.kill()
+        os.kill(process, signal.SIGKILL)
+        assert waiting.result(60).status == 200
+
+
+def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -> None:
+    leaving = asyncio.Event()
+    with stopped(service):
+        waiting = request(service, place, leaving)
+        quickly(lambda: service.pool._taken == 1 and not service.pool._waiting)
+        service.loop.call_soon_threadsafe(leaving.set)
+        assert waiting.result(20).status == 499
+    assert service.pool.metrics.restarts["cancelled"] == 1
+    assert service.pool._taken == 0
+
+
+def test_work_that_takes_too_long_is_stopped(service: Service, place: Place) -> None:
+    service.pool.config = replace(CONFIG, timeout=0.2)
+    try:
+        with stopped(service):
+            first, second = request(service, place), request(service, place)
+            assert (first.result(20).status, second.result(20).status) == (504, 504)
+    finally:
+        service.pool.config = CONFIG
+    assert service.pool.metrics.restarts["timeout"] == 1
+    assert request(service, place).result(60).status == 200
+
+
+def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b""})
+
+    def status(token: str | None, path: str = "/localize", **headers: str) -> int:
+        service = Service.__new__(Service)
+        service.app = Access(app, token)
+        return asyncio.run(service.ask("POST", path, [], headers)).status
+
+    for host in ("localhost:8000", "127.0.0.1", "[::1]:8000", "127.8.8.8"):
+        assert status(None, host=host) == 200, host
+    for host in ("example.org", "192.168.1.5:8000", "localhost.example.org", "", "[", "127.0.0.1.nip.io"):
+        assert status(None, host=host) == 403, host
+    assert status(None, origin="https://example.org") == 403
+    assert status(None, origin="null") == 403
+    assert status(None, origin="http://localhost:8000") == 200
+    token = "0123456789abcdef"
+    assert status(token, host="example.org") == 401
+    assert status(token, host="localhost") == 401
+    for wrong in (
+        "Bearer",
+        "Bearer x",
+        f"Basic {token}",
+        f"bearer{token}",
+        f"Bearer {token}x",
+        "Bearer \xe9",
+    ):
+        assert status(token, authorization=wrong) == 401, wrong
+    assert status(token, host="example.org", authorization=f"Bearer {token}") == 200
+    assert status(token, "/health", host="example.org") == 200
+
+
+def test_geopose_answers_with_an_honest_accuracy(service: Service, place: Place) -> None:
+    import base64
+
+    def body(**more: Any) -> bytes:
+        reading = {
+            "imageBytes": base64.b64encode(place.photo).decode(), "imageFormat": "PNG", "size": [24, 24],
+            "params": {"model": "PINHOLE", "modelParams": [32, 32, 12, 12]}, "sensorId": "phone", **more,
+        }  # fmt: skip
+        return json.dumps({"id": "7", "sensorReadings": {"cameraReadings": [reading]}}).encode()
+
+    assert service.get("/geopose").json == {"status": "running"}
+    reply = service.post("/maps/hall/geopose", body(), "application/json")
+    assert reply.status == 422  # this method needs a start, and no prior pose is given
+    assert "needs a start" in reply.json["detail"]
+    for more, part in (
+        ({"imageBytes": "?"}, "not base64"),
+        ({"imageFormat": "DEPTH"}, "expected a colour image"),
+        ({"params": {"model": "FISHEYE", "modelParams": [1]}}, "model is 'FISHEYE'"),
+        ({"imageOrientation": {"mirrored": True}}, "imageOrientation"),
+        ({"size": [2]}, "expected width and height"),
+    ):
+        assert part in service.post("/maps/hall/geopose", body(**more), "application/json").json["detail"]
+    assert service.post("/maps/hall/geopose", b"[]", "application/json").status == 400
+
+
+def test_every_path_is_described(service: Service) -> None:
+    said = service.get("/openapi.json").json
+    assert said == json.loads(json.dumps(description(["map", "hall"], CONFIG)))
+    assert set(said["paths"]) == {route.path for route in service.app.routes} - {"/", "/openapi.json"}
+    queried = {p["name"] for p in said["paths"]["/localize"]["post"]["parameters"]}
+    assert queried == set(PARAMETERS)
+    text = service.get("/metrics").body.decode()
+    assert 'bidnerf_requests_total{path="/localize",status="200"}' in text
+    assert "bidnerf_workers 1" in text
+    assert set(service.get("/maps").json) == {"map", "hall"}
+    assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
+
+
+def test_the_client_asks_a_server(place: Place) -> None:
+    ready, stop, address = threading.Event(), threading.Event(), []
+
+    def told(url: str, token: str | None) -> None:
+        address.extend([url, token])
+        ready.set()
+
+    options: Any = {
+        "port": 0,
+        "config": CONFIG,
+        "method": "bid",
+        "settings": QUICK,
+        "ready": told,
+        "stop": stop,
+    }
+    running = threading.Thread(target=serve, args=[place.folder / "map"], kwargs=options)
+    running.start()
+    try:
+        assert ready.wait(60)
+        client = ServiceClient(address[0], timeout=30)
+        found = client.localize(place.folder / "photo.png", focal=32, start=json.loads(place.start))
+        assert (found["frame"], found["method"]) == ("photo", "bid")
+        with pytest.raises(ServiceError, match="no map of that name") as refused:
+            client.localize(place.photo, map="other")
+        assert refused.value.status == 404
+    finally:
+        stop.set()
+        running.join(30)
+    with pytest.raises(ServiceError, match="refused"):
+        ServiceClient(address[0]).ask("/maps")
+
+
+def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidnerf: Run) -> None:
+    assert named({"a": "x"}) == {"a": Path("x")}
+    for maps, part in (
+        ([], "no map"),
+        ({"a/b": "x"}, "its name is 'a/b'"),
+        (["x/a", "y/a"], "another map is named 'a'"),
+    ):
+        with pytest.raises(InputError, match=part):
+            named(maps)
+    with pytest.raises(InputError, match="expected 16 or more"):
+        service_app("MAP", token="short")
+    with pytest.raises(InputError, match="timeout is 0"):
+        ServiceConfig(timeout=0)
+    assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
+    status, _, err = bidnerf("serve", place.folder / "data")
+    assert status == 1
+    assert "no map.json in it" in err
