@@ -1,0 +1,179 @@
+"""Bags of ROS 2 (folders with ``metadata.yaml``, files ``.mcap`` and ``.db3``) and of ROS 1 (``.bag``) as sequences.
+
+The images are those of the topic with most colour images that has a camera info beside it: ``/camera/image_raw`` goes with
+``/camera/camera_info``. Depth comes from the topic of depth images of the same aspect ratio; each image has the depth nearest in time,
+within half of the usual interval of the faster of both. Times are those of the messages' headers. A bag has no poses of its images, so it can be
+tracked, but no map can be trained from it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.typesys import Stores, get_typestore
+
+from bidnerf_core import Dataset, InputError, Intrinsics
+from bidnerf_core.camera.intrinsics import same_aspect
+from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.sequence import FrameSequence, TimedFrame
+from bidnerf_ros2.conversions import seconds
+from bidnerf_ros2.messages import frame_of, intrinsics, is_depth
+
+log = logging.getLogger("bidnerf")
+
+METADATA, SUFFIXES = "metadata.yaml", (".bag", ".mcap", ".db3")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO = "sensor_msgs/msg/CameraInfo"
+WAITING = 30
+"""Images that may wait for their depth, which is recorded with a delay."""
+FASTEST = 0.02
+"""Seconds by which the times of an image and its depth may differ in any case."""
+
+
+@dataclass(frozen=True)
+class Topics:
+    """The topics of a bag that make a sequence."""
+
+    image: str
+    info: str
+    depth: str | None
+    camera: Intrinsics
+    frames: int  # messages of the images' topic
+    interval: float  # seconds, the mean of the images or of depth, whichever come faster
+
+
+@dataclass(frozen=True)
+class BagSequence:
+    """The frames of a bag in the order of time, see ``FrameSequence``."""
+
+    path: Path
+    topics: Topics
+    camera: Intrinsics  # of the images, or the one that was given in its place
+
+    def __len__(self) -> int:
+        return self.topics.frames
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        for number, (time, image, depth) in enumerate(self._paired()):
+            yield TimedFrame(time, frame_of(image, self.camera, depth, f"{number:06d}"))
+
+    def _paired(self) -> Iterator[tuple[float, Any, Any | None]]:
+        """Yield images with their times and their depth, once that can have been recorded."""
+        images: deque[tuple[float, Any]] = deque()
+        depths: deque[tuple[float, Any]] = deque(maxlen=2 * WAITING)
+        for topic, time, message in _messages(self.path, (self.topics.image, self.topics.depth)):
+            (images if topic == self.topics.image else depths).append((time, message))
+            while images and (self._is_complete(images[0][0], depths) or len(images) > WAITING):
+                yield self._with_depth(*images.popleft(), depths)
+        for image in images:
+            yield self._with_depth(*image, depths)
+
+    def _is_complete(self, time: float, depths: deque[tuple[float, Any]]) -> bool:
+        return self.topics.depth is None or any(other >= time for other, _ in depths)
+
+    def _with_depth(
+        self, time: float, image: Any, depths: deque[tuple[float, Any]]
+    ) -> tuple[float, Any, Any | None]:
+        nearest = min(depths, key=lambda depth: abs(depth[0] - time), default=None)
+        close = nearest is not None and abs(nearest[0] - time) <= max(FASTEST, self.topics.interval / 2)
+        return time, image, nearest[1] if nearest is not None and close else None
+
+
+class BagReader(Reader):
+    """The reader of bags."""
+
+    accepts = ("camera",)
+
+    @property
+    def expected(self) -> str:
+        """The files of a bag."""
+        return "metadata.yaml and its .mcap or .db3 (a bag of ROS 2), or a file .bag, .mcap or .db3"
+
+    def recognises(self, path: Path) -> bool:
+        """Return whether a folder is a bag of ROS 2, or a file is a bag by its name."""
+        return (path / METADATA).is_file() or (path.is_file() and path.suffix.lower() in SUFFIXES)
+
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        """Raise ``InputError``: a bag is a sequence, not a dataset."""
+        raise InputError(
+            f"{path}: a bag has no poses of its images, expected 'bidnerf track MAP {path}', or a dataset with poses"
+        )
+
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
+        """Return the images of a bag. Raises ``InputError`` for a bag without images and camera infos that fit."""
+        topics = _topics(path)
+        given = options.camera
+        if given is not None and not isinstance(given, Intrinsics):
+            raise InputError(f"{path}: a bag has a camera of its own; expected Intrinsics to replace it")
+        depth = "no depth" if topics.depth is None else f"depth of {topics.depth}"
+        log.info("%s: images of %s, camera of %s, %s", path, topics.image, topics.info, depth)
+        return BagSequence(path, topics, given or topics.camera)
+
+
+def _messages(path: Path, names: tuple[str | None, ...]) -> Iterator[tuple[str, float, Any]]:
+    """Yield the topic, the time and the content of each message of some topics. Raises ``InputError`` for a damaged bag."""
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
+            wanted = [connection for connection in bag.connections if connection.topic in names]
+            for connection, recorded, raw in bag.messages(wanted):
+                message: Any = bag.deserialize(raw, connection.msgtype)
+                time = seconds(message.header.stamp)
+                yield connection.topic, time or recorded * 1e-9, message
+    except InputError:
+        raise
+    except Exception as error:  # the formats' parsers raise anything
+        raise InputError(f"{path}: the bag cannot be read ({type(error).__name__}: {error})") from error
+
+
+def _topics(path: Path) -> Topics:
+    """Choose the topics of a bag."""
+    counts, infos, span = dict[str, int](), set[str](), 0.0
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
+            span = bag.duration * 1e-9
+            for connection in bag.connections:
+                if connection.msgtype in IMAGES and connection.msgcount:
+                    counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+                elif connection.msgtype == INFO and connection.msgcount:
+                    infos.add(connection.topic)
+    except (AnyReaderError, OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: not a bag that can be read ({error}), expected {BagReader().expected}"
+        ) from error
+    first = {topic: next(_messages(path, (topic,)))[2] for topic in (*counts, *infos)}
+    colour = [t for t in counts if not is_depth(first[t]) and _info_beside(t, infos) in infos]
+    if not colour:
+        listed = ", ".join(sorted({*counts, *infos})) or "none"
+        raise InputError(
+            f"{path}: no topic of colour images with a camera_info beside it, expected one; its images and infos: {listed}"
+        )
+    image = max(colour, key=lambda topic: (counts[topic], not hasattr(first[topic], "format")))
+    info = _info_beside(image, infos)
+    camera = intrinsics(first[info], rectified="rect" in image.rpartition("/")[2])
+    depths = [t for t in counts if is_depth(first[t]) and _fits(first[t], camera)]
+    depth = max(depths, key=lambda topic: counts[topic], default=None)
+    return Topics(
+        image, info, depth, camera, counts[image], span / max(counts[image], counts[depth]) if depth else 0.0
+    )
+
+
+def _info_beside(image: str, infos: set[str]) -> str:
+    """Return the camera info that belongs to a topic of images: in its namespace, or one above for compressed images."""
+    namespace = image.rpartition("/")[0]
+    names = [f"{space}/camera_info" for space in (namespace, namespace.rpartition("/")[0])]
+    return next((name for name in names if name in infos), names[0])
+
+
+def _fits(depth: Any, camera: Intrinsics) -> bool:
+    if hasattr(depth, "format"):
+        return True  # its size is known once it is decoded
+    return same_aspect((int(depth.width), int(depth.height)), (camera.width, camera.height))
+
+
+reader = BagReader()
