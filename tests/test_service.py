@@ -445,7 +445,7 @@ def test_geopose_answers_with_an_honest_accuracy(service: Service, place: Place)
     for more, part in (
         ({"imageBytes": "?"}, "not base64"),
         ({"imageFormat": "DEPTH"}, "expected a colour image"),
-        ({"params": {"model": "FISHEYE", "modelParams": [1]}}, "model is 'FISHEYE'"),
+        ({"params": {"model": "KODAK", "modelParams": [1]}}, "model is 'KODAK'"),
         ({"imageOrientation": {"mirrored": True}}, "imageOrientation"),
         ({"size": [2]}, "expected width and height"),
     ):

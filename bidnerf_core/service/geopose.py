@@ -23,7 +23,7 @@ from jaxtyping import Float
 from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
-from bidnerf_core.camera.files import COLMAP_MODELS
+from bidnerf_core.camera.colmap_models import MODELS
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.wgs84 import Geodetic
@@ -192,8 +192,8 @@ def _camera(reading: _Reading) -> dict[str, bytes]:
     model, numbers = params.text("model") or "UNKNOWN_CAMERA", _numbers(params, "modelParams")
     if model == "UNKNOWN_CAMERA" or not numbers:
         return {}
-    if model not in COLMAP_MODELS:
-        raise params.error(f"model is {model!r}, expected one of {', '.join(COLMAP_MODELS)}")
+    if model not in MODELS:
+        raise params.error(f"model is {model!r}, expected one of {', '.join(MODELS)}")
     if reading.size is None:
         raise reading.record.error("a camera model without size, expected width and height of its image")
     width, height = reading.size
