@@ -89,6 +89,7 @@ class BagReader(Reader):
     """The reader of bags."""
 
     accepts = ("camera",)
+    suffixes = SUFFIXES
 
     @property
     def expected(self) -> str:
