@@ -10,25 +10,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.devices import may_wait
+from bidnerf_core.fields.box_tree import TooMany, level_sizes, tree_of
 from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds
+from bidnerf_core.fields.met_pieces import Meeting, flattened, listed, met_pieces, pieces_about
 from bidnerf_core.settings import Range
 from bidnerf_gaussians.gaussians import COEFFICIENTS, LEAST_OPACITY, Gaussians
-from bidnerf_gaussians.index import Lines, TooMany, level_sizes, met, nearest_met, tree_of
 from bidnerf_gaussians.quaternions import matrices, turned_back
 from bidnerf_gaussians.spherical_harmonics import colours
 
 LARGEST_ALPHA = 0.999
 """Of one Gaussian along a ray, as in gsplat."""
-STOPPED = 1e-4
-"""Share of a ray's light that still shines through where nothing behind is looked at, as in the first paper's code."""
 LEAST_EXTENT = 2.0
 """Standard deviations to which at least a Gaussian's box extends, so that ``query`` finds nearly all of its density."""
-RAYS_AT_ONCE = 384
-"""Rays that are looked up together: so few that what they meet stays in the processor's cache."""
 POINTS_AT_ONCE = 2**15
-KEPT_HITS = 64
-"""Gaussians along a ray where their number must be known beforehand; the nearest ones are kept."""
 
 
 @dataclass(frozen=True)
@@ -116,10 +110,10 @@ class GaussiansField(nn.Module):
     def hits(self, rays: Rays) -> RayHits:
         """Return the peaks along rays with colour and alpha; differentiable in the rays and the parameters."""
         shape = rays.near.shape
-        flat = _flattened(rays)
+        flat = flattened(rays)
         gaussian, valid = self.met(flat, self.config.by_means)
         width = gaussian.shape[1]
-        place, ray, index = _listed(gaussian, valid)
+        place, ray, index = listed(gaussian, valid)
         directions = flat.directions.index_select(0, ray)
         peaks = self._peaks(index, flat.origins.index_select(0, ray), directions)
         rgb = colours(self.harmonics.index_select(0, index), directions)
@@ -137,65 +131,13 @@ class GaussiansField(nn.Module):
 
         With ``by_means``, that with the nearest mean comes first, and otherwise that with the nearest peak.
         """
-        if not len(rays.near):
-            empty = torch.zeros((0, 0), dtype=torch.long, device=self.order.device)
-            return empty, empty.bool()
-        if not may_wait(rays.near.device):
-            return self._met_in_known_shape(rays, by_means)
-        parts = self._met_in_parts(rays, RAYS_AT_ONCE, by_means)
-        width = max(gaussian.shape[1] for gaussian, _ in parts)
-        gaussian, valid = (
-            torch.cat([torch.nn.functional.pad(part[i], (0, width - part[i].shape[1])) for part in parts])
-            for i in range(2)
-        )
-        return gaussian, valid
 
-    def _met_in_parts(self, rays: Rays, count: int, by_means: bool) -> list[tuple[Tensor, Tensor]]:
-        parts = zip(
-            *(getattr(rays, n).split(count) for n in ("origins", "directions", "near", "far")), strict=True
-        )
-        found = []
-        for part in parts:
-            few = Rays(*part)
-            try:
-                found.append(self._met_by_few(few, by_means))
-            except TooMany:
-                found += self._met_in_parts(few, (len(few.near) + 1) // 2, by_means)
-        return found
+        def meet(index: Tensor, origins: Tensor, directions: Tensor) -> Meeting:
+            peaks = self._peaks(index, origins, directions)
+            alpha = torch.where(peaks.alpha >= LEAST_OPACITY, peaks.alpha, 0)
+            return Meeting(peaks.distance, alpha, peaks.mean if by_means else peaks.distance)
 
-    def _met_by_few(self, rays: Rays, by_means: bool) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        ray, index = met(self._lines(rays), self.boxes, self.order)
-        peaks = self._peaks(index, rays.origins.index_select(0, ray), rays.directions.index_select(0, ray))
-        near, far = (part.index_select(0, ray) for part in (rays.near, rays.far))
-        kept = _is_hit(peaks, near, far).nonzero()[:, 0]
-        key = peaks.mean if by_means else peaks.distance
-        ray, index, key, alpha = (part.index_select(0, kept) for part in (ray, index, key, peaks.alpha))
-        count = torch.bincount(ray, minlength=len(rays.near))
-        width = int(count.max()) if len(ray) else 0
-        place = ray * width + torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
-        rows = (len(rays.near), width)
-        return _nearest_first(*(
-            value.new_full((rows[0] * width,), fill).index_copy(0, place, value).reshape(rows)
-            for value, fill in ((key, torch.inf), (alpha, 0), (index, 0))
-        ))  # fmt: skip
-
-    def _met_in_known_shape(
-        self, rays: Rays, by_means: bool
-    ) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        index, valid = nearest_met(self._lines(rays), self.boxes, self.order)
-        ray = torch.arange(len(index), device=index.device)[:, None].expand(index.shape).reshape(-1)
-        peaks = self._peaks(
-            index.reshape(-1), rays.origins.index_select(0, ray), rays.directions.index_select(0, ray)
-        )
-        hit = (
-            _is_hit(peaks, rays.near.index_select(0, ray), rays.far.index_select(0, ray)).reshape(index.shape)
-            & valid
-        )
-        key = peaks.mean if by_means else peaks.distance
-        key = torch.where(hit, key.reshape(index.shape), torch.inf)
-        kept = key.topk(min(KEPT_HITS, key.shape[1]), dim=1, largest=False, sorted=True).indices
-        alpha = torch.where(hit, peaks.alpha.reshape(index.shape), 0)
-        return _nearest_first(*(part.gather(1, kept) for part in (key, alpha, index)))
+        return met_pieces(rays, self.boxes, self.order, meet)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return the density whose integral along ``directions`` gives the opacity of ``hits``, and the mean colour."""
@@ -213,7 +155,7 @@ class GaussiansField(nn.Module):
 
     def _values(self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]) -> FieldValues:
         try:
-            point, index, counts = self._about(positions)
+            point, index, counts = pieces_about(positions, self.boxes, self.order)
         except TooMany:
             halves = zip(*(part.chunk(2) for part in (positions, directions)), strict=True)
             found = [self._values(*half) for half in halves]
@@ -230,27 +172,6 @@ class GaussiansField(nn.Module):
         total = density.new_zeros(count).index_add(0, point, density)
         colour = rgb.new_zeros((count, 3)).index_add(0, point, density[:, None] * rgb)
         return FieldValues(total, (colour / total.clamp(min=1e-20)[:, None]).clamp(0, 1))
-
-    @torch.no_grad()
-    def _about(
-        self, positions: Float[Tensor, "p 3"]
-    ) -> tuple[Int[Tensor, "q"], Int[Tensor, "q"], Bool[Tensor, "q"]]:
-        """Return pairs of a point and a Gaussian whose box holds it, and whether each counts.
-
-        Where the host must not wait, each point has equally many, of which some do not count.
-        """
-        zero = torch.zeros_like(positions[:, 0])
-        lines = Lines.of(positions, torch.ones_like(positions), zero, zero)
-        if may_wait(positions.device):
-            point, index = met(lines, self.boxes, self.order)
-            return point, index, torch.ones_like(point, dtype=torch.bool)
-        index, valid = nearest_met(lines, self.boxes, self.order)
-        point = torch.arange(len(index), device=index.device)[:, None].expand(index.shape)
-        return point.reshape(-1), index.reshape(-1), valid.reshape(-1)
-
-    def _lines(self, rays: Rays) -> Lines:
-        far = torch.where(rays.far > rays.near, rays.far, rays.near - 1)  # nothing is met by rays that miss
-        return Lines.of(rays.origins, rays.directions, rays.near, far)
 
     def _peaks(
         self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
@@ -288,7 +209,7 @@ class PeakSampler:
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        shape, flat = rays.near.shape, _flattened(rays)
+        shape, flat = rays.near.shape, flattened(rays)
         gaussian, valid = self.field.met(flat, by_means=False)
         width = gaussian.shape[1]
         ray = torch.arange(len(gaussian), device=gaussian.device)[:, None].expand(gaussian.shape).reshape(-1)
@@ -308,40 +229,3 @@ class PeakSampler:
             ends[:, :-1] = torch.where(valid[:, 1:], torch.minimum(ends[:, :-1], between), ends[:, :-1])
         ends = torch.maximum(starts, ends)
         return RaySamples(*(part.reshape(*shape, width) for part in (starts, ends, valid)))
-
-
-def _flattened(rays: Rays) -> Rays:
-    return Rays(
-        rays.origins.reshape(-1, 3),
-        rays.directions.reshape(-1, 3),
-        rays.near.reshape(-1),
-        rays.far.reshape(-1),
-    )
-
-
-def _is_hit(peaks: _Peaks, near: Float[Tensor, "p"], far: Float[Tensor, "p"]) -> Bool[Tensor, "p"]:
-    return (peaks.alpha >= LEAST_OPACITY) & (peaks.distance >= near) & (peaks.distance <= far)
-
-
-def _nearest_first(
-    key: Float[Tensor, "r s"], alpha: Float[Tensor, "r s"], index: Int[Tensor, "r s"]
-) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-    """Return the indices in order of ``key``, and which of them count: those that are reached by any light."""
-    key, order = key.sort(dim=1, stable=True)
-    alpha, index = alpha.gather(1, order), index.gather(1, order)
-    thickness = -torch.log1p(-alpha)
-    before = thickness.cumsum(1) - thickness
-    valid = (key < torch.inf) & (before < -math.log(STOPPED))
-    if may_wait(valid.device):
-        width = int(valid.sum(1).max()) if valid.numel() else 0
-        return index[:, :width], valid[:, :width]
-    return index, valid
-
-
-def _listed(index: Int[Tensor, "r s"], valid: Bool[Tensor, "r s"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return place in the table, row and index of the valid entries or, where the host must not wait, of all."""
-    if may_wait(valid.device):
-        place = valid.reshape(-1).nonzero()[:, 0]
-    else:
-        place = torch.arange(valid.numel(), device=valid.device)
-    return place, place // max(1, valid.shape[1]), index.reshape(-1).index_select(0, place)

@@ -14,7 +14,6 @@ from bidnerf_core.fields.contract import Rays, SceneBounds
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_gaussians import Gaussians, GaussiansConfig, GaussiansField, quaternions
-from bidnerf_gaussians import index as boxes
 from bidnerf_gaussians.gaussians import LEAST_OPACITY
 from bidnerf_gaussians.spherical_harmonics import colours
 
@@ -97,7 +96,7 @@ def test_in_known_shapes_the_same_is_seen(
     expected = render(field, along)
     points = rays(50, 5).at(torch.full((50, 1), 3.0))[:, 0]
     density = field.query(points, along.directions[:50])
-    monkeypatch.setattr("bidnerf_gaussians.field.may_wait", lambda device: False)
+    monkeypatch.setattr("bidnerf_core.fields.met_pieces.may_wait", lambda device: False)
     with without_waiting():
         found = render(field, along)
         again = field.query(points, along.directions[:50])
@@ -110,7 +109,7 @@ def test_many_boxes_are_tested_in_parts(
 ) -> None:
     field, along = field_of(some(300)), rays()
     expected = field.hits(along)
-    monkeypatch.setattr(boxes, "MOST_PAIRS", 400)
+    monkeypatch.setattr("bidnerf_core.fields.box_tree.MOST_PAIRS", 400)
     found = field.hits(along)
     assert torch.equal(found.alpha, expected.alpha)
 

@@ -1,6 +1,6 @@
-"""A tree of boxes about Gaussians, by which a ray or a point finds the few that it meets.
+"""A tree of boxes about the pieces of a scene (Gaussians, triangles, discs), by which a ray or a point finds the few that it meets.
 
-Gaussians are put in the order of a Morton curve, eight neighbours share a box, eight of these boxes the next, and so on
+Pieces are put in the order of a Morton curve, eight neighbours share a box, eight of these boxes the next, and so on
 (an implicit bounding volume hierarchy, Lauterbach et al. 2009, with eight children). The tree has no pointers: child ``c`` of
 node ``n`` is ``8 n + c`` on the level below. The boxes of a node's children lie side by side, as (6 nodes 8): lower corner,
 upper corner.
@@ -29,11 +29,11 @@ KEPT_NODES = 128
 """Nodes on each level that a ray may meet where their number must be known beforehand; the nearest ones are kept."""
 
 Boxes = Sequence[Float[Tensor, "6 m 8"]]
-"""The boxes of the children of each node, the lowest level (whose children are Gaussians) first."""
+"""The boxes of the children of each node, the lowest level (whose children are pieces) first."""
 
 
 def level_sizes(count: int) -> list[int]:
-    """Return the number of nodes on each level above ``count`` Gaussians, the lowest first."""
+    """Return the number of nodes on each level above ``count`` pieces, the lowest first."""
     sizes = [max(1, -(-count // CHILDREN))]
     while sizes[-1] > TOP:
         sizes.append(-(-sizes[-1] // CHILDREN))
@@ -43,7 +43,7 @@ def level_sizes(count: int) -> list[int]:
 def tree_of(
     centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
 ) -> tuple[Int[Tensor, "n"], list[Float[Tensor, "6 m 8"]]]:
-    """Return the order of the Gaussians, and the boxes of all levels. What is not ``seen`` is in an empty box."""
+    """Return the order of the pieces, and the boxes of all levels. What is not ``seen`` is in an empty box."""
     order = torch.argsort(_morton(centres, seen), stable=True)
     centres, halves, seen = centres[order], halves[order], seen[order]
     lower = torch.where(seen[:, None], centres - halves, torch.inf)
@@ -62,7 +62,7 @@ def tree_of(
 
 def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tensor, "n"]:
     """Return the places along a Morton curve, the last for what is not seen."""
-    # Quantiles, so that a few Gaussians far away do not put all others in one cell.
+    # Quantiles, so that a few pieces far away do not put all others in one cell.
     some = centres[:: max(1, len(centres) // 10_000)].double()
     low, high = (some.quantile(q, dim=0) for q in (0.02, 0.98))
     side = (high - low).amax().clamp(min=1e-12)
@@ -116,7 +116,7 @@ class TooMany(Exception):
 
 
 def met(lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return the pairs of a ray and a Gaussian whose box it meets, sorted by ray. Their number is read from the device.
+    """Return the pairs of a ray and a piece whose box it meets, sorted by ray. Their number is read from the device.
 
     Raises ``TooMany`` where several rays meet so many boxes that memory might not suffice.
     """
@@ -136,7 +136,7 @@ def met(lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]) -> tuple[Int[Tensor
 def nearest_met(
     lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]
 ) -> tuple[Int[Tensor, "r c"], Bool[Tensor, "r c"]]:
-    """Return the Gaussians whose boxes each ray meets first, and which of these places are in use; the shape is known beforehand."""
+    """Return the pieces whose boxes each ray meets first, and which of these places are in use; the shape is known beforehand."""
     rays = len(lines.near)
     node = torch.arange(boxes[-1].shape[1], device=order.device).expand(rays, -1)
     valid = torch.ones_like(node, dtype=torch.bool)
