@@ -178,7 +178,9 @@ def test_places_without_a_sequence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no images in it"):
         open_sequence(tmp_path)
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(InputError, match=r"notes\.txt: is a file, expected a video \(\.mp4"):
+    with pytest.raises(
+        InputError, match=r"notes\.txt: is a file, expected the folder of a dataset, or a video \(\.mp4"
+    ):
         open_sequence(tmp_path / "notes.txt")
     write_transforms(tmp_path, {"train": tiny.views(1)})
     with pytest.raises(InputError, match="is a dataset with cameras of its own, expected no other camera"):

@@ -15,7 +15,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
 from bidnerf_core.depth.registration import DepthCamera, register_depth
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.geometry.se3 import SE3
 
 SIZE = (160, 120)
@@ -133,7 +133,14 @@ def test_a_sequence_may_lack_poses_and_depth(scene: Path) -> None:
     assert [timed.truth is None for timed in frames] == [False, True, False]
     assert [timed.frame.depth is None for timed in frames] == [False, False, True]
     assert [timed.time for timed in frames] == [None] * 3
-    with pytest.raises(InputError, match=r"frame-000001\.pose\.txt: no such file"):
+    with pytest.warns(
+        InputWarning, match=r"1 of 3 poses is missing and left out, the first is frame-000001\.pose\.txt"
+    ):
+        dataset = open_dataset(one)
+    assert [dataset.frame_names(split) for split in dataset.splits] == [["frame-000002"], ["frame-000000"]]
+    for file in one.glob("*.pose.txt"):
+        file.unlink()
+    with pytest.raises(InputError, match=r"frame-000000\.pose\.txt: no such file"):
         open_dataset(one)
 
 
@@ -214,10 +221,14 @@ def test_broken_split_files_name_the_line(text: str, message: str, scene: Path) 
         open_dataset(scene)
 
 
-def test_depth_of_another_size_is_refused(scene: Path) -> None:
-    iio.imwrite(scene / "seq-02" / "frame-000000.depth.png", np.ones((6, 8), np.uint16))
-    with pytest.raises(InputError, match=r"frame-000000\.depth\.png: depth is 8x6, expected 160x120"):
-        open_dataset(scene, register_depth=False).views("test")
+def test_depth_of_another_size_is_that_of_the_nearest_measurement_and_of_another_aspect_ratio_refused(
+    scene: Path,
+) -> None:
+    iio.imwrite(scene / "seq-02" / "frame-000000.depth.png", np.full((6, 8), 1000, np.uint16))
+    depth = open_dataset(scene, register_depth=False, depth_unit=0.002).views("test")[0].frame.depth
+    assert depth is not None
+    assert depth.shape == (120, 160)
+    assert depth.unique().tolist() == [2]
     iio.imwrite(scene / "seq-02" / "frame-000000.depth.png", np.ones((8, 8), np.uint16))
     with pytest.raises(
         InputError, match=r"frame-000000\.depth\.png: depth is 8x8, expected the aspect ratio"

@@ -28,6 +28,7 @@ import torch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.incomplete import present
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -96,22 +97,33 @@ class SevenScenesReader(Reader):
     Poses and depth are moved from a depth sensor to the colour camera: that of a Kinect, unless another or none is given.
     """
 
-    accepts = ("camera", "register_depth")
+    accepts = ("camera", "register_depth", "depth_unit")
     expected = "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)"
 
     def recognises(self, path: Path) -> bool:
         return any(_has_frames(folder) for folder in (path, *_sequence_folders(path).values()))
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """List the frames. Raises ``InputError`` where one lacks a pose, and for split files that are not usable."""
+        """List the frames; those without a pose are left out and counted.
+
+        Raises ``InputError`` where none has one, and for split files that are not usable.
+        """
         splits = _splits(path)
-        for frames in splits.values():
-            for frame in frames:
-                if not frame.pose.is_file():
-                    raise InputError(
-                        f"{frame.pose}: no such file, expected it as {frame.image.name} is there"
-                    )
-        return self._dataset(path, splits, options)
+        frames = list({frame: None for group in splits.values() for frame in group})
+        posed = set(
+            present(
+                frames,
+                lambda frame: frame.pose.is_file(),
+                path,
+                lambda frame: frame.pose.relative_to(path),
+                lambda frame: InputError(
+                    f"{frame.pose}: no such file, expected it as {frame.image.name} is there"
+                ),
+                noun="pose",
+            )
+        )
+        kept = {split: [frame for frame in group if frame in posed] for split, group in splits.items()}
+        return self._dataset(path, {split: group for split, group in kept.items() if group}, options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         """List the frames, including those without a pose."""
@@ -125,7 +137,8 @@ class SevenScenesReader(Reader):
     ) -> SevenScenesDataset:
         sensor = options.sensor(path, SEVEN_SCENES_KINECT)
         camera = folder_camera(path, options.camera, DEPTH_CAMERA if sensor is None else COLOUR_CAMERA)
-        return SevenScenesDataset(Splits(path, splits), camera, sensor, options.background)
+        unit = MILLIMETRE if options.depth_unit is None else options.depth_unit
+        return SevenScenesDataset(Splits(path, splits), camera, sensor, options.background, unit)
 
 
 class SevenScenesDataset(SplitDataset[SceneFrame]):
@@ -137,9 +150,10 @@ class SevenScenesDataset(SplitDataset[SceneFrame]):
         camera: CameraSource,
         sensor: DepthCamera | None,
         background: Background | None,
+        depth_unit: float,
     ) -> None:
         super().__init__(frames, background)
-        self._camera, self._sensor = camera, sensor
+        self._camera, self._sensor, self._depth_unit = camera, sensor, depth_unit
         self._read_depth = DepthReader(documented=("65535",))
 
     def _pose(self, frame: SceneFrame) -> SE3 | None:
@@ -153,7 +167,7 @@ class SevenScenesDataset(SplitDataset[SceneFrame]):
     def _frame(self, frame: SceneFrame, name: str) -> Frame:
         depth = None
         if frame.depth.is_file():
-            depth = DepthFile(frame.depth, MILLIMETRE, self._read_depth, self._sensor)
+            depth = DepthFile(frame.depth, self._depth_unit, self._read_depth, self._sensor)
         return read_rgbd(name, frame.image, self._camera.at(frame.image), self._background, depth)
 
 
