@@ -109,6 +109,17 @@ def test_a_store_returns_what_is_put_into_it(
     assert list(tmp_path.iterdir()) == [], "files of a store have no names"
 
 
+def test_a_full_disk_is_an_error_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pixel_store, "_reserve", full)
+    with pytest.raises(
+        InputError, match=rf"^{tmp_path}: no room for 5000 MB of images \(No space left on device\)"
+    ):
+        PixelStore(5_000_000_000, tmp_path).stored(byte_frame())
+
+
 @pytest.mark.parametrize("most", [1, 64])
 def test_pixels_of_images_are_found_wherever_they_lie(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(image_pixels, "MOST_BLOCKS", most)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames.colours import are_bytes, as_bytes
 from bidnerf_core.frames.frame import Frame
 
@@ -60,9 +61,24 @@ class PixelStore:
         size = max(least, min(BLOCK, self._expected + ALIGNMENT))
         if not self._mapped:
             return torch.empty(size, dtype=torch.uint8)
-        with tempfile.TemporaryFile(dir=self._folder) as file:
-            os.truncate(file.fileno(), size)
-            return torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(size,)))
+        try:
+            with tempfile.TemporaryFile(dir=self._folder) as file:
+                _reserve(file.fileno(), size)
+                return torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(size,)))
+        except OSError as error:
+            place = self._folder or tempfile.gettempdir()
+            raise InputError(
+                f"{place}: no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}), expected that"
+                " much; or read them smaller (--largest, largest=)"
+            ) from error
+
+
+def _reserve(file: int, size: int) -> None:
+    """Give a file a size whose bytes exist: writing to a mapped page for which the disk has no room would end the process."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.truncate(file, size)
 
 
 def bytes_of(frame: Frame) -> int:
