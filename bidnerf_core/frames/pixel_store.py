@@ -83,8 +83,11 @@ def _reserve(file: int, size: int) -> None:
 
 def bytes_of(frame: Frame) -> int:
     """Return the number of bytes that a store takes for the images of a frame."""
+    composited = frame.alpha is not None and frame.held_rgb.dtype != torch.uint8  # of bytes no more
     return sum(
         part.numel() * size
-        for part, size in ((frame.held_rgb, 1), (frame.depth, 4), (frame.alpha, 4), (frame.hidden, 1))
+        for part, size in (
+            (frame.held_rgb, 4 if composited else 1), (frame.depth, 4), (frame.alpha, 4), (frame.hidden, 1),
+        )
         if part is not None
-    )
+    )  # fmt: skip
