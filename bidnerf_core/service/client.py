@@ -55,7 +55,13 @@ class ServiceClient:
             except urllib.error.HTTPError as error:
                 wait = float(error.headers.get("Retry-After") or 0)
                 if error.code not in (429, 503) or time.monotonic() + wait > until:
-                    raise ServiceError(error.code, json.load(error)["detail"]) from error
+                    text = error.read().decode(errors="replace")
+                    told = (
+                        json.loads(text)["detail"]
+                        if "problem+json" in error.headers.get("Content-Type", "")
+                        else text
+                    )
+                    raise ServiceError(error.code, told) from error
                 time.sleep(wait)
             except OSError as error:
                 raise ServiceError(0, f"{self.url}: {getattr(error, 'reason', error)}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -12,8 +13,8 @@ from pathlib import Path
 TEXT = "text/plain; version=0.0.4; charset=utf-8"
 SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 """Upper bounds of the buckets of times."""
-PAGE = 4096
-"""Bytes of a page in ``/proc/PID/statm``; a kernel with another size has no such file that we read."""
+PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
+"""Bytes of a page, in which ``/proc/PID/statm`` counts."""
 
 
 class Histogram:

@@ -28,9 +28,7 @@ class ServiceConfig:
     """
 
     workers: int = 0  # processes that localize, each with one thread; 0: one for each core
-    queue: int = (
-        16  # requests that may be uploading or waiting beside those at work; more are answered with 429
-    )
+    queue: int = 16  # requests that may upload or wait beside those at work; others are answered with 429
     timeout: float = 60.0  # seconds from a whole request to its answer; its worker is then stopped
     upload_timeout: float = 20.0  # seconds in which a whole request must have arrived
     max_megabytes: float = 32.0  # size of a request (2^20 bytes)
