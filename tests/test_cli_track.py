@@ -23,6 +23,7 @@ from bidnerf_core.captures.cameras import StoredCamera, stored_cameras
 from bidnerf_core.cli.watch_folder import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.datasets.trajectories import read_trajectory
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textured_map
 from commands import Run
@@ -40,6 +41,14 @@ class StoredGround(MapWithLandmarks):
     @property
     def info(self) -> MapInfo:
         return MapInfo("ground", {}, self.bounds, 1, True, "data", weights="ground", cameras=self.cameras)
+
+    @property
+    def unit(self) -> LengthUnit:
+        return self.info.unit
+
+    @property
+    def up(self) -> None:
+        return None
 
 
 @pytest.fixture(autouse=True)

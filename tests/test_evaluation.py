@@ -32,6 +32,7 @@ from bidnerf_core.results.errors import (
     rotation_angle,
     steps_to_success,
     success_rate,
+    success_rate_by_frame,
 )
 
 tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(
@@ -163,6 +164,34 @@ def test_wilson_interval(trials: int) -> None:
         assert (found.low, found.high) == pytest.approx((middle - half, middle + half), abs=1e-9)
         assert 0 <= found.low <= found.rate <= found.high <= 1
     assert str(success_rate(23, 24)) == "95.8% (23 of 24; 79.8% to 99.3%)"
+
+
+def test_trials_of_one_frame_are_not_independent() -> None:
+    frames = [n // 4 for n in range(24)]
+    alike = success_rate_by_frame([True] * 24, frames)
+    assert (alike.low, alike.high) == pytest.approx(
+        (success_rate(6, 6).low, 1.0)
+    )  # six frames tell what six tell
+    assert str(alike) == "100.0% (24 of 24 on 6 frames; 61.0% to 100.0%)"
+    split = success_rate_by_frame([frame < 3 for frame in frames], frames)
+    whole = success_rate(3, 6)
+    assert split.low <= whole.low < 0.5 < whole.high <= split.high
+    assert success_rate_by_frame([True, False, True], [1, 2, 3]) == success_rate(2, 3)
+
+
+def test_intervals_by_frames_hold_what_they_promise() -> None:
+    """Frames succeed with their own probability, with mean 0.7; trials of a frame are independent given it."""
+    generator = np.random.default_rng(2)
+    inside = plain = 0
+    for _ in range(300):
+        share = generator.beta(0.7, 0.3, size=12).repeat(6)
+        outcomes = (generator.random(72) < share).tolist()
+        found = success_rate_by_frame(outcomes, np.arange(12).repeat(6).tolist())
+        inside += found.low <= 0.7 <= found.high
+        every = success_rate(sum(outcomes), 72)
+        plain += every.low <= 0.7 <= every.high
+    assert inside > 270
+    assert plain < 210
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 0), (3, 2), (-1, 4)])

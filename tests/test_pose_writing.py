@@ -59,7 +59,9 @@ def test_a_tum_trajectory_is_what_scipy_reads(tmp_path: Path) -> None:
 def test_names_that_are_times_are_the_timestamps() -> None:
     text = tum_trajectory(images(["1305031102.175304", "1305031102.211214"]))
     assert [line.split()[0] for line in text.splitlines()[1:]] == ["1305031102.175304", "1305031102.211214"]
-    assert tum_trajectory(images(["7", "x"])).splitlines()[1].startswith("0 ")
+    lines = tum_trajectory(images(["7", "x"])).splitlines()
+    assert lines[1] == "# 7"  # the name, where the time stamp is only a number
+    assert lines[2].startswith("0 ")
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
@@ -142,7 +144,8 @@ def test_transforms_with_times_are_a_sequence(tmp_path: Path) -> None:
 
 def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"poses\.csv: expected a name that ends with transforms\.json, \.json, \.txt"
+        InputError,
+        match=r"poses\.csv: expected a name that ends with transforms\.json, images\.txt, \.json, \.txt",
     ):
         write_poses(tmp_path / "poses.csv", images(["a", "b"]))
 

@@ -35,6 +35,7 @@ KEYS = [
     "focal_factor",
     "intrinsics",
     "confidence",
+    "unit",
 ]
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.captures.report import Arrangement, CoverageRecord, Gap
+from bidnerf_core.captures.up_direction import UpDirection, up_direction
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews
 from bidnerf_core.mapping.geometry.observations import Sightings
@@ -35,26 +36,28 @@ FEW = 4
 
 
 def coverage(
-    views: Sequence[View], matched: TrackedKeypoints, seen: TrackedKeypoints, least_parallax: float
-) -> CoverageRecord:
+    views: Sequence[View], matched: TrackedKeypoints, seen: TrackedKeypoints, least_parallax: float,
+    up: UpDirection | None = None,
+) -> CoverageRecord:  # fmt: skip
     """Return how well the views cover their scene.
 
     ``matched`` are all keypoints that were matched, ``seen`` those that agree on a triangulated point, and
-    ``least_parallax`` is the angle (degrees) between rays below which a point cannot be placed.
+    ``least_parallax`` is the angle (degrees) between rays below which a point cannot be placed. ``up`` is the upward direction
+    of the scene, by default the one that the cameras give.
     """
     angle = parallax_deg(matched)
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
     rotations = torch.stack([v.T_ref_camera.rotation.cpu().double() for v in views])
-    up = torch.nn.functional.normalize(-rotations[:, :, 1].sum(0), dim=0)
+    upward = (up or up_direction([view.T_ref_camera for view in views])).tensor()
     centre, converge = _meeting_point(centres, rotations[:, :, 2])
     directions = centres - centre if converge else rotations[:, :, 2]
-    arrangement, open_side, gaps, heights = _around(views, directions, up, converge)
+    arrangement, open_side, gaps, heights = _around(views, directions, upward, converge)
     if angle is not None and angle < least_parallax:
         arrangement, open_side, gaps = "one place", None, ()
     views_of = torch.bincount(seen.point).double()
     cones = _cones_deg(seen.sightings, seen.count)
     return CoverageRecord(
-        arrangement, _three(centre), _three(up), angle or 0.0, seen.count, _median(views_of),
+        arrangement, _three(centre), _three(upward), angle or 0.0, seen.count, _median(views_of),
         float((views_of == 2).double().mean()) if len(views_of) else 0.0, _median(cones), open_side, gaps, heights,
     )  # fmt: skip
 

@@ -61,7 +61,7 @@ class CoverageRecord:
         0.0,
         0.0,
     )  # metres: where the optical axes meet, as far as they do
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit: mean upward direction of the cameras
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit, world: the upward direction of the scene
     parallax_deg: float = 0.0  # median angle between the rays to a point
     landmarks: int = 0  # triangulated
     seen_by: float = 0.0  # median number of photos that show a landmark

@@ -22,6 +22,7 @@ from bidnerf_core.captures.photos import (
 )
 from bidnerf_core.captures.relocated_photos import Relocation, image_motion, relocated, suspects
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
+from bidnerf_core.captures.up_direction import UpDirection
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
@@ -45,11 +46,13 @@ def surveyed(
     views: Sequence[View],
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     trial: HeldOutTrial = NOT_TRIED,
+    up: UpDirection | None = None,
 ) -> CaptureReport:
     """Return the record of the capture whose keypoints are matched in ``tracked``, in the order of ``views``.
 
     Photos that share few landmarks with others are localized by the landmarks of those that share many, as they are and
-    mirrored: this distinguishes a wrong pose from a photo of something else. ``trial`` holds the errors of held-out photos.
+    mirrored: this distinguishes a wrong pose from a photo of something else. ``trial`` holds the errors of held-out photos, and
+    ``up`` is the upward direction of the scene where it is known.
     """
     seen, positions = tracked.triangulated(config)
     links, measures = linked(seen), photo_measures(views)
@@ -72,7 +75,7 @@ def surveyed(
         )  # fmt: skip
         photos.append(found.onto(record) if found else record)
     spread = exposure.quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
-    covered = coverage(_sound(views, problems), tracked.matched, seen, config.parallax)
+    covered = coverage(_sound(views, problems), tracked.matched, seen, config.parallax, up)
     return CaptureReport(tuple(photos), covered, trial, float(spread[1] - spread[0]))
 
 

@@ -23,6 +23,7 @@ from bidnerf_core.evaluation.plots import convergence_plot
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.localization import Localization, Localizer, settings_of
@@ -57,7 +58,7 @@ class DemoTrial:
 
     def off(self, poses: SE3) -> PoseError:
         """Return how far poses are from the true one."""
-        return pose_error(poses, self.view.T_ref_camera)
+        return pose_error(poses, self.view.T_ref_camera, self.without_start.unit)
 
 
 def run(arguments: list[str]) -> None:
@@ -132,7 +133,10 @@ def _print(trials: Sequence[DemoTrial]) -> None:
 
 
 def _shown(error: PoseError, digits: int, digits_of_angle: int) -> tuple[str, str]:
-    return f"{float(error.translation):.{digits}f} m", f"{float(error.rotation_deg):.{digits_of_angle}f} deg"
+    return (
+        f"{float(error.translation):.{digits}f} {symbol(error.unit)}",
+        f"{float(error.rotation_deg):.{digits_of_angle}f} deg",
+    )
 
 
 def _draw(stored: Map, trials: Sequence[DemoTrial], out: Path) -> None:

@@ -48,7 +48,12 @@ def run(arguments: list[str]) -> None:
         ] = (),
         method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
         trials: Annotated[
-            int | None, option("N", "number of trials of each size", "the protocol's, 24 or 25")
+            int | None,
+            option(
+                "N",
+                "number of trials of each size; without a start, at most one a frame",
+                "the protocol's, 24 or 25",
+            ),
         ] = None,
         seed: Annotated[int | None, option("S", "seed of every random choice", "the protocol's, 0")] = None,
         split: Annotated[str, option("NAME", "split of the dataset")] = "test",

@@ -45,4 +45,4 @@ def _draw(scene: Map, out: Path) -> None:
         raise InputError(f"{out}: expected the name of a PNG file")
     seen_by = None if scene.landmarks is None else scene.landmarks.views
     points = None if scene.landmarks is None else scene.landmarks.positions
-    draw_capture(scene.capture, points, seen_by, out)
+    draw_capture(scene.capture, points, seen_by, out, scene.unit)

@@ -35,6 +35,7 @@ from bidnerf_core.datasets.queries import DepthPoints, Photos, Query, QuerySourc
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.evaluation.trials import places_of
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import METHODS, Localization, Localizer
 from bidnerf_core.localization.methods import (
@@ -48,7 +49,7 @@ from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
 from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations
 from bidnerf_core.results.overlays import overlay
-from bidnerf_core.results.pose_files import pose_format, read_pose
+from bidnerf_core.results.pose_files import OPENCV_AXES, pose_format, read_poses
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
 
@@ -92,7 +93,13 @@ def run(arguments: list[str]) -> None:
         split: Annotated[str, option("NAME", "split of the dataset")] = "test",
         method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
         start: Annotated[
-            Path | None, one_start, option("POSE.json", "file with a 4x4 T_world_camera to start from", "")
+            Path | None,
+            one_start,
+            option(
+                "POSE.json",
+                "file with a 4x4 T_world_camera to start from, or one for each query by its name",
+                "",
+            ),
         ] = None,
         perturb: Annotated[
             tuple[float, float] | None,
@@ -116,7 +123,7 @@ def run(arguments: list[str]) -> None:
             Path | None,
             option(
                 "POSES",
-                "write poses to this file: .txt or .tum, transforms.json, or .json with all details",
+                "write poses to this file: .txt or .tum, transforms.json, images.txt (COLMAP), or .json with all details",
                 "",
             ),
         ] = None,
@@ -145,7 +152,7 @@ def run(arguments: list[str]) -> None:
             mask_folder(masks, mask_hides),
         )  # fmt: skip
         frames = FrameOptions(split, tuple(name for group in frame for name in group), window)
-        begin = StartSpec(None if start is None else read_pose(start), perturb)
+        begin = StartSpec(None if start is None else read_poses(start), perturb, start)
         for part in (frames, begin):
             part.check()
         if not query:
@@ -196,8 +203,8 @@ def _localize(
     with counted("localizing", "images", total) as report:
         try:
             localize_each(
-                localizer, source, start=lambda query: begin.pose(query.truth, seed), seed=seed, answers=output.answers,
-                each=lambda query, answer: output.show(query, answer, begin.pose(query.truth, seed)),
+                localizer, source, start=lambda query: begin.pose(query, seed), seed=seed, answers=output.answers,
+                each=lambda query, answer: output.show(query, answer, None if isinstance(answer, Failure) else begin.pose(query, seed)),
                 progress=lambda p: report(p.done, p.total),
             )  # fmt: skip
         except BaseException:  # whatever ended it: Ctrl-C, SIGTERM, a reader that went away, a full disk
@@ -214,7 +221,7 @@ class _Output:
     def __init__(self, stored: Map, out: Path | None, draw: Path | None, json: bool, total: int) -> None:
         self._stored, self._out, self._draw, self._json, self._total = stored, out, draw, json, total
         self._not_drawn = 0
-        self.answers = Answers(stored.info.backend)
+        self.answers = Answers(stored.info.backend, stored.unit)
 
     def show(self, query: Query, answer: Answer | Failure, start: SE3 | None) -> None:
         """Print an answer and draw it."""
@@ -277,15 +284,20 @@ def _show_in_full(answer: Answer, start: SE3 | None) -> None:
     found = answer.found
     show(f"{answer.name}: {_verdict(found)} ({found.reason})")
     if answer.error is not None and answer.truth is not None:
-        show(f"  start error  {'no start' if start is None else _shown(pose_error(start, answer.truth))}")
+        show(
+            f"  start error  {'no start' if start is None else _shown(pose_error(start, answer.truth, found.unit))}"
+        )
         show(f"  final error  {_shown(answer.error)}")
     if found.covariance is not None:
         position, rotation = standard_deviations(found.covariance)
-        show(f"  uncertainty  {position:.4f} m, {math.degrees(rotation):.3f} deg (one standard deviation)")
+        show(
+            f"  uncertainty  {position:.4f} {symbol(found.unit)}, {math.degrees(rotation):.3f} deg (one standard deviation)"
+        )
     show(
         f"  {amount(found.steps, 'step')}, {found.seconds:.2f} s, loss {found.loss:.5f}, method {found.method}"
     )
-    show("  T_world_camera")
+    lengths = "metres" if found.unit == "metres" else "units of the map"
+    show(f"  T_world_camera ({OPENCV_AXES}; lengths in {lengths})")
     for row in found.T_world_camera.matrix().tolist():
         show("    " + " ".join(f"{value: .6f}" for value in row))
 
@@ -304,4 +316,4 @@ def _verdict(found: Localization) -> str:
 
 
 def _shown(error: PoseError) -> str:
-    return f"{float(error.translation):.4f} m, {float(error.rotation_deg):.3f} deg"
+    return f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"

@@ -20,6 +20,7 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.fields.rendering import RenderedImage
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.maps.map import Map, load_map
@@ -77,19 +78,21 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
             status.update(Text(printable(f"rendering {number + 1}/{len(views)}: {view.frame.name}")))
             image = scene.render(view, level)
             write_images(out, view.frame.name, image)
-            scores.append(rendering_scores(image, view.frame))
+            scores.append(rendering_scores(image, view.frame, scene.unit))
             show(f"{view.frame.name}  {scores[-1]}")
     errors = torch.cat([score.depth_errors for score in scores])
     mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors)
     error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
-    show(f"mean of {len(scores)}: PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} m")
+    show(
+        f"mean of {len(scores)}: PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} {symbol(scene.unit)}"
+    )
 
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
     """Write ``NAME.png`` and ``NAME.depth.png``."""
     write_file(out / f"{name}.png", _as_png((image.rgb * 255).round().to(torch.uint8).numpy()))
     if float(image.depth.max()) > DEEPEST:
-        say(f"{name}: depth beyond {DEEPEST} m does not fit a 16-bit image of millimetres and is cut off")
+        say(f"{name}: depth beyond {DEEPEST} units does not fit a 16-bit image of thousandths and is cut off")
     millimetres = (image.depth.clamp(0, DEEPEST) * 1000).round().numpy().astype(np.uint16)
     write_file(out / f"{name}.depth.png", _as_png(millimetres))
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+from bidnerf_core.datasets.queries import Query
 from bidnerf_core.errors import UsageError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.results.pose_files import pose_of
 
 
 @dataclass(frozen=True)
 class StartSpec:
-    """A start as given by the arguments: one of the two, or none."""
+    """A start as given by the arguments: one of the two, or none. ``file`` is the one that ``fixed`` was read from."""
 
-    fixed: SE3 | None = None  # T_world_camera
-    perturb: tuple[float, float] | None = None  # metres, degrees
+    fixed: dict[str, SE3] | None = None  # T_world_camera by the names of the queries; a single one is for all
+    perturb: tuple[float, float] | None = None  # length in the unit of the map, degrees
+    file: Path | None = None
 
     def check(self) -> None:
         """Raise ``UsageError`` for a perturbation out of range."""
@@ -28,8 +32,11 @@ class StartSpec:
     def given(self) -> bool:
         return self.fixed is not None or self.perturb is not None
 
-    def pose(self, truth: SE3 | None, seed: int) -> SE3 | None:
-        """Return T_world_camera to start from. ``seed`` determines the direction in which the true pose is perturbed."""
-        if self.perturb is None or truth is None:
-            return self.fixed
-        return protocols.perturb(truth, *self.perturb, seed)
+    def pose(self, query: Query, seed: int) -> SE3 | None:
+        """Return T_world_camera to start from. ``seed`` determines the direction in which the true pose is perturbed.
+
+        Raises ``InputError`` where a file of several poses has none for this query.
+        """
+        if self.perturb is not None and query.truth is not None:
+            return protocols.perturb(query.truth, *self.perturb, seed)
+        return None if self.fixed is None else pose_of(self.fixed, query.name, self.file or "start")

@@ -186,7 +186,7 @@ def _finish(path: TrackedPath, stored: Map, out: Path | None, plot: Path | None,
             path.save(out)
     finally:
         if plot is not None:
-            path.plot(plot, stored.surface)
+            path.plot(plot, stored.surface, stored.up)
     if seconds is None:
         return
     table = Table(show_header=False, box=None, pad_edge=False)

@@ -9,6 +9,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 
 from bidnerf_core.errors import InputError, refuse_text, spelling_hint
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.units import LengthUnit
 
 ReadingProgress: TypeAlias = Callable[[int, int], None]
 """Called with (frames read, frames requested) after each frame."""
@@ -48,6 +49,21 @@ class Dataset(Protocol):
 
         Raises ``InputError`` for an unknown split or frame, and for a file that is missing or not usable.
         """
+        ...
+
+
+@runtime_checkable
+class Georeferenced(Protocol):
+    """A dataset that knows more of its world than the poses say. Readers may offer it beside ``Dataset``."""
+
+    @property
+    def unit(self) -> LengthUnit | None:
+        """The unit of the poses; None where the format does not say it."""
+        ...
+
+    @property
+    def up(self) -> tuple[float, float, float] | None:
+        """The upward direction in the world, where the capture measured gravity, as phones do; else None."""
         ...
 
 

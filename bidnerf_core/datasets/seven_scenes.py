@@ -40,6 +40,7 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.pose_rows import read_pose_matrix
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.images import Background
 from bidnerf_core.io.rows import read_rows
 
@@ -143,6 +144,8 @@ class SevenScenesReader(Reader):
 
 class SevenScenesDataset(SplitDataset[SceneFrame]):
     """Views of a folder of 7-Scenes; see ``Dataset``."""
+
+    unit: LengthUnit | None = "metres"
 
     def __init__(
         self,

@@ -15,6 +15,7 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.masks import WhollyHidden
 from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.images import Background, background_colour
 
 HOLD_OUT_EVERY = 8
@@ -89,7 +90,13 @@ class Splits(Generic[F]):
 
 
 class SplitDataset(ABC, Generic[F]):
-    """A ``Dataset`` whose frames are described by ``Splits``; subclasses read the image and the pose of a frame."""
+    """A ``Dataset`` whose frames are described by ``Splits``; subclasses read the image and the pose of a frame.
+
+    Subclasses set ``unit`` and ``up`` where their format says them, see ``Georeferenced``.
+    """
+
+    unit: LengthUnit | None = None
+    up: tuple[float, float, float] | None = None
 
     def __init__(self, frames: Splits[F], background: Background | None = None) -> None:
         self._frames = frames

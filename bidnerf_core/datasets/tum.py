@@ -52,6 +52,7 @@ from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.images import Background
 
 COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
@@ -138,6 +139,8 @@ class TumReader(Reader):
 
 class TumDataset(SplitDataset[TumFrame]):
     """Views of a folder of the TUM RGB-D benchmark; see ``Dataset``."""
+
+    unit: LengthUnit | None = "metres"
 
     def __init__(
         self,

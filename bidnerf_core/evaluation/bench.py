@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidnerf_core.datasets import Dataset
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -33,6 +34,8 @@ from bidnerf_core.localization.methods import RENAMED, require_use_of_depth
 from bidnerf_core.progress import Cancel, Progress, ProgressCallback
 from bidnerf_core.scenes.closed_form_data import ClosedFormData
 from bidnerf_core.settings import Range, WholeNumbers, to_flat
+
+log = logging.getLogger("bidnerf")
 
 CHANGED = {
     "views": "images, depth or cameras than {trial.data} has now",
@@ -102,6 +105,11 @@ def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
         raise InputError(f"protocol {plan.protocol!r} has its own frames, expected one image and all frames")
     count = protocol.trials if plan.trials is None else plan.trials
     cases = protocol.cases(len(rigs), count, protocol.seed if plan.seed is None else plan.seed)
+    if plan.trials is not None and len(cases) < plan.trials:
+        log.info(
+            f"{amount(len(cases), 'trial')}, one a frame, in place of {plan.trials}: without a start, trying a frame again"
+            " tells nothing new"
+        )
     return [
         Trial(
             map=plan.map,
@@ -188,7 +196,7 @@ def run_trials(
             file.add(future.result())
             count, right = count + 1, right + succeeded(future.result())
             if progress is not None:
-                text = f"{right} within 5 deg and 0.05 m"
+                text = f"{right} within 5 deg and 0.05"
                 progress(Progress("trials", count, len(todo), "trials", text))
     if failed is not None:
         raise failed

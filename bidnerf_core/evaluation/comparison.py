@@ -21,6 +21,7 @@ from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summari
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import Opened
 from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured
+from bidnerf_core.geometry.units import LengthUnit, symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.maps.description import DESCRIPTION, load_info
@@ -38,7 +39,8 @@ class MapRow:
     backend: str
     weights: str  # identifies the training, see ``Map.training``
     success: dict[str, Success | None]  # by criterion; None where it does not apply
-    translation: float | None  # metres, median of the final errors; None where most are not finite
+    unit: LengthUnit  # of the map
+    translation: float | None  # median of the final errors; None where most are not finite
     rotation_deg: float | None
     steps: float  # median
     seconds: float  # median time of a trial
@@ -130,7 +132,11 @@ def compare_maps(
 def _found(label: str, result: TrialResult) -> str:
     """Return in words what a trial found."""
     error = result.error
-    off = f"{error.translation:.3f} m, {error.rotation_deg:.2f} deg" if error else "not finite"
+    off = (
+        f"{error.translation:.3f} {symbol(result.unit)}, {error.rotation_deg:.2f} deg"
+        if error
+        else "not finite"
+    )
     return f"{result.frame} in {label}: {off}, {amount(result.steps, 'step')}, {result.seconds:.1f} s"
 
 
@@ -143,6 +149,7 @@ def map_row(label: str, size: int, measured: Sequence[Measured]) -> MapRow:
         backend=results[0].backend,
         weights=results[0].weights,
         success=found.criteria,
+        unit=found.unit,
         translation=found.translation,
         rotation_deg=found.rotation_deg,
         steps=found.steps,
@@ -197,7 +204,7 @@ def _known(value: float | None, digits: int) -> str:
 LINES: dict[str, Callable[[MapRow], str]] = {
     "backend": lambda row: row.backend,
     **{f"success {name}": partial(_rate, criterion=name) for name in CRITERIA},
-    "median error, m": lambda row: _known(row.translation, 4),
+    "median error": lambda row: f"{_known(row.translation, 4)} {symbol(row.unit)}",
     "median error, deg": lambda row: _known(row.rotation_deg, 2),
     "steps": lambda row: f"{row.steps:g}",
     "steps to success": lambda row: _known(_usual(row).steps, 0),

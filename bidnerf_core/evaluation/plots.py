@@ -22,17 +22,20 @@ from bidnerf_core.evaluation.comparison import Comparison, MapRow
 from bidnerf_core.evaluation.faults import NO_FAULT, find_fault, parse_faults
 from bidnerf_core.evaluation.groups import Group, Situation, situation_titles, situations
 from bidnerf_core.evaluation.summary import (
-    ABSOLUTE,
     NEVER,
-    Summary,
     applies,
+    frame_of,
     seconds_to_success,
     steps_of,
+    succeeded,
     success_of,
     summarize,
+    unit_of,
     usual_criterion,
 )
-from bidnerf_core.results.errors import CRITERIA, PoseError, success_rate
+from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf_core.geometry.units import symbol
+from bidnerf_core.results.errors import CRITERIA, PoseError, Rate, success_rate_by_frame
 from bidnerf_core.results.overlays import as_array
 from bidnerf_core.results.plot_style import (
     COLOURS,
@@ -134,7 +137,8 @@ class Figures:
 
     def traces(self, kind: str) -> Path:
         """Draw median and quartiles of the error after each step. ``kind`` is "translation" or "rotation_deg"."""
-        unit, bar = {"translation": ("units", 0.05), "rotation_deg": ("degrees", 5.0)}[kind]
+        length = unit_of([result for group in self.groups for result in group.results])
+        unit, bar = {"translation": (length, 0.05), "rotation_deg": ("degrees", 5.0)}[kind]
 
         def draw(panel: Any, groups: list[Group]) -> None:
             for group in groups:
@@ -263,12 +267,12 @@ def _table(group: Group, kind: str) -> Float[np.ndarray, "n s"]:
 
 # Faults.
 
-DRAWN_SHARES: dict[str, tuple[Callable[[Summary], int], str]] = {
-    "right": (lambda s: found.rate.successes if (found := s.criteria[ABSOLUTE]) else 0, COLOURS[2]),
-    "converged": (lambda s: s.converged, COLOURS[0]),
-    "converged, but wrong": (lambda s: s.converged_but_wrong, COLOURS[1]),
+DRAWN_SHARES: dict[str, tuple[Callable[[TrialResult], bool], str]] = {
+    "right": (succeeded, COLOURS[2]),
+    "converged": (lambda result: result.converged, COLOURS[0]),
+    "converged, but wrong": (lambda result: result.converged and not succeeded(result), COLOURS[1]),
 }
-"""The lines of a panel: each a number of trials, and a colour."""
+"""The lines of a panel: which trials each counts, and a colour."""
 
 
 @dataclass(frozen=True)
@@ -326,13 +330,19 @@ def draw_faults(groups: Sequence[Group], folder: Path) -> Path | None:
         return save_figure(figure, folder, "faults")
 
 
+def _rate(group: Group, share: Callable[[TrialResult], bool]) -> Rate:
+    return success_rate_by_frame(
+        [share(result) for result in group.results], [frame_of(result) for result in group.results]
+    )
+
+
 def _draw_curve(panel: Any, curve: FaultCurve, title: str) -> None:
     """Draw one curve. Sizes are evenly spaced, since those of a fault may span orders of magnitude."""
     fault = find_fault(curve.name)
     summaries = [summarize(group.results) for _, group in curve.points]
     places = np.arange(len(curve.points))
-    for turn, (label, (count, colour)) in enumerate(DRAWN_SHARES.items()):
-        rates = [success_rate(count(s), s.trials) for s in summaries]
+    for turn, (label, (share, colour)) in enumerate(DRAWN_SHARES.items()):
+        rates = [_rate(group, share) for _, group in curve.points]
         middle = np.array([rate.rate for rate in rates])
         ends = np.array([[r.low for r in rates], [r.high for r in rates]])
         spread = 100 * np.abs(ends - middle)
@@ -449,9 +459,9 @@ def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
     with styled():
         figure = new_figure(9, 3.6)
         left, right = figure.subplots(1, 2)
-        _draw_errors(
-            left, {name: trace.translation for name, trace in traces.items()}, "translation (m)", 0.05
-        )
+        units = {symbol(trace.unit) for trace in traces.values()}
+        length = f"translation ({units.pop() if len(units) == 1 else 'units'})"
+        _draw_errors(left, {name: trace.translation for name, trace in traces.items()}, length, 0.05)
         _draw_errors(
             right, {name: trace.rotation_deg for name, trace in traces.items()}, "rotation (deg)", 5.0
         )

@@ -187,6 +187,11 @@ def each_in_turn(frames: int, trials: int, seed: int) -> list[Case]:
     return [(order[i % frames], seed + i) for i in range(trials)]
 
 
+def once_each(frames: int, trials: int, seed: int) -> list[Case]:
+    """Return as many frames as there are to be trials, each once, in random order; every trial has its own seed."""
+    return each_in_turn(frames, min(trials, frames), seed)
+
+
 def five_of_each(frames: int, trials: int, seed: int) -> list[Case]:
     """Return five starts for each frame, as iNeRF does."""
     order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
@@ -233,6 +238,10 @@ PROTOCOLS = {
         ((0.2, 10.0),),
         ("metres", "degrees"),
     ),
-    "none": Protocol("no start at all", lambda T_true, size, seed, frames: None),
+    "none": Protocol(
+        "no start at all; one trial a frame",
+        lambda T_true, size, seed, frames: None,
+        plan=once_each,
+    ),
 }
 """All protocols by name."""

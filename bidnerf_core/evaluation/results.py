@@ -15,6 +15,7 @@ from bidnerf_core.evaluation.groups import Condition, Group, Situation, grouped,
 from bidnerf_core.evaluation.json_lines import JsonLinesFile, LineFormat, as_line
 from bidnerf_core.evaluation.summary import Success, Summary, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.results.errors import CRITERIA
@@ -59,7 +60,7 @@ class ResultTable:
         )
 
     def __str__(self) -> str:
-        lines = [["success by", "n", *CRITERIA, "median error"]]
+        lines = [["success by", "n", "frames", *CRITERIA, "median error"]]
         start = None
         for row in self.summary:
             if row.start != start:
@@ -69,8 +70,8 @@ class ResultTable:
             rates = [rate_text(success) for success in known.criteria.values()]
             error = "-"
             if known.translation is not None and known.rotation_deg is not None:
-                error = f"{known.translation:.3f} m {known.rotation_deg:6.2f} deg"
-            lines.append([f"  {row.label}", str(known.trials), *rates, error])
+                error = f"{known.translation:.3f} {symbol(known.unit)} {known.rotation_deg:6.2f} deg"
+            lines.append([f"  {row.label}", str(known.trials), str(known.frames), *rates, error])
         return aligned(lines)
 
     def save(self, path: str | Path) -> None:

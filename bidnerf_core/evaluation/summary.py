@@ -10,7 +10,14 @@ from dataclasses import dataclass
 
 from bidnerf_core.evaluation.groups import Group
 from bidnerf_core.evaluation.trial import TrialResult
-from bidnerf_core.results.errors import CRITERIA, Rate, Reduced, steps_to_success, success_rate
+from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.results.errors import (
+    CRITERIA,
+    Rate,
+    Reduced,
+    steps_to_success,
+    success_rate_by_frame,
+)
 
 NEVER = math.inf
 """Steps to success of a trial that did not succeed."""
@@ -33,16 +40,28 @@ class Summary:
     """Statistics of one group of trials. A median is None where the middle value is unknown."""
 
     trials: int
+    frames: int  # distinct ones; their number, and not that of the trials, limits what the rates tell
+    unit: LengthUnit  # of the errors
     criteria: dict[str, Success | None]  # by name; None where a criterion does not apply
-    translation: float | None  # metres, median of the final errors
+    translation: float | None  # median of the final errors
     rotation_deg: float | None  # median of the final errors
     steps: float  # median
     seconds: float  # median
     milliseconds_per_step: float  # median
     peak_memory_bytes: int  # largest
     converged: int
-    converged_but_wrong: int  # converged, and not within 5 degrees and 0.05 m
+    converged_but_wrong: int  # converged, and not within 5 degrees and 0.05
     right_but_not_converged: int
+
+
+def frame_of(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
+    """Return what identifies the images of a trial: trials of the same images are not independent."""
+    return result.trial.data, result.trial.split, result.trial.frames
+
+
+def unit_of(results: Sequence[TrialResult]) -> LengthUnit:
+    """Return the unit of the errors of some trials: metres if that is known of all of them."""
+    return "metres" if results and all(result.unit == "metres" for result in results) else "units"
 
 
 def applies(criterion: str, results: Sequence[TrialResult]) -> bool:
@@ -69,7 +88,7 @@ def seconds_to_success(results: Sequence[TrialResult], criterion: str) -> list[f
 
 
 def succeeded(result: TrialResult) -> bool:
-    """Return whether the final pose is within 5 degrees and 0.05 m of the true one."""
+    """Return whether the final pose is within 5 degrees and 0.05 (in the unit of the map) of the true one."""
     return result.error is not None and steps_of([result], ABSOLUTE)[0] < NEVER
 
 
@@ -79,6 +98,8 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
     errors = [result.error for result in results]
     return Summary(
         trials=len(results),
+        frames=len({frame_of(result) for result in results}),
+        unit=unit_of(results),
         criteria={name: success_of(results, name) for name in CRITERIA},
         translation=median(e.translation if e else None for e in errors),
         rotation_deg=median(e.rotation_deg if e else None for e in errors),
@@ -98,7 +119,9 @@ def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None
         return None
     reached = [s for s in steps_of(results, criterion) if s < NEVER]
     times = [1000 * seconds for seconds in seconds_to_success(results, criterion)]
-    return Success(success_rate(len(reached), len(results)), median(reached), median(times))
+    met = [s < NEVER for s in steps_of(results, criterion)]
+    rate = success_rate_by_frame(met, [frame_of(result) for result in results])
+    return Success(rate, median(reached), median(times))
 
 
 def median(values: Iterable[float | None]) -> float | None:

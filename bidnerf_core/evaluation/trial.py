@@ -18,6 +18,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import PoseError
 from bidnerf_core.scenes.closed_form_data import is_closed_form
@@ -91,7 +92,8 @@ class Trace:
     def as_error(self) -> PoseError:
         """Return the errors as tensors (n), NaN where a pose was not finite."""
         rows = ([math.nan if x is None else x for x in row] for row in (self.translation, self.rotation_deg))
-        return PoseError(*(torch.tensor(row, dtype=torch.float64) for row in rows))
+        translation, rotation_deg = (torch.tensor(row, dtype=torch.float64) for row in rows)
+        return PoseError(translation, rotation_deg)
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,7 @@ class TrialResult:
     focal_factor: float = 1.0  # ratio of the true to the given focal length, where it was estimated as well
     intrinsics: Intrinsics | None = None  # those used for the pose, where they differ from those given
     confidence: float | None = None  # probability that the pose is right, where a model of it was learned
+    unit: LengthUnit = "units"  # of all lengths: that of the map
     inputs: InputDigests | None = None  # None in results of earlier versions
 
     def __post_init__(self) -> None:

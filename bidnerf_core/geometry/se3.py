@@ -10,11 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
+from kornia.geometry.conversions import (
+    axis_angle_to_rotation_matrix,
+    rotation_matrix_to_axis_angle,
+    rotation_matrix_to_quaternion,
+)
 from torch import Tensor
 
 from bidnerf_core.devices import constant
@@ -22,6 +26,10 @@ from bidnerf_core.errors import InputError
 
 SERIES_BELOW = 1e-2
 """Angles (rad) under which coefficients come from their series: sin and cos cancel there, in value and derivative."""
+
+
+QuaternionOrder = Literal["wxyz", "xyzw"]
+"""The place of a quaternion's scalar part w."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +72,37 @@ class SE3:
         top = torch.cat([self.rotation, self.translation[..., None]], dim=-1)
         bottom = constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 4)
         return torch.cat([top, bottom], dim=-2)
+
+    def quaternion(self, order: QuaternionOrder) -> Float[Tensor, "*b 4"]:
+        """Return the unit quaternion of the rotation, with its scalar part w >= 0.
+
+        ``order`` is ``"xyzw"`` (ROS, TUM, scipy, glTF, Unity) or ``"wxyz"`` (COLMAP, Eigen's constructor, Blender, nerfstudio).
+        Raises ``InputError`` for any other.
+        """
+        if order not in get_args(QuaternionOrder):
+            raise InputError(f"order is {order!r}, expected one of {', '.join(get_args(QuaternionOrder))}")
+        found = torch.nn.functional.normalize(rotation_matrix_to_quaternion(self.rotation), dim=-1)
+        found = torch.where(found[..., :1] < 0, -found, found)
+        return found if order == "wxyz" else found.roll(-1, dims=-1)
+
+    @staticmethod
+    def from_quaternion(
+        quaternion: Float[Tensor, "*b 4"], translation: Float[Tensor, "*b 3"], order: QuaternionOrder
+    ) -> SE3:
+        """Return the transform of a quaternion in ``order``, see ``quaternion``, and a translation.
+
+        Raises ``InputError`` for a quaternion whose length is 0 or not finite.
+        """
+        if order not in get_args(QuaternionOrder):
+            raise InputError(f"order is {order!r}, expected one of {', '.join(get_args(QuaternionOrder))}")
+        length = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
+        if not bool((length.isfinite() & (length > 0)).all()):
+            raise InputError("a quaternion of length 0, or one that is not finite, expected a rotation")
+        unit = (quaternion if order == "wxyz" else quaternion.roll(1, dims=-1)) / length
+        w, v = unit[..., :1, None], unit[..., 1:]
+        cross = skew(v)
+        eye = torch.eye(3, dtype=unit.dtype, device=unit.device)
+        return SE3(eye + 2 * w * cross + 2 * cross @ cross, translation)
 
     def __matmul__(self, other: SE3) -> SE3:
         return SE3(self.rotation @ other.rotation, self.apply(other.translation))

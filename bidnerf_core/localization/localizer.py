@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from numbers import Integral
 from typing import Any
 
@@ -23,7 +24,7 @@ from bidnerf_core.io.json import LARGEST_INTEGER
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
-from bidnerf_core.localization.problem import Problem, SceneMap, on_device, rig
+from bidnerf_core.localization.problem import Problem, SceneMap, on_device, rig, unit_of
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.settings import ByColourConfig
 
@@ -103,6 +104,7 @@ class Localizer:
             raise InputError(
                 f"method {self.method!r} returned a {type(found).__name__}, expected a Localization"
             )
+        found = replace(found, unit=unit_of(self.map))
         return found if self.map.has_distances else direction_only(found)
 
     @property

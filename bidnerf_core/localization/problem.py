@@ -17,6 +17,7 @@ from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, 
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
@@ -54,6 +55,11 @@ class SceneMap(Protocol):
     def has_distances(self) -> bool:
         """Whether the map's images determine distances; images from one place do not."""
         ...
+
+
+def unit_of(scene: SceneMap) -> LengthUnit:
+    """Return the unit of a map's lengths; maps that do not say it, such as fields of others, have a unit of their own."""
+    return getattr(scene, "unit", "units")
 
 
 def on_device(scene: _Map, device: torch.device | str) -> _Map:

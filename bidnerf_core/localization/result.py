@@ -16,7 +16,9 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError, unknown_name
 from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.pose_covariance import CovarianceConvention, covariance_in
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, read_record, to_plain
 
@@ -73,13 +75,23 @@ class Localization:
     method: str
     poses: SE3  # (steps + 1): the start or the winning hypothesis, then the pose after each step
     losses: Float[Tensor, "s"]  # at the start and before each further step
-    # Covariance of a right update at the camera: translation (metres) before rotation (radians). None if unknown.
+    # Covariance of a right update at the camera: translation (``unit``) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
     focal_factor: float = 1.0  # ratio of the estimated to the given focal length; 1 if it was not corrected
     # Probability that the pose is right, from the diagnostics; None where no model of it was learned.
     confidence: float | None = None
     diagnostics: Diagnostics | None = None  # the measures by which the pose was judged
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were taken
+    unit: LengthUnit = "units"  # of the position and its covariance: that of the map
+
+    def covariance_in(self, convention: CovarianceConvention) -> Float[Tensor, "6 6"] | None:
+        """Return the covariance in another convention, see ``CovarianceConvention``; None where it is not known.
+
+        Raises ``InputError`` for an unknown convention.
+        """
+        if self.covariance is None:
+            return None
+        return covariance_in(self.covariance, self.T_world_camera, convention)
 
     @property
     def converged(self) -> bool:
@@ -108,6 +120,7 @@ class Localization:
             "focal_factor": _finite(self.focal_factor),
             "intrinsics": None if self.intrinsics is None else to_plain(self.intrinsics),
             "confidence": _finite(self.confidence),
+            "unit": self.unit,
         }
 
     def save(self, path: str | Path) -> None:
@@ -139,7 +152,7 @@ class Localization:
             T, outcome, saved.reason, saved.steps, saved.seconds, loss, saved.method, SE3.stack([T]),
             torch.tensor([loss], dtype=torch.float64), covariance,
             math.nan if saved.focal_factor is None else saved.focal_factor, saved.confidence, None,
-            saved.intrinsics,
+            saved.intrinsics, saved.unit,
         )  # fmt: skip
 
 
@@ -159,6 +172,7 @@ class _Saved:
     focal_factor: float | None
     intrinsics: Intrinsics | None
     confidence: float | None
+    unit: LengthUnit = "units"
 
 
 def _matrix(rows: list[list[float]], size: int, what: str) -> Float[Tensor, "n n"]:

@@ -13,7 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
-from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.localization.problem import SceneMap, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey
@@ -113,7 +113,10 @@ class Tracker:
             answer, state = self._continued(frame, image, state, state.motion, seconds)
         # Points are followed from the last image, even past frames without one.
         self._state = state = state if image is None else replace(state, image=image)
-        answer = replace(answer, seconds=clocks.perf_counter() - began, focal_factor=1.0, intrinsics=None)
+        answer = replace(
+            answer, seconds=clocks.perf_counter() - began, focal_factor=1.0, intrinsics=None,
+            unit=unit_of(self.localizer.map),
+        )  # fmt: skip
         return answer if state.camera is None else state.camera.stated_in(answer, stated)
 
     def save(self, path: str | Path) -> None:

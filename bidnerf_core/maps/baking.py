@@ -12,6 +12,7 @@ from bidnerf_core.captures.cameras import pose_updates
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.captures.trial import tried_landmarks
+from bidnerf_core.captures.up_direction import UpDirection
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.frames.frame import View
@@ -79,12 +80,13 @@ def bake_surface(
 
 def bake_landmarks(
     info: MapInfo, field: RadianceField, views: Sequence[View], where: str, tracked: TrackedViews | None = None,
-    progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+    progress: ProgressCallback | None = None, cancel: Cancel | None = None, up: UpDirection | None = None,
 ) -> BakedLandmarks:  # fmt: skip
     """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's cameras.
 
     ``tracked`` holds the views' keypoints if they were tracked already. A scene without texture has no landmarks;
-    localization then relies on the surface alone. ``where`` begins what is logged.
+    localization then relies on the surface alone. ``where`` begins what is logged, and ``up`` is the upward direction of the
+    scene where it is known.
     """
     began = time.monotonic()
     source: LandmarkSource = "photos" if views else "rendered images"
@@ -107,7 +109,7 @@ def bake_landmarks(
             f"{where}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(images)} {source},"
             f" {time.monotonic() - began:.1f} s"
         )
-    capture = surveyed(tracked, views, trial=trial) if views else None
+    capture = surveyed(tracked, views, trial=trial, up=up) if views else None
     for line in [] if capture is None else summary(capture):
         log.info(line)
     return BakedLandmarks(landmarks, source, noise, capture)

@@ -12,6 +12,7 @@ from bidnerf_core.captures.cameras import PoseRefinement, StoredCamera, with_wro
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.json import from_plain, read_json
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
@@ -36,6 +37,10 @@ class MapInfo:
     seconds: float = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
+    unit: LengthUnit = "units"  # of all lengths in the map; "units" where nothing says how long one is
+    gravity_up: tuple[float, float, float] | None = (
+        None  # upward direction (world), where the capture measured gravity
+    )
     distances: bool = True  # False if all images are from one place, so that they do not determine distances
     sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
     hidden: int = 0  # number of training pixels that masks hid

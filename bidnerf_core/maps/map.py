@@ -15,10 +15,12 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.captures.cameras import at_stored_poses
 from bidnerf_core.captures.report import CaptureReport
+from bidnerf_core.captures.up_direction import UpDirection, given_up, up_direction
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.fields.rendering import RenderedImage, render_image
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import locked
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.io.tensors import read_tensors
@@ -81,6 +83,24 @@ class Map:
         return self.info.distances
 
     @property
+    def unit(self) -> LengthUnit:
+        """The unit of all lengths: ``"metres"``, or ``"units"`` where nothing says how long one is."""
+        return self.info.unit
+
+    @cached_property
+    def up(self) -> UpDirection | None:
+        """The upward direction in the world, and what it was found from; None for a map without cameras.
+
+        It is that of gravity where the capture measured it, else the one that planes of the surface and the cameras support.
+        """
+        if self.info.gravity_up is not None:
+            return given_up(self.info.gravity_up)
+        if not self.info.cameras:
+            return None
+        normals = None if self.surface is None else self.surface.surfels.normals
+        return up_direction([camera.pose for camera in self.info.cameras], normals)
+
+    @property
     def colour_noise(self) -> float | None:
         """Root mean square error of the field's colours (in [0, 1]) on its own training images."""
         return self.info.colour_noise
@@ -114,7 +134,9 @@ class Map:
 
     def describe(self) -> MapSummary:
         """Return the facts about the map; ``str()`` of them is a description for people."""
-        return summarized(self.info, self.field, self.surface, self.landmarks, self.capture, self.folder)
+        return summarized(
+            self.info, self.field, self.surface, self.landmarks, self.capture, self.folder, self.up
+        )
 
     def render(self, view: View, level: int | None = None) -> RenderedImage:
         """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with camera and pose of ``view``.
@@ -200,7 +222,7 @@ class Map:
             )
             return replace(scene, landmarks=kept)
         check_cancelled(cancel, "baking")
-        found = bake_landmarks(self.info, self.field, views, self._name, tracked, progress, cancel)
+        found = bake_landmarks(self.info, self.field, views, self._name, tracked, progress, cancel, scene.up)
         return scene._with_landmarks(found)
 
     def _photo_landmarks(self) -> LandmarkMap | None:

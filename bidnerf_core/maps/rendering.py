@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.fields.rendering import RenderedImage
 from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.units import LengthUnit, symbol
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,24 +19,28 @@ class RenderingScores:
     """The quality of a rendered image, by comparison with the photo from the same pose."""
 
     psnr: float  # dB
-    depth_errors: Float[Tensor, "n"]  # metres: absolute errors of planar z, at the pixels with measured depth
+    depth_errors: Float[Tensor, "n"]  # absolute errors of planar z, at the pixels with measured depth
+    unit: LengthUnit = "units"  # of the depth
 
     @property
     def depth_error(self) -> float | None:
-        """The median absolute depth error (metres); None without measured depth."""
+        """The median absolute depth error; None without measured depth."""
         return float(self.depth_errors.median()) if len(self.depth_errors) else None
 
     def __str__(self) -> str:
         error = "-" if self.depth_error is None else f"{self.depth_error:.4f}"
-        return f"PSNR {self.psnr:.2f} dB  depth error {error} m"
+        return f"PSNR {self.psnr:.2f} dB  depth error {error} {symbol(self.unit)}"
 
 
-def rendering_scores(image: RenderedImage, frame: Frame) -> RenderingScores:
-    """Compare a rendered image with the colours and the measured depth of the frame from the same pose, where it is not hidden."""
+def rendering_scores(image: RenderedImage, frame: Frame, unit: LengthUnit = "units") -> RenderingScores:
+    """Compare a rendered image with the colours and the measured depth of the frame from the same pose, where it is not hidden.
+
+    ``unit`` is that of the map, which serves to print the depth error.
+    """
     errors = torch.zeros(0)
     if frame.depth is not None and frame.has_depth:
         errors = (image.depth - frame.depth).abs()[frame.depth > 0]
     shown, seen = image.rgb, frame.rgb
     if frame.hidden is not None:
         shown, seen = shown[~frame.hidden], seen[~frame.hidden]
-    return RenderingScores(float(psnr(shown, seen, 1.0)), errors)
+    return RenderingScores(float(psnr(shown, seen, 1.0)), errors, unit)

@@ -11,8 +11,10 @@ from torch import nn
 from bidnerf_core.captures.advice import sentences
 from bidnerf_core.captures.cameras import MovedCamera, PoseRefinement, moved_cameras, pose_sentences
 from bidnerf_core.captures.report import CaptureReport
+from bidnerf_core.captures.up_direction import UpDirection
 from bidnerf_core.errors import amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
 from bidnerf_core.maps.description import MapInfo
@@ -36,6 +38,8 @@ class MapSummary:
     backend: str
     data: str  # name of the dataset's folder
     cameras: int
+    unit: LengthUnit  # of all lengths
+    up: UpDirection | None  # the upward direction in the world, and what it was found from
     distances: bool  # whether the training images determine distances
     poses: PoseRefinement | None  # the consistency of the given poses, where it is known
     step: int
@@ -80,6 +84,7 @@ class MapSummary:
             "distances": "known"
             if self.distances
             else "not known, since all images were taken from one place",
+            "frame": self._frame_line(),
             "surface": self._surface_line(),
             "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
             "settings": _shown(self.config),
@@ -91,6 +96,18 @@ class MapSummary:
             error = f", off by {self.colour_noise:.1%} of the range of colours on its training images (RMS)"
         return f"{amount(self.parameters, 'parameter')} in {amount(self.levels, 'level')}{error}"
 
+    def _frame_line(self) -> str:
+        """Return the unit and the upward direction, in words."""
+        unit = "metres" if self.unit == "metres" else "units of unknown length ('bidnerf scale' gives metres)"
+        if self.up is None:
+            return f"lengths in {unit}"
+        source = {"gravity": "gravity", "planes": "planes and cameras", "cameras": "the cameras"}[
+            self.up.source
+        ]
+        return (
+            f"lengths in {unit}; up is {_shown(tuple(round(x, 4) for x in self.up.direction))}, by {source}"
+        )
+
     def _surface_line(self) -> str:
         if self.surface is None:
             return "none; 'bidnerf bake MAP' makes one"
@@ -100,7 +117,7 @@ class MapSummary:
 
 def summarized(
     info: MapInfo, field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None,
-    capture: CaptureReport | None, folder: Path | None,
+    capture: CaptureReport | None, folder: Path | None, up: UpDirection | None = None,
 ) -> MapSummary:  # fmt: skip
     """Return the summary of a map from its parts."""
     size, files = None, None
@@ -115,6 +132,8 @@ def summarized(
         backend=info.backend,
         data=info.data,
         cameras=len(info.cameras),
+        unit=info.unit,
+        up=up,
         distances=info.distances,
         poses=refinement,
         step=info.step,

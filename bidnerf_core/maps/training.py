@@ -128,7 +128,7 @@ def train(
             backend, to_plain(settings, "config"), bounds, 0, False, read.source, cameras=taken.cameras,
             pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=read.sparse_depth,
             hidden=read.hidden,
-            landmark_features=features,
+            landmark_features=features, unit=read.unit, gravity_up=read.gravity_up,
         )  # fmt: skip
         return _trained(chosen, info, taken.views, taken.tracked, work)
 

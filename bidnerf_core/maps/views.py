@@ -10,11 +10,12 @@ from typing import TypeAlias
 
 from bidnerf_core.datasets import Background, Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.datasets.dataset import ReadingProgress
+from bidnerf_core.datasets.dataset import Georeferenced, ReadingProgress
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import BLACK, Frame, View
 from bidnerf_core.frames.masks import INVERTED, WhollyHidden, masks_sentence
 from bidnerf_core.frames.pixel_store import PixelStore, bytes_of
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.memory import available_memory
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
@@ -34,6 +35,10 @@ class ReadViews:
     place: str  # path of the dataset, or words for views from memory
     background: tuple[float, float, float]  # behind images with an alpha channel
     hidden: int = 0  # pixels that masks hide
+    unit: LengthUnit = "units"  # of the poses
+    gravity_up: tuple[float, float, float] | None = (
+        None  # upward direction (world), where the capture measured gravity
+    )
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
 
 
@@ -57,6 +62,8 @@ def read_views(
     that of the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``. Raises ``InputError`` where there
     are no views, and where they or the model are not usable.
     """
+    stated: LengthUnit | None = None
+    up: tuple[float, float, float] | None = None
     if isinstance(data, str | Path):
         data = open_dataset(data, background)
         background = None
@@ -71,14 +78,17 @@ def read_views(
         if not views:
             raise InputError(f"{data.path}: masks hide all of every image in split {split!r}; {INVERTED}")
         source, place, colour = data.path.resolve().name, str(data.path), data.background
+        if isinstance(data, Georeferenced):
+            stated, up = data.unit, data.up
     else:
         views, source, place = _checked(data), "", "views in memory"
         colour = BLACK if background is None else background_colour(background)
     hidden = _hidden(views, place)
+    unit = stated or _unit_of(views)
     if depth_points is None:
-        return ReadViews(views, source, place, colour, hidden)
+        return ReadViews(views, source, place, colour, hidden, unit, up)
     views, count = _with_depth(views, Path(depth_points), point_choice or SparseChoice(), split)
-    return ReadViews(views, source, place, colour, hidden, count)
+    return ReadViews(views, source, place, colour, hidden, unit, up, count)
 
 
 def _hidden(views: Sequence[View], place: str) -> int:
@@ -149,6 +159,11 @@ def _say_size(place: str, frame: Frame, small: Frame, count: int) -> None:
     log.info(
         f"{place}: {amount(count, 'image')} of {before} read at {after}, {size:.0f} MB; --largest (largest=) sets another size"
     )
+
+
+def _unit_of(views: Sequence[View]) -> LengthUnit:
+    """Return metres for views with dense measured depth: training refuses poses that contradict it."""
+    return "metres" if any(view.frame.has_dense_depth for view in views) else "units"
 
 
 def _checked(views: Sequence[View]) -> list[View]:

@@ -15,9 +15,11 @@ from bidnerf_core.depth.noise import noise_remark
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization, Localizer, Outcome
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, LandmarkThresholds
+from bidnerf_core.localization.problem import unit_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.results.pose_files import PosedImage, pose_format, write_poses
@@ -62,7 +64,8 @@ class Answer:
     @property
     def error(self) -> PoseError | None:
         """The error of the pose found, or None where the true pose is not known."""
-        return None if self.truth is None else pose_error(self.found.T_world_camera, self.truth)
+        found = self.found
+        return None if self.truth is None else pose_error(found.T_world_camera, self.truth, found.unit)
 
     @property
     def posed(self) -> PosedImage:
@@ -76,6 +79,7 @@ class Answer:
             self.file,
             self.time,
             found.covariance,
+            found.unit,
         )
 
     def plain(self, backend: str) -> dict[str, Any]:
@@ -91,20 +95,20 @@ class Failure:
     method: str
     reason: str
 
-    def plain(self, backend: str) -> dict[str, Any]:
+    def plain(self, backend: str, unit: LengthUnit = "units") -> dict[str, Any]:
         """Return an object with the keys of ``Answer.plain``, whose outcome is "bad input"."""
         return {
             "frame": self.name, "T_world_camera": None, "converged": False, "outcome": "bad input",
             "reason": self.reason, "steps": 0, "seconds": 0.0, "covariance": None, "loss": None, "method": self.method,
-            "focal_factor": 1.0, "intrinsics": None, "confidence": None, "backend": backend, "error": None,
+            "focal_factor": 1.0, "intrinsics": None, "confidence": None, "unit": unit, "backend": backend, "error": None,
         }  # fmt: skip
 
 
 class Answers:
     """The answers to the images of a run, in their order, for a map of a ``backend``."""
 
-    def __init__(self, backend: str) -> None:
-        self.backend = backend
+    def __init__(self, backend: str, unit: LengthUnit = "units") -> None:
+        self.backend, self.unit = backend, unit
         self.given: list[Answer | Failure] = []
 
     def __len__(self) -> int:
@@ -116,7 +120,11 @@ class Answers:
 
     def plain(self, answer: Answer | Failure) -> dict[str, Any]:
         """Return an answer as JSON values; numbers and matrices that are not finite are None."""
-        return answer.plain(self.backend)
+        return (
+            answer.plain(self.backend, self.unit)
+            if isinstance(answer, Failure)
+            else answer.plain(self.backend)
+        )
 
     @property
     def accepted(self) -> list[Answer]:
@@ -193,7 +201,9 @@ def localize_each(
     the query; for a failure the query has a name only. Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
     """
     answers = (
-        Answers(getattr(getattr(localizer.map, "info", None), "backend", "")) if answers is None else answers
+        Answers(getattr(getattr(localizer.map, "info", None), "backend", ""), unit_of(localizer.map))
+        if answers is None
+        else answers
     )
     total = len(queries.names)
     count = counter("localizing", "images", progress, cancel)

@@ -14,6 +14,7 @@ from torch import Tensor
 from bidnerf_core.captures.coverage import horizontal_axes
 from bidnerf_core.captures.report import CaptureReport, Gap, PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.results.plot_style import COLOURS, new_figure, styled, write_figure
 
 LOOKS: dict[PhotoProblem, tuple[str, str]] = {
@@ -32,11 +33,12 @@ MOST_LABELS = 16
 
 
 def draw_capture(
-    report: CaptureReport, points: Float[Tensor, "n 3"] | None, seen_by: Int[Tensor, "n"] | None, out: Path
-) -> None:
+    report: CaptureReport, points: Float[Tensor, "n 3"] | None, seen_by: Int[Tensor, "n"] | None, out: Path,
+    unit: LengthUnit = "units",
+) -> None:  # fmt: skip
     """Draw a capture to ``out``, a PNG.
 
-    ``points`` (metres, world) are its landmarks, ``seen_by`` the number of photos that show each.
+    ``points`` (world, in ``unit``) are its landmarks, ``seen_by`` the number of photos that show each.
 
     Raises ``InputError`` where matplotlib is not installed, or the file cannot be written.
     """
@@ -44,7 +46,7 @@ def draw_capture(
         figure = new_figure(7.6, 7.0)
         panel = figure.add_subplot()
         cameras = _from_above([photo.position for photo in report.photos], report)
-        _frame(panel, cameras, report)
+        _frame(panel, cameras, report, unit)
         if points is not None and seen_by is not None and len(points):
             _draw_landmarks(figure, panel, _from_above(points.double().tolist(), report), seen_by)
         for gap in (*report.coverage.gaps, *filter(None, [report.coverage.open_side])):
@@ -67,7 +69,7 @@ def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
     return torch.stack([away @ first, away @ second], dim=-1).numpy()
 
 
-def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
+def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport, unit: LengthUnit) -> None:
     """Set the part of the plane that is shown: the cameras, the centre if they look at it, and a margin."""
     shown = cameras
     if report.coverage.arrangement in ("around", "one side"):
@@ -78,7 +80,7 @@ def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport)
     panel.set_xlim(middle[0] - reach, middle[0] + reach)
     panel.set_ylim(middle[1] - reach, middle[1] + reach)
     panel.set_aspect("equal")
-    panel.set_xlabel("metres or units of the map")
+    panel.set_xlabel(f"{unit}, from the centre of the capture")
 
 
 def _draw_landmarks(

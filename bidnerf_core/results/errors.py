@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -13,17 +15,19 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.robust import chi_squared_quantile
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit, symbol
 
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
     """The translation and rotation error of one pose, or of a batch: of all steps of a run, for example."""
 
-    translation: Float[Tensor, "*b"]  # metres between the camera centres
+    translation: Float[Tensor, "*b"]  # between the camera centres, in ``unit``
     rotation_deg: Float[Tensor, "*b"]  # geodesic angle, degrees, 0 to 180
+    unit: LengthUnit = "units"  # of the poses
 
     def __getitem__(self, index: Any) -> PoseError:
-        return PoseError(self.translation[index], self.rotation_deg[index])
+        return replace(self, translation=self.translation[index], rotation_deg=self.rotation_deg[index])
 
     def __str__(self) -> str:
         shown = (
@@ -31,7 +35,7 @@ class PoseError:
             for v in (self.translation, self.rotation_deg)
         )
         return " and ".join(
-            f"{note}{v:.3g} {unit}" for (v, note), unit in zip(shown, ("m", "deg"), strict=True)
+            f"{note}{v:.3g} {unit}" for (v, note), unit in zip(shown, (symbol(self.unit), "deg"), strict=True)
         )
 
     def plain(self) -> dict[str, float] | None:
@@ -40,11 +44,14 @@ class PoseError:
         return values if all(map(math.isfinite, values.values())) else None
 
 
-def pose_error(found: SE3, true: SE3) -> PoseError:
-    """Return the error of ``found`` in float64; batches broadcast. It is not finite where a pose is not."""
+def pose_error(found: SE3, true: SE3, unit: LengthUnit = "units") -> PoseError:
+    """Return the error of ``found`` in float64; batches broadcast. It is not finite where a pose is not.
+
+    ``unit`` is that of the poses, which serves to print the error.
+    """
     found, true = found.to(dtype=torch.float64), true.to(dtype=torch.float64)
     distance = torch.linalg.vector_norm(found.translation - true.translation, dim=-1)
-    return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ found.rotation)))
+    return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ found.rotation)), unit)
 
 
 def normalized_error_squared(
@@ -139,12 +146,13 @@ def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
 
 @dataclass(frozen=True)
 class Rate:
-    """A share of successes and the ends of its Wilson interval."""
+    """A share of successes and the ends of its Wilson interval, which counts repeated trials of a frame as what they are."""
 
     successes: int
     trials: int
     low: float
     high: float
+    frames: int | None = None  # number of distinct frames, where some were tried several times
 
     @property
     def rate(self) -> float:
@@ -152,14 +160,54 @@ class Rate:
 
     def __str__(self) -> str:
         count = f"{self.successes} of {self.trials}"
-        return f"{self.rate:.1%} ({count}; {self.low:.1%} to {self.high:.1%})"
+        on = "" if self.frames is None else f" on {self.frames} frame{'' if self.frames == 1 else 's'}"
+        return f"{self.rate:.1%} ({count}{on}; {self.low:.1%} to {self.high:.1%})"
 
 
 def success_rate(successes: int, trials: int, confidence: float = 0.95) -> Rate:
-    """Return the share of successes with Wilson's interval (Wilson 1927)."""
+    """Return the share of successes of independent trials with Wilson's interval (Wilson 1927)."""
     if not (trials >= 1 and 0 <= successes <= trials):
         raise InputError(f"success rate: {successes} of {trials}, expected 0 to n of at least one trial")
-    from scipy.stats import binomtest  # here, because its import takes longer than any help page should
+    low, high = wilson_interval(successes / trials, trials, confidence)
+    return Rate(successes, trials, low, high)
 
-    interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
-    return Rate(successes, trials, float(interval.low), float(interval.high))
+
+def success_rate_by_frame(
+    outcomes: Sequence[bool], frames: Sequence[Hashable], confidence: float = 0.95
+) -> Rate:
+    """Return the share of successes of trials some of which are of the same frame, with an interval that allows for it.
+
+    Trials of one frame share its difficulty. Wilson's interval is that of the effective number of trials: the number of
+    independent ones whose share would vary as much as this share does from frame to frame (Korn and Graubard 1998, "Confidence
+    intervals for proportions with small expected number of positive counts estimated from survey data"; Dean and Pagano 2015).
+    Where all trials end alike nothing shows how alike those of one frame are, and each frame counts once.
+    """
+    trials, successes = len(outcomes), sum(map(bool, outcomes))
+    grouped: dict[Hashable, list[bool]] = {}
+    for outcome, frame in zip(outcomes, frames, strict=True):
+        grouped.setdefault(frame, []).append(bool(outcome))
+    count = len(grouped)
+    if count in (0, trials):
+        return success_rate(successes, trials, confidence)
+    share = successes / trials
+    effective = float(count)
+    if count > 1 and 0 < successes < trials:
+        from scipy.stats import t  # here, because its import takes longer than any help page should
+
+        squares = sum((sum(own) - share * len(own)) ** 2 for own in grouped.values())
+        variance = count / (count - 1) * squares / trials**2
+        quantiles = [float(t.ppf(0.5 + confidence / 2, n - 1)) for n in (trials, count)]
+        correction = (quantiles[0] / quantiles[1]) ** 2
+        found = correction * share * (1 - share) / variance if variance > 0 else math.inf
+        effective = min(max(found, 1.0), float(trials))
+    low, high = wilson_interval(share, effective, confidence)
+    return Rate(successes, trials, low, high, count)
+
+
+def wilson_interval(share: float, trials: float, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the ends of Wilson's interval of a share of ``trials``, which need not be a whole number."""
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    middle = (share + z * z / (2 * trials)) / (1 + z * z / trials)
+    half = z / (1 + z * z / trials) * math.sqrt(share * (1 - share) / trials + (z / (2 * trials)) ** 2)
+    low, high = min(middle - half, share), max(middle + half, share)  # up to rounding
+    return max(low, 0.0), min(high, 1.0)

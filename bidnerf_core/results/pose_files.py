@@ -1,4 +1,7 @@
-"""Files of estimated poses: TUM trajectories, JSON with covariances, and ``transforms.json`` for nerfstudio."""
+"""Files of estimated poses: TUM trajectories, JSON with covariances, and ``transforms.json`` for nerfstudio.
+
+``colmap_poses`` writes COLMAP models.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +15,21 @@ from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Float
-from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
 from bidnerf_core.camera.exif import read_exif
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.datasets.writing import OPENCV_TO_OPENGL, camera_entry
-from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.errors import InputError, UsageError, printable, spelling_hint
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import read_file, write_file
 from bidnerf_core.io.json import parse_json
 from bidnerf_core.registry import Plugins, interface_defects
 
-TUM_HEAD = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes)\n"
+TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+OPENCV_AXES = "camera axes x right, y down, z forward (OpenCV)"
 EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -40,24 +44,35 @@ class PosedImage:
     T_world_camera: SE3  # OpenCV axes
     file: Path | None = None
     time: float | None = None  # seconds
-    covariance: Float[Tensor, "6 6"] | None = (
-        None  # of the tangent at the camera (translation in metres, rotation in rad)
-    )
+    # Of the tangent at the camera (translation in ``unit``, rotation in rad).
+    covariance: Float[Tensor, "6 6"] | None = None
+    unit: LengthUnit = "units"  # of the position
+
+
+def frame_of(images: Sequence[PosedImage]) -> str:
+    """Return what the head of a file says about its poses: which way they go, the axes, and the unit of lengths."""
+    units = {image.unit for image in images}
+    lengths = "metres" if units == {"metres"} else "units of the map (not metres, as far as is known)"
+    return f"camera to world, {OPENCV_AXES}, lengths in {lengths}"
 
 
 def tum_trajectory(images: Sequence[PosedImage]) -> str:
-    """Return rows ``timestamp tx ty tz qx qy qz qw`` (metres, unit quaternions with the scalar last).
+    """Return rows ``timestamp tx ty tz qx qy qz qw`` (unit quaternions with the scalar last).
 
     The timestamp is the image's time if all have one, else its name if all names are numbers, as in the TUM RGB-D datasets,
-    else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
+    else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats). Where it is a number, a comment
+    before the row names the image, since other programs skip comments.
     """
-    _require_finite(images)
-    stamps = _timestamps(images)
-    rows = (_tum_row(stamp, image.T_world_camera) for stamp, image in zip(stamps, images, strict=True))
-    return TUM_HEAD + "".join(rows)
+    require_finite(images)
+    stamps, named = _timestamps(images)
+    rows = (
+        f"{'# ' + printable(_label(image)) + chr(10) if named else ''}{_tum_row(stamp, image.T_world_camera)}"
+        for stamp, image in zip(stamps, images, strict=True)
+    )
+    return f"# {TUM_COLUMNS} ({frame_of(images)})\n" + "".join(rows)
 
 
-def _require_finite(images: Sequence[PosedImage]) -> None:
+def require_finite(images: Sequence[PosedImage]) -> None:
     for image in images:
         if not bool(image.T_world_camera.matrix().isfinite().all()):
             raise InputError(
@@ -65,25 +80,24 @@ def _require_finite(images: Sequence[PosedImage]) -> None:
             )
 
 
-def _timestamps(images: Sequence[PosedImage]) -> list[str]:
+def _timestamps(images: Sequence[PosedImage]) -> tuple[list[str], bool]:
+    """Return the time stamps of a TUM file, and whether images are to be named beside them."""
     times = [image.time for image in images if image.time is not None]
     if len(times) == len(images):
-        return [f"{time:.6f}" for time in times]
-    named = all(NUMBER.fullmatch(image.name) for image in images)
-    return [image.name if named else str(image.number) for image in images]
+        return [f"{time:.6f}" for time in times], False
+    if all(NUMBER.fullmatch(image.name) for image in images):
+        return [image.name for image in images], False
+    return [str(image.number) for image in images], True
+
+
+def _label(image: PosedImage) -> str:
+    return image.name if image.file is None else image.file.name
 
 
 def _tum_row(timestamp: str, T_world_camera: SE3) -> str:
     pose = T_world_camera.to("cpu", torch.float64)
-    w, x, y, z = quaternion_of(pose.rotation).tolist()
-    numbers = (*pose.translation.tolist(), x, y, z, w)
+    numbers = (*pose.translation.tolist(), *pose.quaternion("xyzw").tolist())
     return " ".join((timestamp, *(f"{number:.12g}" for number in numbers))) + "\n"
-
-
-def quaternion_of(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """Return the unit quaternion (w, x, y, z) of a rotation with w >= 0."""
-    quaternion = torch.nn.functional.normalize(rotation_matrix_to_quaternion(rotation), dim=-1)
-    return -quaternion if float(quaternion[0]) < 0 else quaternion
 
 
 def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
@@ -92,14 +106,16 @@ def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
     It describes the image files as they are stored, so the poses and cameras of photos with an EXIF orientation are rotated.
     Raises ``InputError`` for a photo that is stored mirrored, for which no rigid pose exists.
     """
-    _require_finite(images)
+    require_finite(images)
     frames = [_transforms_entry(image, folder) for image in images]
-    return json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1, allow_nan=False) + "\n"
+    unit = "metres" if images and all(image.unit == "metres" for image in images) else "units"
+    content = {"camera_model": "OPENCV", "unit": unit, "frames": frames}
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
 def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
     orientation = UPRIGHT if image.file is None else read_exif(image.file).orientation
-    intrinsics, pose = _as_stored(image, orientation)
+    intrinsics, pose = as_stored(image, orientation)
     matrix = pose.matrix()
     place = image.name if image.file is None else os.path.relpath(image.file.resolve(), folder.resolve())
     return {
@@ -111,9 +127,9 @@ def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
 
 
 def poses_json(images: Sequence[PosedImage]) -> str:
-    """Return a JSON list of ``{"frame", "time", "T_world_camera", "covariance"}``, one per line; poses have OpenCV axes.
+    """Return a JSON list of ``{"frame", "time", "T_world_camera", "covariance", "unit"}``, one per line; poses have OpenCV axes.
 
-    ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in metres, then rotation in rad, at the camera) are
+    ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in ``unit``, then rotation in rad, at the camera) are
     null where they are not known, and every matrix is null where it is not finite.
     """
     objects = [
@@ -122,6 +138,7 @@ def poses_json(images: Sequence[PosedImage]) -> str:
             "time": image.time,
             "T_world_camera": _rows(image.T_world_camera.matrix()),
             "covariance": None if image.covariance is None else _rows(image.covariance),
+            "unit": image.unit,
         }
         for image in images
     ]
@@ -132,7 +149,7 @@ def _rows(matrix: Float[Tensor, "r c"]) -> list[list[float]] | None:
     return matrix.double().cpu().tolist() if bool(matrix.isfinite().all()) else None
 
 
-def _as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, SE3]:
+def as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, SE3]:
     """Return the camera and the pose (float64) of the image as its file stores it."""
     pose = image.T_world_camera.to("cpu", torch.float64)
     if orientation == UPRIGHT:
@@ -172,7 +189,9 @@ PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
 """A function that writes poses to a file, whole or not at all."""
 
 POSE_WRITERS: Plugins[PoseWriter] = Plugins(
-    "writers", _defects, first=("transforms.json", ".json", ".txt", ".tum", ".kitti.txt", ".euroc.csv")
+    "writers",
+    _defects,
+    first=("transforms.json", "images.txt", ".json", ".txt", ".tum", ".kitti.txt", ".euroc.csv"),
 )
 """Writers by the ending of the file's name; where several match, the longest ending is used."""
 
@@ -210,26 +229,63 @@ def read_pose(path: str | Path) -> SE3:
     A list of one such object is accepted as well. Raises ``InputError`` where the file does not hold the rows of a rigid
     transform.
     """
+    found = read_poses(path)
+    if len(found) != 1:
+        raise InputError(f"{path}: holds {len(found)} poses, expected one")
+    return next(iter(found.values()))
+
+
+def read_poses(path: str | Path) -> dict[str, SE3]:
+    """Read poses T_world_camera by the names of their frames, as ``localize`` writes them with ``--out`` or prints with ``--json``.
+
+    That is one object, a list of objects, or one object a line; objects whose pose is null are left out. A single pose may be
+    without a name, which then is empty. Raises ``InputError`` where a matrix is not a rigid transform, or a name occurs twice.
+    """
     path = Path(path)
-    content = read_file(path, "a pose file")
+    entries = _entries(path, read_file(path, "a pose file"))
+    found = dict[str, SE3]()
+    for entry in entries:
+        rows = entry.get("T_world_camera") if isinstance(entry, dict) else entry
+        name = entry.get("frame", "") if isinstance(entry, dict) else ""
+        if rows is None and len(entries) > 1:
+            continue
+        if not isinstance(name, str) or (not name and len(entries) > 1):
+            raise InputError(
+                f'{path}: holds {len(entries)} poses, expected one, or a name under "frame" for each'
+            )
+        if name in found:
+            raise InputError(f"{path}: holds two poses of frame {name!r}, expected one")
+        try:
+            matrix = torch.tensor(rows, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise InputError(f"{path}: no matrix of numbers in it, expected {EXPECTED_POSE}") from error
+        found[name] = pose_from_matrix(matrix, f"{path}: T_world_camera")
+    if not found:
+        raise InputError(f"{path}: holds no pose that is not null, expected {EXPECTED_POSE}")
+    return found
+
+
+def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
+    """Return the pose of an image among those of a file; a single one serves every image.
+
+    Raises ``InputError`` where the file has several poses and none under that name.
+    """
+    if len(poses) == 1:
+        return next(iter(poses.values()))
+    if name not in poses:
+        raise InputError(f"{path}: no pose of {name!r} among its {len(poses)}{spelling_hint(name, poses)}")
+    return poses[name]
+
+
+def _entries(path: Path, content: bytes) -> list[Any]:
+    """Return the objects of a file of poses, or its matrix."""
     try:
         found = parse_json(content, str(path), EXPECTED_POSE)
-    except InputError as error:
+    except InputError:
         lines = [line for line in content.splitlines() if line.strip()]
-        if len(lines) > 1 and all(line.startswith(b"{") for line in lines):  # as ``--json`` prints several
-            raise _not_one(path, len(lines)) from error
-        raise
-    if isinstance(found, list) and all(isinstance(entry, dict) for entry in found):
-        if len(found) != 1:  # as ``--out`` writes several
-            raise _not_one(path, len(found))
-        (found,) = found
-    rows = found.get("T_world_camera") if isinstance(found, dict) else found
-    try:
-        matrix = torch.tensor(rows, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{path}: no matrix of numbers in it, expected {EXPECTED_POSE}") from error
-    return pose_from_matrix(matrix, f"{path}: T_world_camera")
-
-
-def _not_one(path: Path, count: int) -> InputError:
-    return InputError(f"{path}: holds {count} poses, expected one")
+        if len(lines) < 2 or not all(line.startswith(b"{") for line in lines):
+            raise
+        return [parse_json(line, f"{path}: line {n}", EXPECTED_POSE) for n, line in enumerate(lines, 1)]
+    if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
+        return found
+    return [found]

@@ -15,10 +15,12 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.captures.cameras import as_given
+from bidnerf_core.captures.up_direction import UpDirection
 from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, open_sequence
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import symbol
 from bidnerf_core.localization import Localization, Localizer, SceneMap, Tracker, TrackerConfig
 from bidnerf_core.localization.localizer import Start
 from bidnerf_core.mapping import SurfaceMap
@@ -110,7 +112,7 @@ class TrackedPath(Answers):
 
     def __init__(self, info: MapInfo | None = None) -> None:
         """Begin the path in a map that ``info`` describes."""
-        super().__init__("" if info is None else info.backend)
+        super().__init__("" if info is None else info.backend, "units" if info is None else info.unit)
         self.unread = 0  # frames whose files could not be read
         cameras = () if info is None else as_given(info.cameras)
         self._trained_on = {camera.name: camera.pose for camera in cameras}
@@ -186,8 +188,12 @@ class TrackedPath(Answers):
         """Return the number of frames that are images of the map's training, by their names and true poses."""
         return sum(map(self._is_of_training, self.answers))
 
-    def plot(self, file: str | Path, surface: SurfaceMap | None = None) -> None:
+    def plot(
+        self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None
+    ) -> None:
         """Draw the path over the surface of its map, as PNG or SVG by the ending of the file's name.
+
+        ``up`` is the upward direction of the scene (``Map.up``), by default the one that the surface and the cameras give.
 
         Raises ``InputError`` without matplotlib or without any finite pose.
         """
@@ -199,8 +205,9 @@ class TrackedPath(Answers):
             torch.tensor([answer.accepted for answer in drawn]),
             torch.tensor([_deviation(a.found.covariance) for a in drawn], dtype=torch.float64),
             [answer.truth for answer in drawn],
+            self.unit,
         )
-        plot_path(path, surface, Path(file))
+        plot_path(path, surface, Path(file), up)
 
     def summary(self, seconds: float) -> list[tuple[str, str]]:
         """Return the rows of a table that describes a run that took ``seconds``: frames, losses, errors."""
@@ -215,12 +222,13 @@ class TrackedPath(Answers):
                 f"{amount(len(lost), 'time')}, at most for {amount(longest, 'frame')}" if lost else "never",
             ),
         ]
+        unit = symbol(self.unit)
         if (errors := self.errors()) is not None:
-            rows.append(("raw error", _written(errors.raw)))
+            rows.append(("raw error", _written(errors.raw, unit)))
             if errors.ate is not None:
-                rows.append(("ATE", f"{errors.ate:.4f} m (root mean square, rigidly aligned)"))
+                rows.append(("ATE", f"{errors.ate:.4f} {unit} (root mean square, rigidly aligned)"))
             if errors.rpe is not None:
-                rows.append(("RPE per frame", _written(errors.rpe)))
+                rows.append(("RPE per frame", _written(errors.rpe, unit)))
         if (share := self.consistency()) is not None:
             rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
         if seen := self.trained_on():
@@ -235,10 +243,10 @@ class TrackedPath(Answers):
         return torch.allclose(given.matrix(), answer.truth.matrix(), rtol=0, atol=SAME_POSE)
 
 
-def _written(summary: ErrorSummary) -> str:
+def _written(summary: ErrorSummary, unit: str) -> str:
     return (
-        f"median {summary.translation_median:.4f} m, {summary.rotation_deg_median:.3f} deg;"
-        f" 95 % within {summary.translation_p95:.4f} m, {summary.rotation_deg_p95:.3f} deg"
+        f"median {summary.translation_median:.4f} {unit}, {summary.rotation_deg_median:.3f} deg;"
+        f" 95 % within {summary.translation_p95:.4f} {unit}, {summary.rotation_deg_p95:.3f} deg"
     )
 
 

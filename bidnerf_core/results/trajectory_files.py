@@ -9,8 +9,9 @@ from pathlib import Path
 import torch
 
 from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
-from bidnerf_core.results.pose_files import PosedImage, quaternion_of
+from bidnerf_core.results.pose_files import PosedImage
 
 EUROC_HEAD = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
@@ -42,7 +43,7 @@ def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
     for image in images:
         pose = _matrix(image)
         time = image.number if image.time is None else image.time
-        numbers = [*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3]).tolist()]
+        numbers = [*pose[:3, 3].tolist(), *SE3.from_matrix(pose).quaternion("wxyz").tolist()]
         rows.append(
             ",".join([str(round(time * NANOSECONDS)), *(f"{number:.12g}" for number in numbers)]) + "\n"
         )

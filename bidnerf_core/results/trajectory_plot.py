@@ -12,9 +12,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.captures.up_direction import UpDirection, up_direction
 from bidnerf_core.devices import moved
-from bidnerf_core.geometry.arcs import mean_up
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.results.plot_style import new_figure, styled, write_figure
 
@@ -30,32 +31,45 @@ class PlottedPath:
 
     poses: SE3  # (n) T_world_camera
     accepted: Bool[Tensor, "n"]
-    deviations: Float[Tensor, "n"]  # metres: standard deviation of the position; not a number where unknown
+    deviations: Float[Tensor, "n"]  # standard deviation of the position; not a number where unknown
     truth: Sequence[SE3 | None] = ()
+    unit: LengthUnit = "units"  # of the poses
 
 
-def plot_path(path: PlottedPath, surface: SurfaceMap | None, file: Path) -> None:
-    """Draw a path as PNG or SVG, by the ending of the file's name. Raises ``InputError`` without matplotlib."""
-    axes = _axes(path.poses)
+def plot_path(
+    path: PlottedPath, surface: SurfaceMap | None, file: Path, up: UpDirection | None = None
+) -> None:
+    """Draw a path as PNG or SVG, by the ending of the file's name. Raises ``InputError`` without matplotlib.
+
+    ``up`` is the upward direction, by default the one that the surface and the cameras give.
+    """
+    if up is None:
+        normals = None if surface is None else surface.surfels.normals
+        up = up_direction([path.poses[i] for i in range(len(path.poses.translation))], normals)
+    axes = _axes(path.poses, up.tensor())
     with styled():
         figure = new_figure(9.6, 4.9)
         panels = figure.subplots(1, 2)
-        for panel, (right, up), title in zip(
+        for panel, (across, upward), title in zip(
             panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True
         ):
-            projection = np.stack([axes[right], axes[up]], axis=-1)
+            projection = np.stack([axes[across], axes[upward]], axis=-1)
             marks = _panel(panel, path, surface, projection)
-            panel.set(title=title, xlabel="metres", aspect="equal")
-        figure.colorbar(marks, ax=list(panels), label="standard deviation of the position (mm)", shrink=0.85)
+            panel.set(title=title, xlabel=path.unit, aspect="equal")
+        figure.colorbar(
+            marks,
+            ax=list(panels),
+            label=f"standard deviation of the position ({_fine(path)[1]})",
+            shrink=0.85,
+        )
         handles, labels = panels[0].get_legend_handles_labels()
         if labels:
             figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         write_figure(figure, file, dpi=150)
 
 
-def _axes(poses: SE3) -> Float[np.ndarray, "3 3"]:
+def _axes(poses: SE3, up: Float[Tensor, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return the axes of the plot (rows, world): the longest horizontal one, the other horizontal one, and up."""
-    up = mean_up([poses[i] for i in range(len(poses.translation))]).double()
     centred = poses.translation.double() - poses.translation.double().mean(0)
     level = centred - (centred @ up)[:, None] * up
     right = torch.linalg.svd(level, full_matrices=True)[2][0]
@@ -64,6 +78,11 @@ def _axes(poses: SE3) -> Float[np.ndarray, "3 3"]:
         right = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
     right = right / right.norm()
     return torch.stack([right, torch.linalg.cross(up, right), up]).numpy()
+
+
+def _fine(path: PlottedPath) -> tuple[float, str]:
+    """Return the factor and the unit in which deviations are drawn."""
+    return (1000.0, "mm") if path.unit == "metres" else (1.0, "units")
 
 
 def _panel(
@@ -76,12 +95,12 @@ def _panel(
     known = [T.translation.double().numpy() @ projection for T in path.truth if T is not None]
     if known:
         panel.plot(*np.array(known).T, color="#000", linewidth=0.8, label="ground truth")
-    accepted, millimetres = path.accepted.numpy(), 1000 * path.deviations.double().numpy()
+    accepted, deviations = path.accepted.numpy(), _fine(path)[0] * path.deviations.double().numpy()
     lost = places[~accepted]
     if len(lost):
         panel.scatter(*lost.T, s=14, marker="x", linewidths=0.8, color="#D55E00", label="lost")
     return panel.scatter(
-        *places[accepted].T, c=millimetres[accepted], s=9, cmap="viridis", label="tracked", zorder=3
+        *places[accepted].T, c=deviations[accepted], s=9, cmap="viridis", label="tracked", zorder=3
     )
 
 

@@ -171,7 +171,7 @@ def _blob_field() -> GaussianBlobs:
 
 
 def _blob_map() -> Map:
-    info = MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact")
+    info = MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres")
     return Map(info, _blob_field())
 
 

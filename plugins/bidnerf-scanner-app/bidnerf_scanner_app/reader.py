@@ -43,6 +43,7 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import fit_depth
 from bidnerf_core.geometry.pose_rows import pose_of_rows
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import read_file
 from bidnerf_core.io.images import Background, decode, reduced
 from bidnerf_core.io.json import Record, read_record
@@ -116,6 +117,9 @@ class ScannerAppReader(Reader):
 
 class ScannerAppDataset(SplitDataset[ScannerFrame]):
     """Views of a folder of "3D Scanner App"; see ``Dataset``."""
+
+    unit: LengthUnit | None = "metres"
+    up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
 
     def __init__(self, frames: Splits[ScannerFrame], background: Background | None, largest: int) -> None:
         super().__init__(frames, background)

@@ -1,0 +1,90 @@
+"""Poses as a COLMAP text model: ``images.txt``, with ``cameras.txt`` and an empty ``points3D.txt`` beside it.
+
+See https://colmap.github.io/format.html. COLMAP's poses take the world to the camera, quaternions have the scalar first, and
+pixel centres lie at +0.5, as ours do.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from bidnerf_core.camera.exif import read_exif
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
+from bidnerf_core.results.pose_files import PosedImage, as_stored, frame_of, require_finite
+
+HEAD = "# written by bidnerf"
+RADIAL_TERMS = 4
+"""Coefficients k1 k2 p1 p2 of COLMAP's model OPENCV; FULL_OPENCV has k3 to k6 as well."""
+MOST_TERMS = 8
+
+
+def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write ``path`` (images.txt), and the cameras.txt and points3D.txt without which COLMAP does not read it.
+
+    Names of images are paths of their files relative to the folder that holds all of them. Raises ``InputError`` for a lens that
+    COLMAP cannot describe, and where another program's cameras.txt lies beside.
+    """
+    require_finite(images)
+    _check_beside(path)
+    names = file_names(images)
+    cameras: dict[Intrinsics, int] = {}
+    rows = list[str]()
+    for number, (image, name) in enumerate(zip(images, names, strict=True), start=1):
+        orientation = UPRIGHT if image.file is None else read_exif(image.file).orientation
+        intrinsics, T_world_camera = as_stored(image, orientation)
+        camera = cameras.setdefault(intrinsics, len(cameras) + 1)
+        rows.append(image_rows(number, T_world_camera, camera, name))
+    head = f"{HEAD}; {frame_of(images)}\n"
+    listed = "".join(camera_row(number, camera) for camera, number in cameras.items())
+    points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
+    write_file(
+        path.with_name("cameras.txt"), f"{head}# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n{listed}".encode()
+    )
+    write_file(path.with_name("points3D.txt"), f"{head}{points}".encode())
+    columns = (
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (world to camera), then an empty line\n"
+    )
+    write_file(path, f"{head}{columns}{''.join(rows)}".encode())
+
+
+def image_rows(number: int, T_world_camera: SE3, camera: int, name: str) -> str:
+    """Return the two rows of an image, of which the second lists no keypoints."""
+    T_camera_world = T_world_camera.to("cpu").inverse()
+    numbers = (*T_camera_world.quaternion("wxyz").tolist(), *T_camera_world.translation.tolist())
+    return f"{number} {' '.join(f'{x:.15g}' for x in numbers)} {camera} {name}\n\n"
+
+
+def camera_row(number: int, camera: Intrinsics) -> str:
+    """Return the row of a camera. Raises ``InputError`` for a lens with more than eight coefficients."""
+    k = camera.distortion
+    if len(k) > MOST_TERMS:
+        raise InputError(f"a lens of {len(k)} coefficients, expected at most {MOST_TERMS} in a COLMAP model")
+    model, count = ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", 8)
+    lens = (*k, *(0.0,) * MOST_TERMS)[:count]
+    numbers = " ".join(f"{x:.15g}" for x in (camera.fx, camera.fy, camera.cx, camera.cy, *lens))
+    return f"{number} {model} {camera.width} {camera.height} {numbers}\n"
+
+
+def file_names(images: Sequence[PosedImage]) -> list[str]:
+    """Return the paths of the images' files relative to the folder that holds all of them; the name of an image without file."""
+    files = [image.file.resolve() for image in images if image.file is not None]
+    parent = os.path.commonpath([file.parent for file in files]) if files else ""
+    return [
+        image.name if image.file is None else Path(os.path.relpath(image.file.resolve(), parent)).as_posix()
+        for image in images
+    ]
+
+
+def _check_beside(path: Path) -> None:
+    """Raise ``InputError`` where a camera file that this module did not write would be replaced."""
+    beside = path.with_name("cameras.txt")
+    if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
+        raise InputError(
+            f"{beside}: would be replaced, since a COLMAP model has one; expected {path.name} in a folder without another model"
+        )
