@@ -27,7 +27,7 @@ from bidnerf_core.evaluation.results import ResultTable
 from bidnerf_core.evaluation.summary import NEVER, compare_pair, median, pairwise_tests, steps_of, summarize
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.io.json import to_plain
-from bidnerf_core.results.errors import success_rate
+from bidnerf_core.results.errors import success_rate_by_frame
 
 STEPS = 10
 
@@ -85,7 +85,7 @@ def test_a_summary_counts(results: list[TrialResult]) -> None:
     judged = slow.criteria["10%"]
     assert judged is not None
     assert (judged.rate.successes, judged.rate.trials) == (6, 12)
-    assert judged.rate == success_rate(6, 12)
+    assert judged.rate == success_rate_by_frame([True] * 6 + [False] * 6, [0] * 12)
     assert judged.steps == 7
     assert (slow.milliseconds_per_step, slow.seconds, slow.trials) == (200, 2, 12)
     assert slow.translation == pytest.approx((0.001 + 1.2) / 2)
@@ -169,14 +169,14 @@ def test_the_page_needs_nothing_beside_it(
         ET.fromstring(base64.b64decode(picture.partition(",")[2]))
     for said in (
         "Mine & yours", "24 trials", "bidnerf evaluate 'a <map>' photos", "2 local processes", "bid, level none",
-        "100.0 %6/6, 61 to 100 %", "50.0 %6/12, 25 to 75 %", "Fisher",
+        "100.0 %6/6 on 1 frame, 21 to 100 %", "50.0 %6/12 on 1 frame, 5 to 95 %", "Fisher",
     ):  # fmt: skip
         assert said in page.text
     for name in ("rates", "steps", "share", "translation", "rotation"):
         assert iio.imread(tmp_path / "out" / f"{name}.png").std() > 1
         assert (tmp_path / "out" / f"{name}.svg").stat().st_size > 2000
     out = capsys.readouterr().out
-    assert re.search(r"bid, all sizes\n.*\n  bid, level none +12 +50 % \(25-75\) +50 % \(25-75\) +50 %", out)
+    assert re.search(r"bid, all sizes\n.*\n  bid, level none +12 +1 +50 % \(5-95\) +50 % \(5-95\) +50 %", out)
 
 
 def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:

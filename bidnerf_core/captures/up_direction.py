@@ -28,6 +28,8 @@ INDEPENDENT = 8
 """Largest number of cameras whose rolls count as independent, since many frames of a video share one."""
 SIDEWAYS = 2.0
 """Log odds of upright against sideways images, as phones that are held upright store them."""
+LOOKING_UP = 3.0
+"""Log odds against cameras that all look straight up, in proportion to the sine of the angle."""
 ALIKE_DEG = 8.0
 """Angle within which normals belong to one plane or to parallel ones."""
 CHANCE = 1 - math.cos(math.radians(ALIKE_DEG))
@@ -65,15 +67,17 @@ def up_direction(poses: Sequence[SE3], normals: Float[Tensor, "n 3"] | None = No
     best: tuple[float, Tensor, UpSource] | None = None
     for up_axis, level_axis, prior in (
         (-rotations[:, :, 1], rotations[:, :, 0], 0.0),
-        (rotations[:, :, 0], rotations[:, :, 1], -SIDEWAYS),
         (-rotations[:, :, 0], rotations[:, :, 1], -SIDEWAYS),
+        (rotations[:, :, 0], rotations[:, :, 1], -SIDEWAYS - 1),  # phones have the camera at the top
     ):
         for direction, support, source in [*planes, *_level(up_axis, level_axis)]:
-            upward = float((up_axis @ direction).mean())
+            direction = direction if float((up_axis @ direction).mean()) >= 0 else -direction
+            looking_up = max(0.0, float((rotations[:, :, 2] @ direction).mean()))  # which is rare
             tilt = (level_axis @ direction).square().mean() / math.sin(math.radians(ROLL_DEG)) ** 2
             score = prior + math.log(CHANCE + support) - 0.5 * min(len(poses), INDEPENDENT) * float(tilt)
+            score -= LOOKING_UP * looking_up
             if best is None or score > best[0]:
-                best = score, direction if upward >= 0 else -direction, source
+                best = score, direction, source
     assert best is not None  # cameras always give a direction
     return _snapped(best[1], best[2], planes)
 
