@@ -62,12 +62,17 @@ if TYPE_CHECKING:
     from bidnerf_core.localization import settings_of as settings_of
     from bidnerf_core.localization.corrector import Corrector as Corrector
     from bidnerf_core.mapping import BakeConfig as BakeConfig
+    from bidnerf_core.maps.collection import MapCollection as MapCollection
+    from bidnerf_core.maps.collection import Placement as Placement
     from bidnerf_core.maps.importers import ImportedField as ImportedField
     from bidnerf_core.maps.importing import import_map as import_map
     from bidnerf_core.maps.map import Map as Map
     from bidnerf_core.maps.map import load_map as load_map
     from bidnerf_core.maps.rendering import RenderingScores as RenderingScores
     from bidnerf_core.maps.rendering import rendering_scores as rendering_scores
+    from bidnerf_core.maps.scaling import ScaleFit as ScaleFit
+    from bidnerf_core.maps.scaling import factor_of_distance as factor_of_distance
+    from bidnerf_core.maps.scaling import factor_of_poses as factor_of_poses
     from bidnerf_core.maps.summary import MapSummary as MapSummary
     from bidnerf_core.maps.training import resume as resume
     from bidnerf_core.maps.training import train as train
@@ -81,6 +86,7 @@ if TYPE_CHECKING:
     from bidnerf_core.results.overlays import overlay as overlay
     from bidnerf_core.results.pose_files import PosedImage as PosedImage
     from bidnerf_core.results.pose_files import read_pose as read_pose
+    from bidnerf_core.results.pose_files import read_poses as read_poses
     from bidnerf_core.results.pose_files import write_poses as write_poses
     from bidnerf_core.results.tracked_path import TrackedPath as TrackedPath
     from bidnerf_core.results.tracked_path import track as track
@@ -113,9 +119,11 @@ HOMES = {
     "Localization": "localization",
     "Localizer": "localization",
     "Map": "maps.map",
+    "MapCollection": "maps.collection",
     "MapSummary": "maps.summary",
     "Observations": "fields.observations",
     "Outcome": "localization",
+    "Placement": "maps.collection",
     "PoseError": "results.errors",
     "PosedImage": "results.pose_files",
     "Progress": "progress",
@@ -129,6 +137,7 @@ HOMES = {
     "RenderingScores": "maps.rendering",
     "ResultTable": "evaluation.results",
     "SE3": "geometry.se3",
+    "ScaleFit": "maps.scaling",
     "SceneBounds": "fields.contract",
     "ServiceClient": "service.client",
     "ServiceConfig": "service.settings",
@@ -145,6 +154,8 @@ HOMES = {
     "compare": "evaluation.evaluate",
     "evaluate": "evaluation.evaluate",
     "import_map": "maps.importing",
+    "factor_of_distance": "maps.scaling",
+    "factor_of_poses": "maps.scaling",
     "levels": "fields.contract",
     "list_plugins": "registry",
     "load_backend": "backend",
@@ -156,6 +167,7 @@ HOMES = {
     "perturb": "evaluation.protocols",
     "pose_error": "results.errors",
     "read_pose": "results.pose_files",
+    "read_poses": "results.pose_files",
     "register": "registry",
     "render": "fields.rendering",
     "render_image": "fields.rendering",

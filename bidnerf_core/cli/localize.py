@@ -29,11 +29,13 @@ from bidnerf_core.cli.options import LARGEST_SEED, Flag, MapFolder, Names, optio
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
+from bidnerf_core.cli.several_maps import check_for_several, collected, localize_in_several, named_maps
 from bidnerf_core.cli.starts import StartSpec
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.queries import DepthPoints, Photos, Query, QuerySource
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.evaluation.trials import places_of
+from bidnerf_core.frames.frame import BLACK
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
@@ -45,6 +47,7 @@ from bidnerf_core.localization.methods import (
     require_use_of_depth,
 )
 from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.maps.collection import maps_in
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
 from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations
@@ -63,7 +66,12 @@ def run(arguments: list[str]) -> None:
         query: Annotated[
             tuple[Path, ...],
             tyro.conf.Positional,
-            option("QUERY...", "image files, folders of photos, or one folder of a dataset (required)", ""),
+            option(
+                "[MAP...] QUERY...",
+                "image files, folders of photos, or one folder of a dataset (required); before them, more maps or folders of maps:"
+                " the one that an image shows is found",
+                "",
+            ),
         ],
         *,
         depth: Annotated[
@@ -136,7 +144,7 @@ def run(arguments: list[str]) -> None:
         preset: Preset = None,
         config: Any = None,
     ) -> None:
-        """Find the poses of photos, or of frames of a dataset, in a map.
+        """Find the poses of photos, or of frames of a dataset, in a map, or in the one of several maps that they show.
 
         QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF
         has no focal length, method auto begins with that of the map's images.
@@ -155,6 +163,7 @@ def run(arguments: list[str]) -> None:
         begin = StartSpec(None if start is None else read_poses(start), perturb, start)
         for part in (frames, begin):
             part.check()
+        maps, query = named_maps(map, query)
         if not query:
             raise UsageError("no QUERY, expected image files, folders of photos, or a folder of a dataset")
         require_start(method, begin.given)
@@ -165,6 +174,18 @@ def run(arguments: list[str]) -> None:
             check_pose_file(out, inputs)
         if draw is not None:
             make_folder(draw, inputs)
+        if len(maps) > 1 or len(maps_in(map)) > 1 or maps_in(map) not in ([], [map]):
+            given = {
+                "--start": start is not None,
+                "--perturb": perturb is not None,
+                "--draw": draw is not None,
+            }
+            check_for_several(given | {"--depth-points": depth_points is not None}, out)
+            collection = collected(maps, method, config)
+            photos = replace(photos, camera=replace(photos.camera, assumed=collection.cameras))
+            source = open_queries(query, photos, frames, BLACK, None)
+            localize_in_several(collection, source, seed, out, json)
+            return
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
         assumed = _assumed_cameras(stored.landmarks, method, config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +26,18 @@ LandmarkSource = Literal["photos", "rendered images"]
 
 
 @dataclass(frozen=True)
+class FieldFrame:
+    """The unit that the field of a map was trained in, where the map was scaled since."""
+
+    scale: float  # units of the map in a unit of the field
+    bounds: SceneBounds  # of the field, in its own unit
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale < math.inf:
+            raise InputError(f"scale is {self.scale}, expected a positive number")
+
+
+@dataclass(frozen=True)
 class MapInfo:
     """The content of ``map.json``."""
 
@@ -41,6 +54,7 @@ class MapInfo:
     gravity_up: tuple[float, float, float] | None = (
         None  # upward direction (world), where the capture measured gravity
     )
+    field_frame: FieldFrame | None = None  # where the map was scaled after training
     distances: bool = True  # False if all images are from one place, so that they do not determine distances
     sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
     hidden: int = 0  # number of training pixels that masks hid

@@ -17,12 +17,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors.torch import save as tensors_to_bytes
 from torch import nn
 
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.fields.scaled import ScaledField, trained_field
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import from_plain, read_json, to_plain
@@ -138,7 +140,10 @@ def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: An
 
 def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:
     """Return a digest of what a map consists of, in hexadecimal."""
-    parts = [packed(field.state_dict())] if isinstance(field, nn.Module) else []
+    trained = trained_field(field)
+    parts = [packed(trained.state_dict())] if isinstance(trained, nn.Module) else []
+    if isinstance(field, ScaledField):
+        parts.append({"scale": torch.tensor(field.scale, dtype=torch.float64)})
     parts += [] if surface is None else [packed(surface_tensors(surface))]
     parts += [] if landmarks is None else [packed(landmark_tensors(landmarks))]
     hashed = hashlib.blake2b(digest_size=8)
@@ -152,7 +157,7 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
     if info.training is None:
         raise InputError(f"{folder}: training is complete ({amount(info.step, 'step')}), nothing to resume")
     path = folder / info.weights
-    weights = checked_weights(field, read_tensors(path, EXPECTED_PART), path)
+    weights = checked_weights(trained_field(field), read_tensors(path, EXPECTED_PART), path)
     return TrainingState(info.step, weights, read_tensors(folder / info.training, EXPECTED_PART))
 
 

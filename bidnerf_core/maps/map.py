@@ -19,6 +19,7 @@ from bidnerf_core.captures.up_direction import UpDirection, given_up, up_directi
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.fields.rendering import RenderedImage, render_image
+from bidnerf_core.fields.scaled import trained_field
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import locked
@@ -41,6 +42,7 @@ from bidnerf_core.maps.files import (
     save_surface,
 )
 from bidnerf_core.maps.same_scene import check_same_scene
+from bidnerf_core.maps.scaling import in_map_frame, scaled
 from bidnerf_core.maps.summary import MapSummary, summarized
 from bidnerf_core.maps.views import Images, checked_side, read_views
 from bidnerf_core.maps.weights import checked_weights
@@ -137,6 +139,14 @@ class Map:
         return summarized(
             self.info, self.field, self.surface, self.landmarks, self.capture, self.folder, self.up
         )
+
+    def scaled(self, factor: float, unit: LengthUnit = "metres") -> Map:
+        """Return the map with all lengths multiplied by ``factor``, in memory: field, bounds, surface, landmarks and record.
+
+        ``unit`` is what lengths are in then; ``scaled(1)`` says that they are metres. ``save`` stores it, over the map itself too.
+        Raises ``InputError`` for a factor that is not positive, and for a map whose training is not complete.
+        """
+        return scaled(self, factor, unit)
 
     def render(self, view: View, level: int | None = None) -> RenderedImage:
         """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with camera and pose of ``view``.
@@ -261,19 +271,20 @@ class Map:
         Baked parts that were left unread (``load_map`` with ``baked=False``) are written as well, and returned. Raises ``InputError`` where the folder cannot be written, where it is not empty and ``overwrite`` is not set, and where
         the field is not that of a backend.
         """
-        if not isinstance(self.field, nn.Module):
-            found = type(self.field).__name__
+        field = trained_field(self.field)
+        if not isinstance(field, nn.Module):
+            found = type(field).__name__
             raise InputError(f"{folder}: the map's field is a {found}, expected an nn.Module of a backend")
-        state = TrainingState(self.info.step, self.field.state_dict(), {})
+        state = TrainingState(self.info.step, field.state_dict(), {})
         if not self.info.complete and self.folder is not None:
             state = load_state(self.folder, self.info, self.field)
-        folder, whole = Path(folder), self._whole()
+        folder, whole = Path(folder), self.whole()
         here = whole.to("cpu")
         with map_folder(folder, overwrite):
             info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture)
         return replace(whole, info=info, folder=folder, record=self.capture)
 
-    def _whole(self) -> Map:
+    def whole(self) -> Map:
         """Return the map with the baked parts of its folder that were left unread."""
         if self.folder is None:
             return self
@@ -317,7 +328,7 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
         tensors = checked_weights(field, tensors, path)
     cast(nn.Module, field).load_state_dict(tensors)
     cast(nn.Module, field).requires_grad_(False).eval()
-    return field
+    return in_map_frame(field, info)
 
 
 def _with_cameras(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
@@ -330,7 +341,7 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
     """Return an untrained field (an ``nn.Module``) and its config, as ``info`` describes them."""
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
     try:
-        field = backend.build(config, info.bounds)
+        field = backend.build(config, info.bounds if info.field_frame is None else info.field_frame.bounds)
     except ValueError as error:
         raise InputError(f"{where}: backend {info.backend!r} refuses its config: {error}") from error
     if not (isinstance(field, nn.Module) and isinstance(field, RadianceField)):

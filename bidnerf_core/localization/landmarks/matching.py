@@ -99,8 +99,8 @@ class _Cells:
     def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
         count = round(max(math.sqrt(len(descriptors)), len(descriptors) / USUAL_IN_CELL))
         generator = torch.Generator().manual_seed(seed)
-        self._centres = _k_means(descriptors, count, generator)
-        cell = _nearest_centre(descriptors, self._centres)
+        self._centres = k_means(descriptors, count, generator)
+        cell = nearest_centre(descriptors, self._centres)
         order = cell.argsort(stable=True)
         self._order = order
         self._descriptors = descriptors[order]
@@ -138,7 +138,7 @@ class _Cells:
         ]
 
 
-def _k_means(
+def k_means(
     descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
 ) -> Float[Tensor, "c d"]:
     """Return the centres of k-means cells (Lloyd 1982) on a sample; a centre that loses all its members stays in place."""
@@ -146,14 +146,14 @@ def _k_means(
     values = descriptors[sample.to(descriptors.device)].float()
     centres = values[:count].clone()
     for _ in range(K_MEANS_ROUNDS):
-        cell = _nearest_centre(values, centres)
+        cell = nearest_centre(values, centres)
         sizes = torch.bincount(cell, minlength=count)
         total = torch.zeros_like(centres).index_add_(0, cell, values)
         centres = torch.where(sizes[:, None] > 0, total / sizes.clamp(min=1)[:, None], centres)
     return centres
 
 
-def _nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
+def nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
     rows = max(1, BLOCK // len(centres))
     return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(rows)])
 

@@ -1,0 +1,109 @@
+"""``bidnerf localize`` in several maps: which one an image shows, the runner-up, and the pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.cli.interruptions import uninterrupted
+from bidnerf_core.cli.output import print_json, say, show
+from bidnerf_core.cli.progress import counted
+from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.geometry.units import symbol
+from bidnerf_core.io.images import IMAGE_SUFFIXES
+from bidnerf_core.maps.collection import MapCollection, maps_in
+from bidnerf_core.results.answers import Answer, Failure
+from bidnerf_core.results.errors import standard_deviations
+from bidnerf_core.results.placements import PlacedAnswer, Placements, place_each
+from bidnerf_core.results.pose_files import pose_format
+
+
+def named_maps(first: Path, others: Sequence[Path]) -> tuple[list[Path], tuple[Path, ...]]:
+    """Return the maps, or folders of maps, that the arguments begin with, and the queries after them."""
+    count = 0
+    while count < len(others) and _holds_maps(others[count]):
+        count += 1
+    return [first, *others[:count]], tuple(others[count:])
+
+
+def _holds_maps(path: Path) -> bool:
+    found = maps_in(path)
+    if not found or found == [path]:
+        return bool(found)
+    images = any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir())
+    return not images and find_reader(path) is None
+
+
+def collected(maps: Sequence[Path], method: str, config: Any) -> MapCollection:
+    """Read the landmarks of all maps, with a progress display."""
+    with counted("reading", "maps", max(1, sum(len(maps_in(path)) for path in maps))) as report:
+        return MapCollection(list(maps), method, config, progress=lambda p: report(p.done, p.total))
+
+
+def check_for_several(given: dict[str, bool], out: Path | None) -> None:
+    """Raise ``UsageError`` for options that belong to one map, by whether each was given, and for a file of poses other than JSON."""
+    for option, is_given in given.items():
+        if is_given:
+            raise UsageError(f"{option} is for one map, but several are named")
+    if out is not None and pose_format(out) != ".json":
+        raise UsageError(
+            f"{out}: poses in several maps have different worlds, expected a name that ends with .json"
+        )
+
+
+def localize_in_several(
+    maps: MapCollection, source: QuerySource, seed: int, out: Path | None, json: bool
+) -> None:
+    """Localize each query in the map that it shows, print the answers, and write them to ``out``.
+
+    Raises ``InputError`` if a query failed.
+    """
+    answers, total = Placements(), len(source.names)
+
+    def answered(query: Query, answer: Answer | Failure) -> None:
+        if isinstance(answer, Failure):
+            say(f"{answer.name}: {answer.reason}")
+        if json:
+            print_json(answers.plain(answer))
+        elif isinstance(answer, PlacedAnswer):
+            _show(answer, total == 1)
+
+    try:
+        with counted("localizing", "images", total) as report:
+            place_each(
+                maps, source, seed=seed, answers=answers, each=answered,
+                progress=lambda p: report(p.done, p.total),
+            )  # fmt: skip
+    finally:
+        with uninterrupted():
+            if out is not None and answers.given:
+                answers.save(out)
+    if total > 1:
+        say(f"{len(answers.accepted)} of {total} converged in {len(maps)} maps")
+    if failed := len(answers) - len(answers.answers):
+        raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
+
+
+def _show(answer: PlacedAnswer, full: bool) -> None:
+    placement, found = answer.placement, answer.found
+    assert placement is not None
+    where = f"in {placement.map}" if found.converged else f"in none of the maps; nearest {placement.map}"
+    verdict = "converged" if found.converged else f"NOT converged: {found.outcome.value}"
+    show(f"{answer.name}: {where}: {verdict} ({found.reason})")
+    if placement.runner_up is not None:
+        name, other = placement.runner_up
+        rival = "converged too" if other.converged else str(other.outcome)
+        show(f"  runner-up {name}: {rival} ({other.reason})")
+    if not full:
+        return
+    if found.covariance is not None:
+        position, rotation = standard_deviations(found.covariance)
+        show(
+            f"  uncertainty  {position:.4f} {symbol(found.unit)}, {57.29578 * rotation:.3f} deg (one standard deviation)"
+        )
+    show(f"  T_world_camera (in the frame of {placement.map}; lengths in {found.unit})")
+    for row in found.T_world_camera.matrix().tolist():
+        show("    " + " ".join(f"{value: .6f}" for value in row))

@@ -1,0 +1,54 @@
+"""A field in a world whose lengths are multiples of those that it was trained in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+
+from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, RaySamples, levels
+
+
+class ScaledField(nn.Module):
+    """A field whose world is ``scale`` times as large as that of the field in it; colours stay, densities are per new length."""
+
+    def __init__(self, field: RadianceField, scale: float) -> None:
+        super().__init__()
+        self.trained, self.scale = field, scale
+
+    @property
+    def sampler(self) -> RaySampler:
+        """The sampler of the field, for rays in the scaled world."""
+        return ScaledSampler(self.trained.sampler, self.scale)
+
+    @property
+    def levels(self) -> tuple[RadianceField, ...]:
+        """The levels of detail of the field, coarsest first; the last one is this field."""
+        return (*(ScaledField(level, self.scale) for level in levels(self.trained)[:-1]), self)
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Return density and colour at ``positions`` in the scaled world."""
+        found = self.trained.query(positions / self.scale, directions)
+        return replace(found, density=found.density / self.scale)
+
+
+@dataclass(frozen=True)
+class ScaledSampler:
+    """A sampler for rays in a world that is ``scale`` times as large."""
+
+    sampler: RaySampler
+    scale: float
+
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        """Return the samples of rays in the scaled world."""
+        shrunk = Rays(
+            rays.origins / self.scale, rays.directions, rays.near / self.scale, rays.far / self.scale
+        )
+        found = self.sampler(shrunk, jitter)
+        return replace(found, starts=found.starts * self.scale, ends=found.ends * self.scale)
+
+
+def trained_field(field: RadianceField) -> RadianceField:
+    """Return the field as its backend built it, in the unit of its training, whose weights are what is stored."""
+    return field.trained if isinstance(field, ScaledField) else field

@@ -1,0 +1,257 @@
+"""Several maps at once: which of them an image shows, and its pose there."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import Localization, Localizer, Outcome
+from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
+from bidnerf_core.localization.methods import USUAL_METHOD
+from bidnerf_core.localization.problem import unit_of
+from bidnerf_core.mapping import LandmarkMap, find_features
+from bidnerf_core.mapping.landmarks.features import detected
+from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of, load_info
+from bidnerf_core.maps.files import load_landmarks
+from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.maps.pooled import Vocabulary, viewpoints
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter
+
+log = logging.getLogger("bidnerf")
+
+ASKED = 5
+"""Largest number of maps that are asked for the pose of an image, the most similar ones first."""
+KEPT = 6
+"""Number of maps from folders that are kept in memory once they were asked."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """How similar an image is to what the cameras of a map see: the cosine between pooled descriptors, -1 where it has none."""
+
+    map: str
+    cosine: float
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """The map that an image shows, its pose there, and the runner-up."""
+
+    map: str  # the best answer's, though it may be rejected like all others
+    found: Localization
+    runner_up: tuple[str, Localization] | None  # the next best answer; None where one map was asked
+    ranking: tuple[Similarity, ...]  # all maps, the most similar first
+    asked: tuple[str, ...]  # maps that were asked for a pose, in this order
+
+    @property
+    def converged(self) -> bool:
+        """Whether the image was localized in a map."""
+        return self.found.converged
+
+    @property
+    def rival(self) -> str | None:
+        """The runner-up, where it accepts the image as well: both maps show the place, or it exists twice."""
+        return self.runner_up[0] if self.runner_up is not None and self.runner_up[1].converged else None
+
+
+class MapCollection:
+    """Finds the map that an image shows, and its pose there. Maps are ranked by pooled descriptors, and only the first are asked.
+
+    Maps without landmarks cannot be ranked and are asked last. It keeps some of the maps that it has read, and belongs to one thread.
+    """
+
+    def __init__(
+        self,
+        maps: str | Path | Sequence[Map | str | Path],
+        method: str = USUAL_METHOD,
+        config: Any = None,
+        asked: int = ASKED,
+        progress: ProgressCallback | None = None,
+        cancel: Cancel | None = None,
+    ) -> None:
+        """Read the landmarks of all maps: those in the sub-folders of one folder, or a list of maps and of folders of maps.
+
+        ``asked`` is the largest number of maps that are asked for a pose. Raises ``InputError`` where there is no map, or two have
+        the same name, and ``Cancelled`` once ``cancel`` returns True.
+        """
+        if asked < 1:
+            raise InputError(f"asked is {asked}, expected 1 or more")
+        self.method, self.config, self.asked = method, config, asked
+        self._maps = _named([maps] if isinstance(maps, str | Path) else maps)
+        self._localizers: OrderedDict[str, Localizer] = OrderedDict()
+        self._infos = {name: _info(scene) for name, scene in self._maps.items()}
+        self._pooled: dict[str, Float[Tensor, "v p"]] = {}
+        self._vocabularies: dict[tuple[str, int], Vocabulary] = {}
+        self._index(progress, cancel)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the maps: those of their folders."""
+        return tuple(self._maps)
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    @property
+    def cameras(self) -> tuple[Intrinsics, ...]:
+        """The cameras of the images of all maps, which serve for photos without any."""
+        return tuple(camera.intrinsics for info in self._infos.values() for camera in info.cameras)
+
+    def localizer(self, name: str) -> Localizer:
+        """Return the localizer of a map, read from its folder unless it was used lately. Raises ``InputError`` for an unknown name."""
+        if name not in self._maps:
+            raise InputError(f"no map {name!r}, expected one of {', '.join(self._maps)}")
+        if name not in self._localizers:
+            scene = self._maps[name]
+            stored = scene if isinstance(scene, Map) else load_map(scene)
+            self._localizers[name] = Localizer(stored, self.method, self.config, warm_up=False)
+            while len(self._localizers) > KEPT:
+                self._localizers.popitem(last=False)
+        self._localizers.move_to_end(name)
+        return self._localizers[name]
+
+    def ranked(self, frame: Frame) -> list[Similarity]:
+        """Return all maps by their similarity to an image, the most similar first; maps without landmarks come last."""
+        vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
+        for key, vocabulary in self._vocabularies.items():
+            descriptors = detected(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
+            if descriptors is not None and len(descriptors) and descriptors.shape[1] == key[1]:
+                vectors[key] = vocabulary.pooled(descriptors)
+        found = []
+        for name in self._maps:
+            pooled, key = self._pooled.get(name), self._key.get(name)
+            known = pooled is not None and key in vectors
+            cosine = (
+                float((pooled @ vectors[key]).max())
+                if known and pooled is not None and key is not None
+                else -1.0
+            )
+            found.append(Similarity(name, cosine))
+        return sorted(found, key=lambda similarity: -similarity.cosine)
+
+    def __call__(self, frame: Frame, seed: int = 0) -> Placement:
+        """Find the map that a frame shows, and its pose there.
+
+        The most similar maps are asked by their landmarks, one after another until one recognises the image, and then the next as
+        runner-up. The whole method answers in the map that recognises it, or in the first one where none does. Raises
+        ``InputError`` for a frame that cannot be localized at all.
+        """
+        ranking = self.ranked(frame)
+        quick: dict[str, Localization] = {}
+        for similarity in ranking[: self.asked]:
+            recognised = any(found.converged for found in quick.values())
+            quick[similarity.map] = self._by_landmarks(similarity.map, frame, seed)
+            if recognised:
+                break
+        chosen = max(quick, key=lambda name: _merit(quick[name]))  # the first of equals
+        found = self.localizer(chosen)(frame, seed=seed)
+        others = [name for name in quick if name != chosen]
+        second = max(others, key=lambda name: _merit(quick[name]), default=None)
+        runner_up = None if second is None else (second, quick[second])
+        return Placement(chosen, found, runner_up, tuple(ranking), tuple(quick))
+
+    def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
+        """Return what the landmarks of a map say about a frame; maps without landmarks, and other methods, say all they can."""
+        localizer = self.localizer(name)
+        try:
+            if not localizer.matches_landmarks or localizer.matcher is None:
+                return localizer(frame, seed=seed)
+            began, problem = time.perf_counter(), localizer.problem(frame)
+            answer = answer_by_landmarks(problem, problem.matcher or localizer.matcher, localizer.rays, seed)
+        except InputError as error:  # such as a map without a surface
+            return _unrecognised(str(error), self.method)
+        if answer is None:
+            return _unrecognised("hardly any landmark of the map is in the image", self.method)
+        return replace(localization_by_landmarks(problem, answer, began), unit=unit_of(localizer.map))
+
+    def _index(self, progress: ProgressCallback | None, cancel: Cancel | None) -> None:
+        count = counter("reading", "maps", progress, cancel)
+        landmarks: dict[str, LandmarkMap] = {}
+        for number, (name, scene) in enumerate(self._maps.items(), start=1):
+            check_cancelled(cancel, "reading maps")
+            found = _landmarks(scene, self._infos[name])
+            if found is not None and len(found):
+                landmarks[name] = found
+            count(number, len(self._maps))
+        self._key = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
+        for key in dict.fromkeys(self._key.values()):
+            same = [found.descriptors for name, found in landmarks.items() if self._key[name] == key]
+            self._vocabularies[key] = Vocabulary.of(same)
+        for name, found in landmarks.items():
+            cameras = cameras_of(self._infos[name])
+            self._pooled[name] = viewpoints(self._vocabularies[self._key[name]], found, cameras)
+        if bare := [name for name in self._maps if name not in landmarks]:
+            log.info(f"{amount(len(bare), 'map')} without landmarks, asked last: {', '.join(bare)}")
+
+
+def maps_in(folder: Path) -> list[Path]:
+    """Return the folder itself if it is a map, else those of its sub-folders that are maps, by name."""
+    if (folder / DESCRIPTION).exists():
+        return [folder]
+    if not folder.is_dir():
+        return []
+    return sorted(path.parent for path in folder.glob(f"*/{DESCRIPTION}"))
+
+
+def _named(maps: Sequence[Map | str | Path]) -> dict[str, Map | Path]:
+    found: dict[str, Map | Path] = {}
+    for given in maps:
+        scenes: list[Map | Path] = [given] if isinstance(given, Map) else [*maps_in(Path(given))]
+        if not scenes:
+            raise InputError(f"{given}: no map in it, expected a map or a folder of maps")
+        for scene in scenes:
+            name = (
+                scene.info.data or "map" if isinstance(scene, Map) and scene.folder is None else _name(scene)
+            )
+            if name in found:
+                raise InputError(f"two maps are called {name!r}, expected folders with names that differ")
+            found[name] = scene
+    if not found:
+        raise InputError("no maps, expected at least one")
+    return found
+
+
+def _name(scene: Map | Path) -> str:
+    folder = scene.folder if isinstance(scene, Map) else scene
+    assert folder is not None
+    return folder.resolve().name
+
+
+def _info(scene: Map | Path) -> MapInfo:
+    return scene.info if isinstance(scene, Map) else load_info(scene)
+
+
+def _landmarks(scene: Map | Path, info: MapInfo) -> LandmarkMap | None:
+    if isinstance(scene, Map):
+        return None if scene.landmarks is None else scene.landmarks.to("cpu")
+    if info.landmarks is None:
+        return None
+    return replace(load_landmarks(scene / info.landmarks), features=info.landmark_features)
+
+
+def _unrecognised(reason: str, method: str) -> Localization:
+    """Return the answer of a map that does not recognise an image at all; its pose has no meaning."""
+    T = SE3.identity()
+    return Localization(
+        T, Outcome.TOO_FEW_MATCHES, reason, 0, 0.0, math.nan, method, SE3.stack([T]), torch.zeros(0, dtype=torch.float64)
+    )  # fmt: skip
+
+
+def _merit(found: Localization) -> tuple[bool, float, float]:
+    """Return by what answers of several maps are compared: whether they are accepted, inliers, and confidence."""
+    inliers = getattr(found.diagnostics, "inliers", 0)
+    return found.converged, float(inliers), -1.0 if found.confidence is None else found.confidence

@@ -1,0 +1,81 @@
+"""Pooled descriptors of what cameras see of landmarks, by which the place of an image is found among many maps.
+
+A VLAD vector (Jegou et al. 2010, "Aggregating local descriptors into a compact image representation") sums, for each word of a
+vocabulary, the differences of the descriptors nearest to it, so that an image is one vector whatever its number of keypoints.
+Maps store landmarks and no images: what each camera of a map sees of them stands for its image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.matching import k_means, nearest_centre
+from bidnerf_core.mapping import LandmarkMap
+
+WORDS = 32
+SAMPLE = 20_000
+"""Largest number of descriptors that a vocabulary is made of."""
+VIEWPOINTS = 48
+"""Largest number of cameras of a map that are pooled; of more, evenly spaced ones."""
+OBLIQUE_DEG = 10.0
+"""Angle beyond the cone of directions from which a landmark was seen within which it still counts as visible."""
+FEWEST = 8
+"""Number of landmarks below which what a camera sees is not pooled."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """Words of descriptors, and the pooling of descriptors by them."""
+
+    words: Float[Tensor, "w d"]
+
+    @staticmethod
+    def of(descriptors: Sequence[UInt8[Tensor, "n d"]], seed: int = 0) -> Vocabulary:
+        """Return the vocabulary of some maps, each of which contributes equally many of its descriptors."""
+        generator = torch.Generator().manual_seed(seed)
+        share = -(-SAMPLE // len(descriptors))
+        some = torch.cat([one[torch.randperm(len(one), generator=generator)[:share]] for one in descriptors])
+        return Vocabulary(k_means(some, min(WORDS, len(some)), generator))
+
+    def pooled(self, descriptors: UInt8[Tensor, "n d"], word: Tensor | None = None) -> Float[Tensor, "p"]:
+        """Return the VLAD vector of descriptors, of unit length; ``word`` is the nearest word of each, where that is known."""
+        word = self.nearest(descriptors) if word is None else word
+        sums = torch.zeros_like(self.words).index_add_(0, word, descriptors.float() - self.words[word])
+        roots = sums.sign() * sums.abs().sqrt()  # so that repeated structures do not dominate
+        return normalize(normalize(roots, dim=1).flatten(), dim=0)
+
+    def nearest(self, descriptors: UInt8[Tensor, "n d"]) -> Tensor:
+        """Return the number of the word nearest to each descriptor."""
+        return nearest_centre(descriptors, self.words)
+
+
+def viewpoints(
+    vocabulary: Vocabulary, landmarks: LandmarkMap, cameras: Sequence[tuple[Intrinsics, SE3]]
+) -> Float[Tensor, "v p"]:
+    """Return the VLAD vectors of what cameras of a map (T_world_camera) see of its landmarks, and of all of them as the last."""
+    word = vocabulary.nearest(landmarks.descriptors)
+    found = []
+    for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / VIEWPOINTS))]:
+        seen = visible(landmarks, camera, pose)
+        if int(seen.sum()) >= FEWEST:
+            found.append(vocabulary.pooled(landmarks.descriptors[seen], word[seen]))
+    return torch.stack([*found, vocabulary.pooled(landmarks.descriptors, word)])
+
+
+def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Bool[Tensor, "n"]:
+    """Return which landmarks show in the image of a camera, unless something hides them."""
+    pose = T_world_camera.to(torch.float32)
+    x, y, z = pose.inverse().apply(landmarks.positions).unbind(-1)
+    inside = (x.abs() * camera.fx <= z * camera.width / 2) & (y.abs() * camera.fy <= z * camera.height / 2)
+    towards = normalize(pose.translation - landmarks.positions, dim=-1)
+    angle = (towards * landmarks.directions).sum(-1).clamp(-1, 1).acos()
+    return inside & (z > 0) & (angle <= landmarks.cones + math.radians(OBLIQUE_DEG))

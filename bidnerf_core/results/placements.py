@@ -1,0 +1,104 @@
+"""The answers to a run of images in several maps, of which each image shows one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.maps.collection import MapCollection, Placement
+from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.results.answers import Answer, Answers, Failure
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedAnswer(Answer):
+    """The pose found for an image in one of several maps."""
+
+    placement: Placement | None = None
+    own_backend: str = ""  # of the map
+
+    @staticmethod
+    def placed(
+        frame: Frame, number: int, placement: Placement, backend: str, file: Path | None
+    ) -> PlacedAnswer:
+        """Return the answer for a frame, without what takes much memory."""
+        found = Answer.of(frame, number, placement.found, file=file)
+        return PlacedAnswer(
+            found.name, number, found.intrinsics, found.found, None, None, file, placement, backend
+        )
+
+    def plain(self, backend: str) -> dict[str, Any]:
+        """Return the object of ``localize --json``, with the map and the runner-up."""
+        placement = self.placement
+        assert placement is not None
+        second = placement.runner_up
+        cosines = {similarity.map: similarity.cosine for similarity in placement.ranking}
+        runner_up = None
+        if second is not None:
+            name, other = second
+            runner_up = {
+                "map": name, "outcome": str(other.outcome), "converged": other.converged,
+                "similarity": round(cosines[name], 4),
+            }  # fmt: skip
+        place = {"map": placement.map, "similarity": round(cosines[placement.map], 4), "runner_up": runner_up}
+        return super().plain(self.own_backend) | place
+
+
+class Placements(Answers):
+    """The answers to the images of a run in several maps. Their poses are in the frames of different maps."""
+
+    def __init__(self) -> None:
+        super().__init__("")
+
+    def plain(self, answer: Answer | Failure) -> dict[str, Any]:
+        """Return an answer as JSON values; ``map`` is null for an image that could not be read."""
+        if isinstance(answer, Answer):
+            return answer.plain(self.backend)
+        unit: LengthUnit = "units"
+        return answer.plain("", unit) | {"map": None, "similarity": None, "runner_up": None}
+
+
+def place_each(
+    maps: MapCollection,
+    queries: QuerySource,
+    *,
+    seed: int = 0,
+    answers: Placements | None = None,
+    each: Callable[[Query, Answer | Failure], None] | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Placements:
+    """Find the map and the pose of each query, as ``localize_each`` finds poses in one map; queries of several views are refused.
+
+    Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
+    """
+    answers = Placements() if answers is None else answers
+    count, total = counter("localizing", "images", progress, cancel), len(queries.names)
+    for number, name in enumerate(queries.names):
+        answer: Answer | Failure
+        query = Query(name, ())
+        try:
+            query = queries.read(number)
+            if len(query.views) != 1 or query.depth_rays is not None:
+                raise InputError(
+                    f"{name}: is a rig or has points of a sensor, expected single images in several maps"
+                )
+            placement = maps(query.views[0].frame, seed)
+            backend = getattr(getattr(maps.localizer(placement.map).map, "info", None), "backend", "")
+            frame = replace(query.frame, name=query.name)
+            answer = PlacedAnswer.placed(frame, number, placement, backend, query.file)
+        except InputError as error:
+            if total == 1:
+                raise
+            answer = Failure(name, maps.method, str(error))
+        answers.append(answer)
+        if each is not None:
+            each(query, answer)
+        count(number + 1, total)
+    return answers

@@ -1,0 +1,125 @@
+"""Maps in another unit: everything scales together, and scaling back gives the same map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import levels
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.map import Map
+from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, textured_map, unseen
+from commands import Run
+
+
+@pytest.fixture(scope="module")
+def ground() -> Map:
+    """The textured ground as a map of three cameras, in units of unknown length."""
+    known, view = textured_map(surface=True), unseen()
+    moves = torch.eye(3, 6, dtype=torch.float64)
+    views = [
+        bn.View(replace(view.frame, name=f"c{n}"), view.T_ref_camera.retract(move))
+        for n, move in enumerate(moves)
+    ]
+    info = MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground", cameras=stored_cameras(views))
+    return Map(info, known.field, known.surface, known.landmarks)
+
+
+def test_all_that_is_computed_scales(ground: Map) -> None:
+    view, large = unseen(), ground.scaled(4.0)
+    assert (ground.unit, large.unit) == ("units", "metres")
+    there = bn.View(view.frame, bn.SE3(view.T_ref_camera.rotation, 4 * view.T_ref_camera.translation))
+    before, after = ground.render(view), large.render(there)
+    torch.testing.assert_close(after.rgb, before.rgb, atol=2e-4, rtol=0)
+    torch.testing.assert_close(after.depth, 4 * before.depth, atol=1e-3, rtol=1e-4)
+    found, scaled = (bn.Localizer(scene)(view.frame) for scene in (ground, large))
+    assert found.converged
+    assert scaled.converged
+    assert (found.unit, scaled.unit) == ("units", "metres")
+    off = scaled.T_world_camera.translation - 4 * found.T_world_camera.translation
+    assert float(off.norm()) < 1e-3
+    assert len(levels(large.field)) == len(levels(ground.field))
+
+
+def test_scaling_back_gives_the_same_answers(ground: Map) -> None:
+    """To the last bit for a power of two, whose products are exact."""
+    back = ground.scaled(0.5).scaled(2.0, "units")
+    assert back.info == ground.info
+    assert torch.equal(back.render(unseen()).rgb, ground.render(unseen()).rgb)
+    before, after = (bn.Localizer(scene)(unseen().frame) for scene in (ground, back))
+    assert torch.equal(after.T_world_camera.matrix(), before.T_world_camera.matrix())
+    assert before.covariance is not None
+    assert after.covariance is not None
+    assert torch.equal(after.covariance, before.covariance)
+
+
+def test_a_known_length_gives_the_factor(ground: Map) -> None:
+    assert bn.factor_of_distance(ground, "c0", "c1", 2.8284271247) == pytest.approx(2)
+    assert bn.factor_of_distance(ground, "0,0,0", (0.0, 3.0, 4.0), 1.0) == pytest.approx(0.2)
+    low, high = (f"c0@{0.25 * CAMERA.width},{y * CAMERA.height}" for y in (0.4, 0.6))
+    apart = bn.factor_of_distance(ground, low, high, 1.0)
+    assert bn.factor_of_distance(ground.scaled(0.5), low, high, 1.0) == pytest.approx(2 * apart, rel=1e-3)
+    for bad in ("nobody", "c0@-3,1", "c0@1", "1,2", "1,2,nan"):
+        with pytest.raises(InputError, match=r"no place|outside"):
+            bn.factor_of_distance(ground, bad, "c1", 1.0)
+    with pytest.raises(InputError, match="the same place"):
+        bn.factor_of_distance(ground, "c0", "c0", 1.0)
+
+
+def test_known_poses_give_the_factor(ground: Map) -> None:
+    """In any world: only the distances of the cameras count."""
+    T_other_world = bn.SE3.exp(torch.tensor([3.0, -2, 1, 0.5, 1.0, -0.3], dtype=torch.float64))
+    known = {
+        camera.name: T_other_world @ bn.SE3(camera.pose.rotation, 3 * camera.pose.translation)
+        for camera in ground.info.cameras
+    }
+    fit = bn.factor_of_poses(ground, known | {"elsewhere": bn.SE3.identity()})
+    assert fit.factor == pytest.approx(3)
+    assert (fit.cameras, fit.error) == (3, pytest.approx(0, abs=1e-9))
+    with pytest.raises(InputError, match="1 of 1 known poses"):
+        bn.factor_of_poses(ground, {"c0": known["c0"]})
+    wrong = {
+        name: bn.SE3(known["c0"].rotation, torch.tensor([x, 0.0, 0.0]).double())
+        for name, x in (("c0", 0), ("c1", 1), ("c2", 9))
+    }
+    with pytest.raises(InputError, match="known positions of the same capture"):
+        bn.factor_of_poses(ground, wrong)
+
+
+@pytest.mark.parametrize("factor", [0, -1.0, float("nan"), float("inf"), 1e300, "2", True])
+def test_a_factor_is_a_positive_number(ground: Map, factor: float) -> None:
+    with pytest.raises(InputError, match="factor is"):
+        ground.scaled(factor)
+
+
+def test_an_interrupted_training_is_not_scaled(ground: Map) -> None:
+    with pytest.raises(InputError, match="cannot be scaled: its training stopped"):
+        replace(ground, info=replace(ground.info, complete=False)).scaled(2)
+
+
+def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
+    trained = tmp_path / "map"
+    before = bn.train(tiny.views(3), out=trained, config=tiny.config(5), bake=False)
+    status, out, err = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half")
+    assert status == 0, err
+    assert "all lengths multiplied by 0.5" in out
+    half = bn.load_map(tmp_path / "half")
+    assert half.unit == "metres"
+    assert half.bounds.side == 0.5 * before.bounds.side
+    names = [camera.name for camera in before.info.cameras]
+    length = float((before.info.cameras[0].pose.translation - before.info.cameras[1].pose.translation).norm())
+    status, _, err = bidnerf("scale", tmp_path / "half", "--distance", names[0], names[1], length)
+    assert status == 0, err
+    back = bn.load_map(tmp_path / "half")
+    assert back.bounds.side == pytest.approx(before.bounds.side)
+    view = before.info.cameras[0]
+    assert view.pose.translation.tolist() == pytest.approx(back.info.cameras[0].pose.translation.tolist())
+    assert bidnerf("scale", tmp_path / "half")[0] == 2
+    assert bidnerf("scale", tmp_path / "half", "--factor", "-1")[0] == 1
