@@ -83,6 +83,7 @@ if TYPE_CHECKING:
     from bidnerf_core.registry import register as register
     from bidnerf_core.results.errors import PoseError as PoseError
     from bidnerf_core.results.errors import pose_error as pose_error
+    from bidnerf_core.results.export import export_map as export_map
     from bidnerf_core.results.overlays import overlay as overlay
     from bidnerf_core.results.pose_files import PosedImage as PosedImage
     from bidnerf_core.results.pose_files import read_pose as read_pose
@@ -154,6 +155,7 @@ HOMES = {
     "compare": "evaluation.evaluate",
     "evaluate": "evaluation.evaluate",
     "import_map": "maps.importing",
+    "export_map": "results.export",
     "factor_of_distance": "maps.scaling",
     "factor_of_poses": "maps.scaling",
     "levels": "fields.contract",

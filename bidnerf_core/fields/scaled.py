@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, RaySamples, levels
+from bidnerf_core.fields.contract import (
+    FieldValues,
+    HitField,
+    RadianceField,
+    RayHits,
+    Rays,
+    RaySampler,
+    RaySamples,
+    levels,
+)
 
 
 class ScaledField(nn.Module):
@@ -15,7 +25,8 @@ class ScaledField(nn.Module):
 
     def __init__(self, field: RadianceField, scale: float) -> None:
         super().__init__()
-        self.trained, self.scale = field, scale
+        self.trained: Any = field
+        self.scale = scale
 
     @property
     def sampler(self) -> RaySampler:
@@ -25,12 +36,32 @@ class ScaledField(nn.Module):
     @property
     def levels(self) -> tuple[RadianceField, ...]:
         """The levels of detail of the field, coarsest first; the last one is this field."""
-        return (*(ScaledField(level, self.scale) for level in levels(self.trained)[:-1]), self)
+        return (*(scaled_field(level, self.scale) for level in levels(self.trained)[:-1]), self)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return density and colour at ``positions`` in the scaled world."""
         found = self.trained.query(positions / self.scale, directions)
         return replace(found, density=found.density / self.scale)
+
+
+class ScaledHitField(ScaledField):
+    """A scaled field that finds what whole rays meet."""
+
+    def hits(self, rays: Rays) -> RayHits:
+        """Return what rays of the scaled world meet."""
+        trained: HitField = self.trained
+        found = trained.hits(shrunk(rays, self.scale))
+        return replace(found, distance=found.distance * self.scale)
+
+
+def scaled_field(field: RadianceField, scale: float) -> ScaledField:
+    """Return a field in a world that is ``scale`` times as large; it offers what ``field`` does."""
+    return (ScaledHitField if isinstance(field, HitField) else ScaledField)(field, scale)
+
+
+def shrunk(rays: Rays, scale: float) -> Rays:
+    """Return rays of a scaled world in the world of the field."""
+    return Rays(rays.origins / scale, rays.directions, rays.near / scale, rays.far / scale)
 
 
 @dataclass(frozen=True)
@@ -42,10 +73,7 @@ class ScaledSampler:
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         """Return the samples of rays in the scaled world."""
-        shrunk = Rays(
-            rays.origins / self.scale, rays.directions, rays.near / self.scale, rays.far / self.scale
-        )
-        found = self.sampler(shrunk, jitter)
+        found = self.sampler(shrunk(rays, self.scale), jitter)
         return replace(found, starts=found.starts * self.scale, ends=found.ends * self.scale)
 
 

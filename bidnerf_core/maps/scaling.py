@@ -16,7 +16,7 @@ from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.fields.contract import LARGEST_LENGTH, RadianceField, SceneBounds, device_of
 from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.scaled import ScaledField, trained_field
+from bidnerf_core.fields.scaled import scaled_field, trained_field
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.similarity import fit_similarity, spread
@@ -76,7 +76,7 @@ def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
 
 def in_map_frame(field: RadianceField, info: MapInfo) -> RadianceField:
     """Return a field as its backend built it in the unit of its map."""
-    return field if info.field_frame is None else ScaledField(field, info.field_frame.scale)
+    return field if info.field_frame is None else scaled_field(field, info.field_frame.scale)
 
 
 def scaled_info(info: MapInfo, factor: float, unit: LengthUnit) -> MapInfo:

@@ -1,0 +1,35 @@
+"""``bidnerf export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from bidnerf_core.cli.folders import check_folder
+from bidnerf_core.cli.options import Flag, MapFolder, option, parse
+from bidnerf_core.cli.output import show
+from bidnerf_core.maps.map import load_map
+from bidnerf_core.results.export import ExportFormat, export_map
+
+
+def run(arguments: list[str]) -> None:
+    parse("export", export, arguments)
+
+
+def export(
+    map: MapFolder,
+    to: Annotated[
+        ExportFormat,
+        option(
+            "FORMAT",
+            "ply: surface, landmarks and cameras as point clouds and meshes; colmap: a text model of cameras and landmarks;"
+            " transforms.json: cameras as nerfstudio reads them, with landmarks as its sparse points",
+        ),
+    ],
+    out: Annotated[Path, option("DIR", "folder for the files")],
+    overwrite: Annotated[Flag, option(None, "write into a folder that is not empty", "")] = False,
+) -> None:
+    """Write the surface, the landmarks and the cameras of a map for other software, in the frame and the unit of the map."""
+    check_folder(out, (map,))
+    for file in export_map(load_map(map), out, to, overwrite):
+        show(f"{file}: {file.stat().st_size / 1e6:.2f} MB")

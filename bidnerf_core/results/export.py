@@ -1,0 +1,173 @@
+"""A map for other software: its surface, landmarks and cameras as point clouds, as a COLMAP model, or as ``transforms.json``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.folders import output_folder
+from bidnerf_core.maps.map import Map
+from bidnerf_core.results.colmap_poses import write_colmap_poses
+from bidnerf_core.results.pose_files import PosedImage, frame_of, transforms_json
+
+ExportFormat = Literal["ply", "colmap", "transforms.json"]
+GREY = 0.5
+"""Colour of landmarks in a map without a surface."""
+FRUSTUM = 0.03
+"""Length of the drawn frustum of a camera, as a share of the scene."""
+
+
+def export_map(scene: Map, out: str | Path, to: ExportFormat, overwrite: bool = False) -> list[Path]:
+    """Write a map into folder ``out`` in the format of other software, and return the files.
+
+    - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
+      each) and cameras.ply (a pyramid for each camera);
+    - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks, without tracks;
+    - ``"transforms.json"``: the cameras as nerfstudio reads them, and landmarks.ply as its sparse points.
+
+    All are in the frame and the unit of the map, which their heads name. Images are named as the map knows them, without the endings
+    of their files. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
+    export, and for a folder that is not empty unless ``overwrite`` is set.
+    """
+    if to not in get_args(ExportFormat):
+        raise InputError(f"format {to!r}, expected one of {', '.join(get_args(ExportFormat))}")
+    scene, out = scene.whole(), Path(out)
+    surface = None if scene.surface is None else scene.surface.to("cpu")
+    landmarks = None if scene.landmarks is None else scene.landmarks.to("cpu")
+    scene = replace(scene, surface=surface, landmarks=landmarks)
+    images = [
+        PosedImage(camera.name, number, camera.intrinsics, camera.pose, unit=scene.unit)
+        for number, camera in enumerate(scene.info.cameras)
+    ]
+    if to != "ply" and not images:
+        raise InputError(
+            f"{scene.folder or 'map in memory'}: has no cameras, expected some for {to}; ply has the surface alone"
+        )
+    if to == "ply" and not images and scene.surface is None and scene.landmarks is None:
+        raise InputError(f"{scene.folder or 'map in memory'}: has no surface, landmarks or cameras to export")
+    with output_folder(out, overwrite):
+        if to == "colmap":
+            write_colmap_poses(out / "images.txt", images)
+            head = (out / "points3D.txt").read_bytes()
+            write_file(out / "points3D.txt", head + _colmap_points(scene))
+        elif to == "transforms.json":
+            content = json.loads(transforms_json(images, out))
+            if scene.landmarks is not None:
+                content["ply_file_path"] = "landmarks.ply"
+                _write_landmarks(scene, images, out / "landmarks.ply")
+            write_file(
+                out / "transforms.json", (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
+            )
+        else:
+            _write_clouds(scene, images, out)
+    return sorted(file for file in out.iterdir() if file.suffix in (".ply", ".txt", ".json"))
+
+
+def _write_clouds(scene: Map, images: list[PosedImage], out: Path) -> None:
+    if scene.surface is not None:
+        parts = scene.surface.surfels
+        columns = {"x y z": parts.positions, "nx ny nz": parts.normals, "red green blue": parts.rgb}
+        write_file(out / "surface.ply", ply(columns, _head(scene, images, amount(len(parts), "surfel"))))
+    if scene.landmarks is not None:
+        _write_landmarks(scene, images, out / "landmarks.ply")
+    if images:
+        vertices, faces = _pyramids(images, FRUSTUM * scene.bounds.side)
+        head = _head(
+            scene,
+            images,
+            f"{amount(len(images), 'camera')}, five points each, the first of which is its centre",
+        )
+        write_file(out / "cameras.ply", ply({"x y z": vertices}, head, faces))
+
+
+def _write_landmarks(scene: Map, images: list[PosedImage], file: Path) -> None:
+    landmarks = scene.landmarks
+    assert landmarks is not None
+    columns = {"x y z": landmarks.positions, "red green blue": _colours(scene), "photos": landmarks.views}
+    write_file(file, ply(columns, _head(scene, images, amount(len(landmarks), "landmark"))))
+
+
+def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | None = None) -> bytes:
+    """Return a binary PLY of points; keys of ``columns`` name the properties of each row.
+
+    Colours in [0, 1] are written as bytes, whole numbers as 32 bits, and others in single precision.
+    """
+    kinds, values = [], []
+    for names, column in columns.items():
+        table = column.detach().cpu().reshape(len(column), -1)
+        if names == "red green blue":
+            array, kind = (table.clamp(0, 1) * 255).round().to(torch.uint8).numpy(), "uchar"
+        elif table.dtype.is_floating_point:
+            array, kind = table.float().numpy(), "float"
+        else:
+            array, kind = table.to(torch.int32).numpy(), "int"
+        for number, name in enumerate(names.split()):
+            kinds.append((name, kind))
+            values.append(array[:, number])
+    row = np.dtype([(name, {"uchar": "u1", "float": "<f4", "int": "<i4"}[kind]) for name, kind in kinds])
+    rows = np.empty(len(values[0]), row)
+    for (name, _), value in zip(kinds, values, strict=True):
+        rows[name] = value
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    lines += [f"element vertex {len(rows)}", *(f"property {kind} {name}" for name, kind in kinds)]
+    body = rows.tobytes()
+    if faces is not None:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        listed = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+        listed["count"], listed["corners"] = 3, faces
+        body += listed.tobytes()
+    return "\n".join([*lines, "end_header", ""]).encode() + body
+
+
+def _head(scene: Map, images: list[PosedImage], what: str) -> list[str]:
+    lengths = "metres" if scene.unit == "metres" else "units of unknown length"
+    lines = ["written by bidnerf", what, f"lengths in {lengths}"]
+    if scene.up is not None:
+        lines.append(f"up is {' '.join(f'{x:.6f}' for x in scene.up.direction)}, by {scene.up.source}")
+    return [*lines, frame_of(images)] if images else lines
+
+
+def _colours(scene: Map) -> Float[Tensor, "n 3"]:
+    """Return the colours of the landmarks: those of the nearest surfels."""
+    landmarks = scene.landmarks
+    assert landmarks is not None
+    if scene.surface is None:
+        return torch.full((len(landmarks), 3), GREY)
+    return scene.surface.surfels.rgb[scene.surface.nearest(landmarks.positions)]
+
+
+def _colmap_points(scene: Map) -> bytes:
+    if scene.landmarks is None:
+        return b""
+    colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
+    places = scene.landmarks.positions.tolist()
+    lines = [
+        f"{number} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} {scene.landmarks.noise:.3f}\n"
+        for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, colours, strict=True), start=1)
+    ]
+    return "".join(lines).encode()
+
+
+def _pyramids(images: list[PosedImage], length: float) -> tuple[Float[Tensor, "v 3"], np.ndarray]:
+    """Return the corners of a pyramid for each camera, and the triangles between them."""
+    corners = []
+    for image in images:
+        camera = image.intrinsics
+        right, down = 0.5 * camera.width / camera.fx * length, 0.5 * camera.height / camera.fy * length
+        local = [
+            [0.0, 0, 0],
+            *([x, y, length] for x, y in ((-right, -down), (right, -down), (right, down), (-right, down))),
+        ]
+        corners.append(image.T_world_camera.apply(torch.tensor(local, dtype=torch.float64)))
+    one = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [1, 3, 2], [1, 4, 3]])
+    faces = (one[None] + 5 * np.arange(len(images))[:, None, None]).reshape(-1, 3)
+    return torch.cat(corners), faces
