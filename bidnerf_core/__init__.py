@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from bidnerf_core.mapping import BakeConfig as BakeConfig
     from bidnerf_core.maps.collection import MapCollection as MapCollection
     from bidnerf_core.maps.collection import Placement as Placement
+    from bidnerf_core.maps.extending import extend as extend
     from bidnerf_core.maps.importers import ImportedField as ImportedField
     from bidnerf_core.maps.importing import import_map as import_map
     from bidnerf_core.maps.map import Map as Map
@@ -156,6 +157,7 @@ HOMES = {
     "evaluate": "evaluation.evaluate",
     "import_map": "maps.importing",
     "export_map": "results.export",
+    "extend": "maps.extending",
     "factor_of_distance": "maps.scaling",
     "factor_of_poses": "maps.scaling",
     "levels": "fields.contract",

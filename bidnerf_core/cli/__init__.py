@@ -23,6 +23,7 @@ COMMANDS = {
     "import": "make a map of a field that others trained: splats, a checkpoint",
     "bake": "add to a map what localization without a start needs, as train does",
     "info": "describe a map",
+    "extend": "add photos of its scene to a map",
     "export": "write the surface, landmarks and cameras of a map for other software",
     "scale": "change the unit of a map to metres",
     "render": "render images and depth of a map from a dataset's poses",

@@ -51,6 +51,7 @@ class MapInfo:
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
     unit: LengthUnit = "units"  # of all lengths in the map; "units" where nothing says how long one is
+    added: int = 0  # number of cameras that were added after training, at the end of ``cameras``
     gravity_up: tuple[float, float, float] | None = (
         None  # upward direction (world), where the capture measured gravity
     )

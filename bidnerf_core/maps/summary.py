@@ -38,6 +38,7 @@ class MapSummary:
     backend: str
     data: str  # name of the dataset's folder
     cameras: int
+    added: int  # of these cameras, after the training
     unit: LengthUnit  # of all lengths
     up: UpDirection | None  # the upward direction in the world, and what it was found from
     distances: bool  # whether the training images determine distances
@@ -77,7 +78,7 @@ class MapSummary:
         place = f"{self.map}, {(self.bytes or 0) / 2**20:.1f} MiB" if self.map else "in memory"
         return {
             "map": f"{place}, written by bidnerf {self.bidnerf}",
-            "made from": f"{self.data or 'views in memory'}, {photos}",
+            "made from": f"{self.data or 'views in memory'}, {photos}{self._added}",
             "training": f"{self.step} steps of backend {self.backend} in {time}, {state}",
             "field": self._field_line(),
             "scene": _scene_line(self.bounds),
@@ -89,6 +90,10 @@ class MapSummary:
             "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
             "settings": _shown(self.config),
         }
+
+    @property
+    def _added(self) -> str:
+        return f", {self.added} of which were added later" if self.added else ""
 
     def _field_line(self) -> str:
         error = ""
@@ -132,6 +137,7 @@ def summarized(
         backend=info.backend,
         data=info.data,
         cameras=len(info.cameras),
+        added=info.added,
         unit=info.unit,
         up=up,
         distances=info.distances,

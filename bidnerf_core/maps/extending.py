@@ -1,0 +1,383 @@
+"""Extending a map by new photos: they are located in it, the field is trained on, and landmarks and surface are completed."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from bidnerf_core.backend import load_backend
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.captures.cameras import at_stored_poses, stored_cameras
+from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets.queries import Photos, photo_files
+from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.fields.scaled import trained_field
+from bidnerf_core.frames.frame import Frame, SeenLandmarks, View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import locked
+from bidnerf_core.io.json import from_plain
+from bidnerf_core.localization import Localizer
+from bidnerf_core.mapping import (
+    DEFAULT_LANDMARKS,
+    BakeConfig,
+    LandmarkMap,
+    SurfaceMap,
+    TrackedViews,
+    bake,
+    tracked_views,
+)
+from bidnerf_core.mapping.landmarks.landmark_map import concatenated
+from bidnerf_core.maps.baking import bake_landmarks
+from bidnerf_core.maps.checkpoints import Checkpoints
+from bidnerf_core.maps.description import cameras_of, load_info
+from bidnerf_core.maps.files import save_map
+from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.maps.scaling import in_map_frame
+from bidnerf_core.maps.views import Images, read_views
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter
+from bidnerf_core.training import TrainingState, TrainingStopped
+
+log = logging.getLogger("bidnerf")
+
+NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Dataset | str | Path
+"""Photos to add: frames, a dataset or the path to one, whose own poses are not used, or the path to a photo or a folder of photos."""
+
+LEAST_LOCATED = 0.25
+"""Least share of new photos that a map of their scene recognises."""
+SAME_PLACE = 0.02
+"""Distance, as a share of the scene, within which a photo with the name of one of the map's counts as that photo."""
+STAND_IN_SIDE = 320
+"""Pixels along the longer side of what the field renders in place of the photos that it was made of."""
+STAND_IN_DEPTHS = 400
+"""Number of pixels of such a rendering whose distances are kept in training."""
+SAME_DESCRIPTOR = 0.35
+"""Largest distance of the descriptors of one landmark, as a share of their length."""
+DESCRIPTOR_LENGTH = 512.0
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedPhotos:
+    """New photos that were found in a map, and those that were not."""
+
+    views: tuple[View, ...]
+    left_out: tuple[tuple[str, str], ...] = ()  # name, and why
+    known: tuple[str, ...] = ()  # photos that the map was made of
+
+
+def extend(
+    scene: Map | str | Path,
+    photos: NewPhotos,
+    data: Images | None = None,
+    *,
+    split: str = "train",
+    steps: int | None = None,
+    config: BakeConfig | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Map:
+    """Return a map with more photos of its scene; one that lies in a folder is replaced there, once all is done.
+
+    The photos are located by the map; those that it does not recognise, and those that it was made of, are left out. Training goes on
+    with the others and with ``data``, the images that the map was made of, or, without these, with what the field renders at their
+    cameras, so that it does not forget them. ``steps`` is the number of training steps, by default in proportion to the new photos.
+    Landmarks of the new photos are added (with ``data``, all are built anew), and the surface is baked anew from all cameras.
+
+    A map whose photos are all known is returned as it is. Raises ``InputError`` where the photos show another scene, where the map has
+    no landmarks to find them by, and where its folder is changed meanwhile; raises ``Cancelled`` once ``cancel`` returns True. The map
+    in the folder then stays what it was, as it does if the process is killed.
+    """
+    scene = scene if isinstance(scene, Map) else load_map(scene)
+    where = str(scene.folder or scene.info.data or "map in memory")
+    if scene.info.interruption is not None:
+        raise InputError(f"{where}: cannot be extended: {scene.info.interruption}")
+    if steps is not None and (isinstance(steps, bool) or steps < 1):
+        raise InputError(f"steps is {steps!r}, expected a positive whole number")
+    with contextlib.nullcontext() if scene.folder is None else locked(scene.folder):
+        frames = _frames(photos, scene, split)
+        located = locate(scene, frames, where, progress, cancel)
+        if not located.views:
+            log.info(f"{where}: made of these photos already; nothing to add")
+            return scene
+        old = _old_views(scene, data, split, where, progress, cancel)
+        return _extended(
+            scene, located, old, data is not None, steps, config or BakeConfig(), where, progress, cancel
+        )
+
+
+def locate(
+    scene: Map, frames: Sequence[Frame], where: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None
+) -> LocatedPhotos:  # fmt: skip
+    """Return frames at the poses at which a map finds them, with names that the map does not have yet.
+
+    Raises ``InputError`` where the map has no landmarks, and where it recognises hardly any of the frames.
+    """
+    if scene.landmarks is None:
+        raise InputError(
+            f"{where}: has no landmarks to locate photos by; 'bidnerf bake MAP --data DATA' builds them"
+        )
+    localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
+    count = counter("locating", "photos", progress, cancel)
+    views, left_out, known = list[View](), list[tuple[str, str]](), list[str]()
+    for number, frame in enumerate(frames, start=1):
+        check_cancelled(cancel, "extending")
+        try:
+            found = localizer(frame)
+        except InputError as error:
+            left_out.append((frame.name, str(error)))
+            continue
+        stored = cameras.get(frame.name)
+        if not found.converged:
+            left_out.append((frame.name, f"{found.outcome}: {found.reason}"))
+        elif stored is not None and _apart(found.T_world_camera, stored) < SAME_PLACE * scene.bounds.side:
+            known.append(frame.name)
+        else:
+            named = replace(
+                found.frame_as_taken(frame),
+                name=_free(frame.name, {*cameras, *(v.frame.name for v in views)}),
+            )
+            views.append(View(named, found.T_world_camera))
+        count(number, len(frames))
+    for name, why in left_out:
+        log.info(f"{name}: left out: {why}")
+    if len(views) + len(known) < max(1.0, LEAST_LOCATED * len(frames)):
+        raise InputError(
+            f"{where}: recognises {len(views) + len(known)} of {amount(len(frames), 'photo')}, expected photos of its scene"
+        )
+    log.info(
+        f"{where}: {len(views)} of {amount(len(frames), 'photo')} located, {len(known)} already in the map,"
+        f" {len(left_out)} left out"
+    )
+    return LocatedPhotos(tuple(views), tuple(left_out), tuple(known))
+
+
+def _frames(photos: NewPhotos, scene: Map, split: str) -> list[Frame]:
+    """Read photos, reduced to the size of the largest image of the map."""
+    if isinstance(photos, str | Path):
+        path = Path(photos)
+        if path.is_dir() and find_reader(path) is not None:
+            photos = open_dataset(path, scene.bounds.background)
+        else:
+            assumed = () if scene.landmarks is None else scene.landmarks.cameras
+            source = Photos(
+                photo_files([path]), CameraSource(assumed=assumed), background=scene.bounds.background
+            )
+            photos = [source.read(n).frame for n in range(len(source.names))]
+    if isinstance(photos, Dataset):
+        names = photos.frame_names(split)
+        photos = [view.frame for name in names for view in photos.views(split, [name])]
+    sides = [max(c.intrinsics.width, c.intrinsics.height) for c in scene.info.cameras]
+    frames = [item.frame if isinstance(item, View) else item for item in photos]
+    for frame in frames:
+        if not isinstance(frame, Frame):
+            raise InputError(f"photos holds a {type(frame).__name__}, expected frames, views, or a path")
+    if not frames:
+        raise InputError("no photos to add, expected at least one")
+    return [frame.at_most(max(sides)) if sides else frame for frame in frames]
+
+
+def _old_views(
+    scene: Map, data: Images | None, split: str, where: str, progress: ProgressCallback | None, cancel: Cancel | None
+) -> list[View]:  # fmt: skip
+    """Return the images that the map was made of, or what its field renders at their cameras."""
+    if data is not None:
+        background = scene.bounds.background if isinstance(data, str | Path) else None
+        views = at_stored_poses(
+            read_views(data, split, background, progress=progress, cancel=cancel).views, scene.info.cameras
+        )
+        own = {camera.name for camera in scene.info.cameras}
+        if not any(view.frame.name in own for view in views):
+            raise InputError(f"{where}: data has none of the images that the map was made of, expected these")
+        return views
+    count, cameras = counter("rendering", "images", progress, cancel), cameras_of(scene.info)
+    views = []
+    for number, ((intrinsics, pose), camera) in enumerate(
+        zip(cameras, scene.info.cameras, strict=True), start=1
+    ):
+        small = intrinsics.scaled(min(1.0, STAND_IN_SIDE / max(intrinsics.width, intrinsics.height)))
+        image = render_image(scene.field, small, pose, scene.bounds)
+        frame = Frame(camera.name, image.rgb.cpu().clamp(0, 1), small)
+        views.append(
+            View(frame, pose, landmarks=_distances(frame, image.depth.cpu(), image.opacity.cpu(), number))
+        )
+        count(number, len(cameras))
+    return views
+
+
+def _distances(frame: Frame, depth: Tensor, opacity: Tensor, seed: int) -> SeenLandmarks:
+    """Return some of the distances that a field renders, so that training keeps them without taking them for measurements."""
+    solid = ((opacity > 0.95) & (depth > 0)).nonzero()
+    generator = torch.Generator().manual_seed(seed)
+    rows = solid[torch.randperm(len(solid), generator=generator)[:STAND_IN_DEPTHS]]
+    pixels = rows.flip(-1).double() + 0.5
+    along = frame.intrinsics.unproject(pixels).norm(dim=-1)
+    distance = depth[rows[:, 0], rows[:, 1]].double() * along
+    return SeenLandmarks(pixels.float(), distance.float(), (0.01 * distance).float())
+
+
+def _extended(
+    scene: Map, located: LocatedPhotos, old: Sequence[View], complete: bool, steps: int | None, config: BakeConfig,
+    where: str, progress: ProgressCallback | None, cancel: Cancel | None,
+) -> Map:  # fmt: skip
+    began, info, new = time.monotonic(), scene.info, list(located.views)
+    tracked = tracked_views(
+        [*old, *new] if complete else new,
+        info.landmark_features,
+        progress=counter("landmarks", "steps", progress, cancel),
+    )
+    weighted = list(old) if complete else list(old) * _repeated(old, new)
+    field, done = _trained_on(
+        scene, [*weighted, *new], steps, len(new) / max(1, len(old) + len(new)), progress, cancel
+    )
+    info = replace(
+        info, cameras=(*info.cameras, *stored_cameras(new)), step=info.step + done, added=info.added + len(new),
+        seconds=info.seconds + time.monotonic() - began,
+    )  # fmt: skip
+    whole = replace(scene, info=info, field=in_map_frame(field, info), folder=None, record=scene.capture)
+    surface = _surface(whole, [*old, *new] if complete else new, config, progress, cancel)
+    check_cancelled(cancel, "extending")
+    if complete:
+        baked = bake_landmarks(info, whole.field, [*old, *new], where, tracked, progress, cancel, whole.up)
+        landmarks, record = baked.landmarks or scene.landmarks, baked.capture
+        info = replace(info, colour_noise=baked.colour_noise)
+    else:
+        landmarks, record = _with_more_landmarks(scene, tracked), scene.capture
+    if landmarks is not None:
+        landmarks = replace(landmarks, cameras=tuple(camera.intrinsics for camera in info.cameras))
+    grown = replace(whole, info=info, surface=surface or scene.surface, landmarks=landmarks, record=record)
+    before, after = (0 if each is None else len(each) for each in (scene.landmarks, landmarks))
+    log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")
+    if scene.folder is None:
+        return grown
+    if load_info(scene.folder).weights != scene.info.weights:
+        raise InputError(f"{where}: was trained anew meanwhile; extend it again")
+    check_cancelled(cancel, "extending")
+    state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
+    here = grown.to("cpu")
+    stored = save_map(scene.folder, info, state, here.surface, here.landmarks, record)
+    return replace(grown, info=stored, folder=scene.folder)
+
+
+def _repeated(old: Sequence[View], new: Sequence[View]) -> int:
+    """Return how often renderings are given so that, with fewer pixels than photos, they count as much; three times at most."""
+    if not old:
+        return 1
+    pixels = [
+        sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part)
+        for part in (old, new)
+    ]
+    return min(3, max(1, round(pixels[1] / pixels[0])))
+
+
+def _trained_on(
+    scene: Map, views: Sequence[View], steps: int | None, share: float, progress: ProgressCallback | None, cancel: Cancel | None
+) -> tuple[RadianceField, int]:  # fmt: skip
+    """Train a copy of the field on; return it, in the unit of its own training, and the number of steps."""
+    info = scene.info
+    backend = load_backend(info.backend, str(scene.folder or ""))
+    settings: Any = from_plain(backend.config_type, info.config, "config")
+    usual = getattr(settings, "steps", None)
+    if isinstance(usual, int):
+        settings = replace(settings, steps=steps or max(1, math.ceil(usual * max(share, 0.25))))
+    elif steps is not None:
+        raise InputError(f"steps is {steps}, but backend {info.backend!r} has no such setting; leave it out")
+    if not isinstance(trained := trained_field(scene.field), nn.Module):
+        raise InputError(f"the map's field is a {type(trained).__name__}, expected an nn.Module of a backend")
+    field = copy.deepcopy(trained).requires_grad_(True).train()
+    scale = 1.0 if info.field_frame is None else info.field_frame.scale
+    own = [_in_field_unit(view, 1 / scale) for view in views] if scale != 1 else list(views)
+    report = Checkpoints(replace(info, step=0, complete=False), progress=progress, cancel=cancel)
+    try:
+        backend.train(cast(RadianceField, field), own, settings, report)
+    except TrainingStopped as stopped:
+        raise Cancelled(f"cancelled after step {stopped.step}; the map is what it was") from stopped
+    field.requires_grad_(False).eval()
+    return cast(RadianceField, field), int(getattr(settings, "steps", report.info.step))
+
+
+def _in_field_unit(view: View, factor: float) -> View:
+    """Return a view whose lengths are multiplied by a factor."""
+    pose = SE3(view.T_ref_camera.rotation, view.T_ref_camera.translation * factor)
+    frame, seen = view.frame, view.landmarks
+    if frame.depth is not None:
+        frame = replace(frame, depth=frame.depth * factor)
+    if seen is not None:
+        seen = replace(seen, distance=seen.distance * factor, deviation=seen.deviation * factor)
+    return replace(view, frame=frame, T_ref_camera=pose, landmarks=seen)
+
+
+def _surface(
+    scene: Map,
+    views: Sequence[View],
+    config: BakeConfig,
+    progress: ProgressCallback | None,
+    cancel: Cancel | None,
+) -> SurfaceMap | None:
+    """Bake the surface from measured depth where views have it, and elsewhere from what the field renders."""
+    measured = [view for view in views if view.frame.has_dense_depth]
+    names = {view.frame.name for view in measured}
+    cameras = [
+        place
+        for camera, place in zip(scene.info.cameras, cameras_of(scene.info), strict=True)
+        if camera.name not in names
+    ]
+    try:
+        return bake(
+            scene.field, scene.bounds, cameras, measured, config, counter("baking", "views", progress, cancel)
+        )
+    except InputError as error:
+        log.info(f"the surface stays as it was: {error}")
+        return None
+
+
+def _with_more_landmarks(scene: Map, tracked: TrackedViews) -> LandmarkMap | None:
+    """Return the landmarks of a map with those of new photos that it lacks."""
+    landmarks = scene.landmarks
+    try:
+        more = tracked.landmarks(DEFAULT_LANDMARKS)
+    except InputError as error:  # one photo, or photos that share nothing
+        log.info(f"no new landmarks: {error}")
+        return landmarks
+    if landmarks is None or not len(more):
+        return landmarks or more
+    new = more[~_present(landmarks, more)]
+    return concatenated([landmarks, new])
+
+
+def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
+    """Return which landmarks of ``more`` are among ``landmarks``: near one in space, by its accuracy, with a like descriptor."""
+    count = min(4, len(landmarks))
+    away, near = cKDTree(landmarks.positions.numpy()).query(more.positions.numpy(), k=count)
+    distance = torch.from_numpy(np.asarray(away).reshape(len(more), -1))
+    index = torch.from_numpy(np.asarray(near).reshape(len(more), -1))
+    deviation = more.deviations.amax(-1)[:, None] + landmarks.deviations.amax(-1)[index]
+    descriptors = landmarks.descriptors[index].float() - more.descriptors[:, None].float()
+    alike = descriptors.norm(dim=-1) <= SAME_DESCRIPTOR * DESCRIPTOR_LENGTH
+    return ((distance <= 3 * deviation) & alike).any(-1)
+
+
+def _apart(first: SE3, second: SE3) -> float:
+    return float((first.translation - second.translation).norm())
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Return a name that is not taken: the name itself, or with the first number that makes it one."""
+    number, found = 2, name
+    while found in taken:
+        found, number = f"{name}_{number}", number + 1
+    return found
