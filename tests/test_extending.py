@@ -14,6 +14,7 @@ from bidnerf_core.testing.textured_field import training_views, view
 from commands import Run
 
 STEPS = 12
+BAKE = bn.BakeConfig(rays=20_000, measured=60_000, cells=20_000)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
         list(training_views()[:7]),
         out=folder,
         config=tiny.config(25),
-        bake=bn.BakeConfig(rays=20_000, measured=60_000),
+        bake=BAKE,
     )
     return folder
 
@@ -41,7 +42,7 @@ def map_folder(stored: Path, tmp_path: Path) -> Path:
 
 def test_new_photos_are_located_and_added(map_folder: Path) -> None:
     before, new = bn.load_map(map_folder), training_views()[7:]
-    after = bn.extend(map_folder, new, steps=STEPS)
+    after = bn.extend(map_folder, new, steps=STEPS, config=BAKE)
     assert [camera.name for camera in after.info.cameras[7:]] == [each.frame.name for each in new]
     for camera, truth in zip(after.info.cameras[7:], new, strict=True):
         assert float((camera.pose.translation - truth.T_ref_camera.translation).norm()) < 0.03
@@ -58,7 +59,7 @@ def test_new_photos_are_located_and_added(map_folder: Path) -> None:
 
 def test_the_same_photos_change_nothing(map_folder: Path) -> None:
     before = files(map_folder)
-    same = bn.extend(map_folder, training_views()[:3], steps=STEPS)
+    same = bn.extend(map_folder, training_views()[:3], steps=STEPS, config=BAKE)
     assert len(same.info.cameras) == 7
     assert files(map_folder) == before
 
@@ -67,7 +68,7 @@ def test_another_scene_is_refused(map_folder: Path) -> None:
     before = files(map_folder)
     others = [replace(view(each.T_ref_camera, f"x{n}", 9)) for n, each in enumerate(training_views()[:2])]
     with pytest.raises(InputError, match="recognises 0 of 2 photos, expected photos of its scene"):
-        bn.extend(map_folder, others, steps=STEPS)
+        bn.extend(map_folder, others, steps=STEPS, config=BAKE)
     assert files(map_folder) == before
 
 
@@ -75,7 +76,7 @@ def test_a_cancelled_extension_leaves_the_map(map_folder: Path) -> None:
     before, steps = files(map_folder), []
     with pytest.raises(Cancelled):
         bn.extend(
-            map_folder, training_views()[7:], steps=STEPS,
+            map_folder, training_views()[7:], steps=STEPS, config=BAKE,
             progress=lambda p: steps.append(p) if p.stage == "training" else None, cancel=lambda: len(steps) > 3,
         )  # fmt: skip
     assert files(map_folder) == before
@@ -86,7 +87,7 @@ def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
     large = bn.load_map(map_folder).scaled(2.0)
     old = [replace(v, frame=replace(v.frame, depth=None), T_ref_camera=bn.SE3(v.T_ref_camera.rotation, 2 * v.T_ref_camera.translation))
            for v in training_views()[:7]]  # fmt: skip
-    after = bn.extend(large, training_views()[7:8], old, steps=STEPS)
+    after = bn.extend(large, training_views()[7:8], old, steps=STEPS, config=BAKE)
     assert len(after.info.cameras) == 8
     assert after.folder is None
     truth = training_views()[7].T_ref_camera.translation

@@ -240,6 +240,8 @@ def _extended(
         info.landmark_features,
         progress=counter("landmarks", "steps", progress, cancel),
     )
+    seeing = _with_distances([*old, *new] if complete else new, tracked)
+    old, new = (seeing[: len(old)], seeing[len(old) :]) if complete else (old, seeing)
     weighted = list(old) if complete else list(old) * _repeated(old, new)
     field, done = _trained_on(
         scene, [*weighted, *new], steps, len(new) / max(1, len(old) + len(new)), progress, cancel
@@ -271,6 +273,18 @@ def _extended(
     here = grown.to("cpu")
     stored = save_map(scene.folder, info, state, here.surface, here.landmarks, record)
     return replace(grown, info=stored, folder=scene.folder)
+
+
+def _with_distances(views: Sequence[View], tracked: TrackedViews) -> list[View]:
+    """Return the views, those without dense depth with the landmarks that they show, from which training takes distances."""
+    try:
+        seen = tracked.seen(DEFAULT_LANDMARKS)
+    except InputError:  # one photo, or photos that share nothing
+        return list(views)
+    return [
+        view if view.frame.has_dense_depth else replace(view, landmarks=part)
+        for view, part in zip(views, seen, strict=True)
+    ]
 
 
 def _repeated(old: Sequence[View], new: Sequence[View]) -> int:
