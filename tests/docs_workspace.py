@@ -34,11 +34,12 @@ EQUIVALENT_MM = 41  # on 35 mm film, about the focal length of that camera
 
 
 def fill(folder: Path) -> None:
-    """Write DATA, SCAN, MAP, MAP2, photo.jpg, depth.png, photos/, camera.json and pose.json into ``folder``."""
+    """Write DATA, SCAN, MAP, MAP2, MAPS/, photo.jpg, depth.png, photos/, camera.json, pose.json and poses.json into ``folder``."""
     train, test = tiny.views(8), named(tiny.views(3, seed=1))
     write_transforms(folder / "DATA", {"train": train, "test": test}, tiny.BACKGROUND)
     write_map(folder / "MAP", train)
     shutil.copytree(folder / "MAP", folder / "MAP2")
+    shutil.copytree(folder / "MAP", folder / "MAPS" / "hall")
     write_photo(folder / "photo.jpg", test[0])
     write_depth(folder / "depth.png", test[0])
     for number, view in enumerate(test[:2]):
@@ -46,6 +47,8 @@ def fill(folder: Path) -> None:
     write_scan(folder / "SCAN", test)
     pose = test[0].T_ref_camera.matrix().tolist()
     (folder / "pose.json").write_text(json.dumps({"T_world_camera": pose, "outcome": Outcome.CONVERGED}))
+    both = [{"frame": f"{number}", "T_world_camera": pose} for number in range(2)]
+    (folder / "poses.json").write_text(json.dumps(both))
     camera = PHOTO_CAMERA
     intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": 24, "h": 24}
     (folder / "camera.json").write_text(json.dumps(intrinsics))

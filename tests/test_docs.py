@@ -51,7 +51,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
     ): "asks a running service; tests/test_service.py does"
 }
 """Python blocks that are not executed, by page and first line, each with the reason."""
-TOO_SLOW = {"train", "demo", "evaluate", "compare", "report", "import", "serve"}
+TOO_SLOW = {"train", "demo", "evaluate", "compare", "report", "import", "serve", "extend", "scale"}
 """Commands that are only parsed: they take minutes, or the results of one that does, files of a plugin's, or run until stopped."""
 OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest", "curl"}
 """Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""

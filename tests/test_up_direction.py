@@ -29,7 +29,7 @@ def looking(
         roll = math.radians(roll_deg) * float(torch.randn((), generator=generator)) + sideways * math.pi / 2
         turn = SE3.exp(torch.tensor([0, 0, 0, 0, 0, roll], dtype=torch.float64)).rotation
         poses.append(SE3(WORLD @ axes @ turn, torch.zeros(3, dtype=torch.float64)))
-    return poses
+    return SE3.stack(poses)
 
 
 def normals(floor: int, wall: int, clutter: int) -> torch.Tensor:

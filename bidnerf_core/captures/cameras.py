@@ -86,6 +86,11 @@ class PoseRefinement(PoseConsistency):
     replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized by the others' landmarks
 
 
+def poses_of(cameras: Sequence[StoredCamera]) -> SE3:
+    """Return T_world_camera of all cameras (n), float64."""
+    return _pose([camera.T_world_camera for camera in cameras])
+
+
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
     """Return the cameras of training views in the form that ``map.json`` holds."""
     return tuple(

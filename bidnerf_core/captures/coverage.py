@@ -12,6 +12,7 @@ from torch import Tensor
 from bidnerf_core.captures.report import Arrangement, CoverageRecord, Gap
 from bidnerf_core.captures.up_direction import UpDirection, up_direction
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews
 from bidnerf_core.mapping.geometry.observations import Sightings
 
@@ -48,7 +49,7 @@ def coverage(
     angle = parallax_deg(matched)
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
     rotations = torch.stack([v.T_ref_camera.rotation.cpu().double() for v in views])
-    upward = (up or up_direction([view.T_ref_camera for view in views])).tensor()
+    upward = (up or up_direction(SE3(rotations, centres))).tensor()
     centre, converge = _meeting_point(centres, rotations[:, :, 2])
     directions = centres - centre if converge else rotations[:, :, 2]
     arrangement, open_side, gaps, heights = _around(views, directions, upward, converge)

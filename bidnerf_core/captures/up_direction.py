@@ -57,12 +57,12 @@ def given_up(direction: Sequence[float]) -> UpDirection:
     return _found(normalize(torch.tensor(tuple(direction), dtype=torch.float64), dim=0), "gravity")
 
 
-def up_direction(poses: Sequence[SE3], normals: Float[Tensor, "n 3"] | None = None) -> UpDirection:
+def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpDirection:
     """Return the upward direction of a scene from its cameras and, where there is a surface, from the normals of its surfels.
 
-    ``poses`` are T_world_camera of the images, at least one; the sign of a normal has no meaning.
+    ``poses`` are T_world_camera of the images (n), at least one; the sign of a normal has no meaning.
     """
-    rotations = torch.stack([T.rotation.detach().cpu().double() for T in poses])
+    rotations = poses.rotation.detach().cpu().double()
     planes = _planes(normals)
     best: tuple[float, Tensor, UpSource] | None = None
     for up_axis, level_axis, prior in (
@@ -74,7 +74,7 @@ def up_direction(poses: Sequence[SE3], normals: Float[Tensor, "n 3"] | None = No
             direction = direction if float((up_axis @ direction).mean()) >= 0 else -direction
             looking_up = max(0.0, float((rotations[:, :, 2] @ direction).mean()))  # which is rare
             tilt = (level_axis @ direction).square().mean() / math.sin(math.radians(ROLL_DEG)) ** 2
-            score = prior + math.log(CHANCE + support) - 0.5 * min(len(poses), INDEPENDENT) * float(tilt)
+            score = prior + math.log(CHANCE + support) - 0.5 * min(len(rotations), INDEPENDENT) * float(tilt)
             score -= LOOKING_UP * looking_up
             if best is None or score > best[0]:
                 best = score, direction, source

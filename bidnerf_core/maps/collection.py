@@ -133,13 +133,10 @@ class MapCollection:
                 vectors[key] = vocabulary.pooled(descriptors)
         found = []
         for name in self._maps:
-            pooled, key = self._pooled.get(name), self._key.get(name)
-            known = pooled is not None and key in vectors
-            cosine = (
-                float((pooled @ vectors[key]).max())
-                if known and pooled is not None and key is not None
-                else -1.0
-            )
+            own = self._key.get(name)
+            cosine = -1.0
+            if own is not None and own in vectors:
+                cosine = float((self._pooled[name] @ vectors[own]).max())
             found.append(Similarity(name, cosine))
         return sorted(found, key=lambda similarity: -similarity.cosine)
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.captures.cameras import at_stored_poses
+from bidnerf_core.captures.cameras import at_stored_poses, poses_of
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.captures.up_direction import UpDirection, given_up, up_direction
 from bidnerf_core.errors import InputError, amount
@@ -100,7 +100,7 @@ class Map:
         if not self.info.cameras:
             return None
         normals = None if self.surface is None else self.surface.surfels.normals
-        return up_direction([camera.pose for camera in self.info.cameras], normals)
+        return up_direction(poses_of(self.info.cameras), normals)
 
     @property
     def colour_noise(self) -> float | None:

@@ -45,7 +45,7 @@ def plot_path(
     """
     if up is None:
         normals = None if surface is None else surface.surfels.normals
-        up = up_direction([path.poses[i] for i in range(len(path.poses.translation))], normals)
+        up = up_direction(path.poses, normals)
     axes = _axes(path.poses, up.tensor())
     with styled():
         figure = new_figure(9.6, 4.9)
