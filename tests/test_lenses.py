@@ -63,7 +63,7 @@ def photo_of(lens: Lens) -> np.ndarray:
     camera = pycolmap.Camera(model=lens.name, width=SIZE[0], height=SIZE[1], params=PARAMETERS[lens.name])
     v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
     flat = np.asarray(camera.cam_ray_from_img(np.stack([u, v], -1).reshape(-1, 2)))
-    return scene(flat.reshape(SIZE[1], SIZE[0], 3)).round().astype(np.uint8)
+    return np.nan_to_num(scene(flat.reshape(SIZE[1], SIZE[0], 3)).round()).astype(np.uint8)
 
 
 def panorama(width: int) -> np.ndarray:
@@ -185,6 +185,18 @@ def test_fisheye_in_transforms(changes: dict[str, object], tmp_path: Path) -> No
     left = second.frame.hidden[:, : int(first.frame.intrinsics.cx) - 2]
     assert bool(left.all()), "masks are of the image as it is stored"
     assert not bool(second.frame.hidden[40:-40, int(first.frame.intrinsics.cx) + 2 : -40].any())
+
+
+def test_masks_in_a_folder_are_of_the_images_as_stored(tmp_path: Path) -> None:
+    folder, masks = write_fisheye(tmp_path), tmp_path / "masks"
+    masks.mkdir()
+    (masks / "0.png").write_bytes((folder / "mask.png").read_bytes())
+    (view,) = open_dataset(folder, masks=masks).views("test")
+    hidden, middle = view.frame.hidden, int(view.frame.intrinsics.cx)
+    assert hidden is not None
+    assert bool(hidden[:, : middle - 2].all())
+    assert not bool(hidden[40:-40, middle + 2 : -40].any())
+    assert view.frame.held_rgb.dtype == torch.uint8
 
 
 @pytest.mark.parametrize(("size", "factor"), [((400, 320), 2), ((100, 80), 0.5)])

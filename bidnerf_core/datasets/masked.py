@@ -7,6 +7,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import torch
+
+from bidnerf_core.camera.lenses import CentralLens
 from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, ReadFrame, SequenceEntry, TimedFrame
@@ -61,8 +64,14 @@ def mask_folder(masks: str | Path | MaskFolder) -> MaskFolder:
 
 def masked(frame: Frame, masks: MaskFolder) -> Frame:
     """Return the frame with what its mask hides, by its name. Raises ``InputError`` as ``MaskFolder.hidden`` does."""
-    size = (frame.intrinsics.width, frame.intrinsics.height)
-    return frame.with_hidden(masks.hidden(frame.name, Raster(*size), size))
+    if not isinstance(frame.lens, CentralLens):
+        size = (frame.intrinsics.width, frame.intrinsics.height)
+        return frame.with_hidden(masks.hidden(frame.name, Raster(*size), size))
+    size = (frame.lens.width, frame.lens.height)  # the mask is of the image before it was undistorted
+    hidden = masks.hidden(frame.name, Raster(*size), size)
+    if hidden is None:
+        return frame
+    return frame.with_hidden(torch.from_numpy(frame.lens.resampled(hidden.byte().numpy(), nearest=True)) > 0)
 
 
 def masked_sequence(frames: FrameSequence, masks: MaskFolder) -> FrameSequence:

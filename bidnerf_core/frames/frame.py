@@ -70,6 +70,9 @@ class Frame:
     colours around it.
     """
 
+    lens: Lens | None = None
+    """The lens from whose image those of the frame were resampled on reading, where that was no pinhole camera."""
+
     def __post_init__(self) -> None:
         where, camera = f"frame {self.name}", self.intrinsics
         if not isinstance(camera, Intrinsics):
@@ -186,7 +189,7 @@ class Frame:
         intrinsics = camera
         if isinstance(camera, Lens):
             intrinsics, images = camera.pinhole, images.as_pinhole(camera)
-            about = {"camera_source": camera.sentence} | about
+            about = {"camera_source": camera.sentence} | about | {"lens": camera}
         hidden = images.hidden if images.hidden is not None and bool(images.hidden.any()) else None
         return Frame(name, images.rgb, intrinsics, images.depth, images.alpha, hidden=hidden, **about)  # type: ignore[arg-type]
 
@@ -197,7 +200,7 @@ class Frame:
         """
         if hidden is None or not bool(hidden.any()):
             return self
-        return replace(self, hidden=hidden if self.hidden is None else hidden | self.hidden)
+        return self.with_images(hidden=hidden if self.hidden is None else hidden | self.hidden)
 
     @staticmethod
     def from_numpy(
