@@ -42,6 +42,8 @@ class ImportSettings(Settings):
     pixel_angle: Annotated[float, Range(0, 0.1)] = 0.001
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour (rgb) where a ray meets nothing
     degree: Annotated[int, Range(0, 3)] = 3  # highest degree of the harmonics that is kept
+    # composite in the order of the means, as the renderers do with which splats are trained
+    by_means: bool = True
     least_opacity: NotNegative = 0.0  # opacity below which Gaussians are left out
 
 
@@ -88,7 +90,7 @@ def imported(
     opaque = moved.means[moved.opacities > OPAQUE]
     points = opaque if len(opaque) >= FEWEST else moved.means
     bounds = bounds_about(points, config.background)
-    settings = GaussiansConfig(gaussians=len(moved), degree=moved.degree, by_means=True, steps=1)
+    settings = GaussiansConfig(gaussians=len(moved), degree=moved.degree, by_means=config.by_means, steps=1)
     field = GaussiansField(settings, bounds)
     field.assign(moved)
     facts = [f"{count:,} Gaussians, harmonics of degree {gaussians.degree}" + (f" ({of.name})" if of else "")]
