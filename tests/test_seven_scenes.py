@@ -140,7 +140,7 @@ def test_a_sequence_may_lack_poses_and_depth(scene: Path) -> None:
     assert [dataset.frame_names(split) for split in dataset.splits] == [["frame-000002"], ["frame-000000"]]
     for file in one.glob("*.pose.txt"):
         file.unlink()
-    with pytest.raises(InputError, match=r"frame-000000\.pose\.txt: no such file"):
+    with pytest.raises(InputError, match=r"frame-00000\d\.pose\.txt: no such file"):
         open_dataset(one)
 
 
