@@ -1,151 +1,241 @@
-"""Poses in another convention than expected: axes of other software, or inverse matrices.
+"""Poses that contradict their images, and what they would have to mean to agree with them.
 
 Which keypoints of two images show the same point follows from the images alone (RANSAC of an essential matrix, Nistér, PAMI
-2004). Poses under which most of these matches are off their epipolar lines, and would not be with other axes or as inverse
-matrices, are in another convention.
+2004). Under right poses these matches lie on their epipolar lines, and their points in front of both cameras; the lines alone do
+not see the sign of a baseline (Hartley, Cheirality, IJCV 1998). Poses under which most pairs of images disagree are wrong, and each
+reading of ``pose_readings`` is tried and counted in the same way.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from bidnerf_core.captures.pose_readings import SWAP, Y_AND_Z_REVERSED, Reading, readings, with_axes
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import PosedKeypoints
 from bidnerf_core.mapping.landmarks.features import squared_distances
 from bidnerf_core.mapping.landmarks.tracks import LEAST_BASELINE, likely_pairs_of_poses
 
 MOST_PAIRS = 40
-"""Largest number of pairs of images that are examined."""
+"""Largest number of pairs of images that are examined, of those that poses and order propose, and of those that images propose."""
+COMPARED_IMAGES, COMPARED_KEYPOINTS = 60, 300
+"""Number of images all of whose pairs are compared, and of the strongest keypoints of each that are."""
+PARTNERS, SIMILAR_MATCHES = 2, 12
+"""Number of other images that an image proposes, and least number of matches of them."""
 ENOUGH_PAIRS = 8
-"""Least number of pairs with matches, from which the convention is judged."""
+"""Least number of pairs with matches, from which poses are judged."""
 RATIO = 0.8
 """Largest ratio of a match's descriptor distance to that of the next best (Lowe 2004)."""
 ENOUGH_MATCHES = 40
 """Least number of matches of a pair that agree on an essential matrix."""
-MATCH_PIXELS, POSE_PIXELS = 1.0, 4.0
-"""Largest distance (pixels) of a match from its epipolar line: by its own essential matrix, and by poses of any source."""
-NEAR_LINES = 0.7
-"""Least share of the matches of a pair near their epipolar lines, for poses that agree with it."""
-FEW, MOST = 0.4, 0.7
-"""Shares of the pairs with which poses agree: fewer contradict them as given, and as many support another convention."""
+MATCH_PIXELS, POSE_PIXELS = 1.0, 2.0
+"""Least bounds (pixels) of a match's distance from its epipolar line: by its own essential matrix, and by poses of any source."""
+USUAL_FOCAL = 700.0
+"""Focal length (pixels) beyond which pixels count as larger: keypoints of larger images are found in reduced ones."""
+POSE_ANGLE = 4 / USUAL_FOCAL
+"""Distance from the epipolar line, on the plane z = 1, that errors of right poses may cause."""
+NEAR_LINES, IN_FRONT = 0.7, 0.7
+"""Least shares of the matches of a pair near their epipolar lines and in front of both cameras, for poses that agree with it."""
+PARALLAX_PIXELS, ENOUGH_PARALLAX = 3.0, 10
+"""Least parallax of a match that shows on which side of the cameras its point is, and least number of such matches."""
+HALF = 0.5
+"""Share of the pairs that given poses must agree with: they are refused where they disagree with most."""
+MOST = 0.7
+"""Share of the pairs that a reading must agree with to be named."""
 ALMOST_BEST = 0.9
-"""Share of the best convention's pairs with which a more usual one must agree to be preferred."""
+"""Share of the best reading's pairs with which a more usual one must agree to be preferred."""
+NEARLY_ALL, NOT_ALL = 0.9, 0.75
+"""Shares of the pairs: where the given poses agree with at most the second, a reading that agrees with the first is right, even if
+the given poses do not disagree with most. Some mistakes hardly show where cameras move on one level."""
+FIT_ROUNDS = 10
+"""Rounds of reweighting in which the axes of positions are fitted."""
+PRIOR = 1e-4
+"""Weight of the identity in a fit of the axes of positions, relative to that of the matches."""
+SIMILAR = 0.03
+"""Largest difference of entries of a fitted matrix, relative to its largest, that is attributed to noise."""
 
 
 @dataclass(frozen=True)
-class OtherConvention:
-    """A convention in which the poses agree with the images, as they do not in the expected one."""
+class PoseContradiction:
+    """Poses that disagree with the images, and the reading in which they would agree, if there is one."""
 
-    axes: tuple[
-        tuple[int, int, int], ...
-    ]  # rows of R_given_true, the true camera's axes in the given camera's
-    inverted: bool  # whether the given matrices are T_camera_world
     pairs: int  # of images with matches
-    agreeing: int  # pairs with which this convention agrees
     agreeing_as_given: int
+    reading: Reading | None = None
+    agreeing: int = 0  # pairs with which the reading agrees
 
     @property
     def sentence(self) -> str:
         """What is wrong, and what to do about it."""
         found = (
             f"the poses contradict the photos: they agree with the keypoints of {self.agreeing_as_given} of {self.pairs}"
-            f" pairs of photos, but of {self.agreeing} if the matrices are"
+            " pairs of photos"
         )
-        if self.inverted:
+        if self.reading is None:
             return (
-                f"{found} inverses (world to camera); invert them, and if they are then refused again, multiply each from"
-                " the right by diag(1, -1, -1, 1)"
+                f"{found}, and no usual mistake explains it; check that each pose belongs to its photo, that the matrices are"
+                " camera to world, and the camera's focal length and distortion"
             )
-        if self.axes == Y_AND_Z_REVERSED:
-            return (
-                f"{found} for cameras whose y and z axes are reversed (OpenCV's and COLMAP's axes where OpenGL's and"
-                " Blender's are expected, or the other way round); multiply each from the right by diag(1, -1, -1, 1)"
-            )
-        return f"{found} for cameras with other axes: right, down and forward are {self._named_axes}"
-
-    @property
-    def _named_axes(self) -> str:
-        """Where the true camera's axes point, in terms of the given camera's."""
-        names = ("right", "down", "forward"), ("left", "up", "backward")
-        words = []
-        for column in zip(*self.axes, strict=True):
-            number = next(i for i, value in enumerate(column) if value)
-            words.append(names[column[number] < 0][number])
-        return "the given ones' {}, {} and {}".format(*words)
+        return f"{found}, but of {self.agreeing} if {self.reading.clause}; {self.reading.remedy}"
 
 
-Y_AND_Z_REVERSED = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
-
-
-def other_convention(images: Sequence[PosedKeypoints]) -> OtherConvention | None:
-    """Return the convention that the poses of ``images`` follow, if it is plainly another one than expected."""
-    known = [pair for i, j in _pairs(images) if (pair := _matched(images, i, j)) is not None]
-    if len(known) < ENOUGH_PAIRS:
+def pose_contradiction(images: Sequence[PosedKeypoints]) -> PoseContradiction | None:
+    """Return how the poses of ``images`` contradict these; None where they agree, or the images do not tell."""
+    proposed = _pairs(images)
+    pairs = [pair for i, j in proposed if (pair := _matched(images, i, j)) is not None]
+    if len(pairs) < MOST_PAIRS / 2:
+        others = [pair for pair in _similar(images) if pair not in proposed][:MOST_PAIRS]
+        pairs += [pair for i, j in others if (pair := _matched(images, i, j)) is not None]
+    if len(pairs) < ENOUGH_PAIRS:
         return None
-    axes = _axes()
-    agreeing = torch.stack(
-        [torch.cat([p.agreeing(axes, inverted) for inverted in (False, True)]) for p in known]
-    )
-    agreeing = agreeing.sum(0)
+    poses = SE3.stack([image.T_world_camera for image in images])
+    as_given = int(_agreeing(pairs, SE3.stack([poses]))[0])
+    if as_given > NOT_ALL * len(pairs):
+        return None
+    tried = [*readings(len(images)), *_fitted_positions(pairs, poses)]
+    agreeing = _agreeing(pairs, SE3.stack([reading.understand(poses) for reading in tried]))
     best = int(agreeing.max())
-    if int(agreeing[0]) > FEW * len(known) or best < MOST * len(known):
-        return None
-    usual = [1, len(axes), len(axes) + 1]  # y and z reversed, and both ways to invert
-    number = next((n for n in usual if int(agreeing[n]) >= ALMOST_BEST * best), int(agreeing.argmax()))
-    rows = tuple((int(a), int(b), int(c)) for a, b, c in axes[number % len(axes)].tolist())
-    return OtherConvention(rows, number >= len(axes), len(known), int(agreeing[number]), int(agreeing[0]))
+    refused = as_given < HALF * len(pairs)
+    if best >= (MOST if refused else NEARLY_ALL) * len(pairs):
+        number = int((agreeing >= ALMOST_BEST * best).nonzero()[0, 0])
+        return PoseContradiction(len(pairs), as_given, tried[number], int(agreeing[number]))
+    return PoseContradiction(len(pairs), as_given) if refused else None
 
 
 @dataclass(frozen=True, eq=False)
 class _MatchedPair:
-    """Two cameras, and points on the plane z = 1 that both see."""
+    """Two images by number, and points on the plane z = 1 that both see."""
 
-    T_world_first: SE3
-    T_world_second: SE3
-    first: Float[Tensor, "m 3"]
-    second: Float[Tensor, "m 3"]
-    focal: float  # pixels
+    first: int
+    second: int
+    seen_by_first: Float[Tensor, "m 3"]
+    seen_by_second: Float[Tensor, "m 3"]
+    pixel: float  # size on the plane z = 1
 
-    def agreeing(self, axes: Float[Tensor, "a 3 3"], inverted: bool) -> Float[Tensor, "a"]:
-        """Return 1 for each choice of axes with which the matches are near their epipolar lines, else 0."""
-        first, second = self.T_world_first, self.T_world_second
-        given = first @ second.inverse() if inverted else first.inverse() @ second
-        turned = axes.mT @ given.rotation.mT @ axes  # R_second_first
-        moved = -(turned @ axes.mT @ given.translation[:, None])  # of the origin, seen by the second camera
-        rays = (turned @ self.first.mT).mT
-        if (
-            float(torch.linalg.vector_norm(given.translation)) < LEAST_BASELINE
-        ):  # no lines, but the same directions
-            away = torch.linalg.vector_norm(rays[..., :2] / rays[..., 2:] - self.second[:, :2], dim=-1)
-        else:
-            lines = torch.linalg.cross(moved.mT, rays)
-            away = (lines * self.second).sum(-1) / torch.linalg.vector_norm(lines[..., :2], dim=-1)
-        near = (away.abs() * self.focal <= POSE_PIXELS).double().mean(-1)
-        return (near >= NEAR_LINES).double()
+    def agreeing(self, T: SE3) -> Bool[Tensor, "h"]:
+        """Return with which poses T_world_camera (h n) the matches are near their lines and in front of both cameras."""
+        R_second_world = T.rotation[:, self.second].mT
+        turned = R_second_world @ T.rotation[:, self.first]
+        moved = (R_second_world @ (T.translation[:, self.first] - T.translation[:, self.second])[..., None])[
+            ..., 0
+        ]
+        rays, seen = self.seen_by_first @ turned.mT, self.seen_by_second.expand(len(moved), -1, -1)
+        lines = torch.linalg.cross(moved[:, None].expand_as(rays), rays)
+        away = (lines * seen).sum(-1) / torch.linalg.vector_norm(lines[..., :2], dim=-1)
+        still = torch.linalg.vector_norm(rays[..., :2] / rays[..., 2:] - seen[..., :2], dim=-1)
+        at_rest = (
+            torch.linalg.vector_norm(moved, dim=-1) < LEAST_BASELINE
+        )  # no lines, but the same directions
+        away = torch.where(at_rest[:, None], still, away)
+        near = (away.abs() <= max(POSE_ANGLE, POSE_PIXELS * self.pixel)).double().mean(-1) >= NEAR_LINES
+        return near & (self._in_front(rays, seen, moved) | at_rest)
+
+    def _in_front(
+        self, rays: Float[Tensor, "h m 3"], seen: Float[Tensor, "h m 3"], moved: Float[Tensor, "h 3"]
+    ) -> Bool[Tensor, "h"]:
+        """Return whether most points are in front of both cameras, as far as their parallax shows it.
+
+        The depths solve ``a seen = b rays + moved`` in the least-squares sense along the common normal of both rays.
+        """
+        normal, moved = torch.linalg.cross(seen, rays), moved[:, None].expand_as(rays)
+        a = (torch.linalg.cross(moved, rays) * normal).sum(-1)
+        b = (torch.linalg.cross(moved, seen) * normal).sum(-1)
+        lengths = torch.linalg.vector_norm(seen, dim=-1) * torch.linalg.vector_norm(rays, dim=-1)
+        shows = torch.linalg.vector_norm(normal, dim=-1) / lengths > PARALLAX_PIXELS * self.pixel
+        front = ((a > 0) & (b > 0) & shows).sum(-1)
+        return (shows.sum(-1) < ENOUGH_PARALLAX) | (front >= IN_FRONT * shows.sum(-1))
 
 
-def _axes() -> Float[Tensor, "24 3 3"]:
-    """Return the rotations that permute and reverse axes: the identity, y and z reversed, then the others."""
-    found = [torch.eye(3, dtype=torch.float64), torch.tensor(Y_AND_Z_REVERSED, dtype=torch.float64)]
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = torch.zeros(3, 3, dtype=torch.float64)
-            matrix[list(order), range(3)] = torch.tensor(signs, dtype=torch.float64)
-            if float(torch.linalg.det(matrix)) > 0 and not any(torch.equal(matrix, other) for other in found):
-                found.append(matrix)
-    return torch.stack(found)
+def _agreeing(pairs: Sequence[_MatchedPair], T: SE3) -> Float[Tensor, "h"]:
+    """Return with how many pairs each choice of poses (h n) agrees."""
+    return torch.stack([pair.agreeing(T).double() for pair in pairs]).sum(0)
+
+
+def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading]:
+    """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines of all pairs.
+
+    They cover positions that are scaled along one axis, and positions and rotations in different worlds.
+    """
+    found = []
+    for swapped in (False, True):
+        T = with_axes(poses, torch.tensor(Y_AND_Z_REVERSED, dtype=torch.float64)) if swapped else poses
+        for B in _fitted(pairs, T):
+            apart = bool(((B - torch.diag(B.diagonal())).abs() < SIMILAR * B.abs().max()).all())
+            scales = ", ".join(f"{value:.3g}" for value in (B.diagonal() / B[0, 0]).tolist())
+            clause, remedy = (
+                "their positions are in another frame than their rotations",
+                "take both from one source",
+            )
+            if apart:
+                clause = "the axes of their positions are scaled differently"
+                remedy = f"multiply the positions, not the rotations, by about diag({scales})"
+            more = ", and their cameras' y and z axes are reversed" if swapped else ""
+
+            def understand(_: SE3, T: SE3 = T, B: Tensor = B) -> SE3:
+                return SE3(T.rotation, T.translation @ B.mT)
+
+            found.append(Reading(clause + more, remedy + (f", and {SWAP}" if swapped else ""), understand))
+    return found
+
+
+def _fitted(pairs: Sequence[_MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]:
+    """Return matrices by which positions are multiplied so that matches lie on their epipolar lines.
+
+    The first and the second are the least-squares solution with either sign, of no certain scale. The last stays near the identity
+    as far as the lines do not tell, as they do of a direction in which the cameras do not move.
+    """
+    rows, counts = [], []
+    for pair in pairs:
+        R, baseline = T.rotation[pair.second], T.translation[pair.first] - T.translation[pair.second]
+        if float(baseline.norm()) < LEAST_BASELINE:
+            continue
+        rays = pair.seen_by_first @ (R.mT @ T.rotation[pair.first]).mT
+        normal = torch.linalg.cross(rays, pair.seen_by_second)  # normal . R^T B baseline = 0
+        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True).median().clamp(min=1e-9)
+        world = normal @ R.mT
+        rows.append((world[:, :, None] * (baseline / baseline.norm())).flatten(1))
+        counts.append(len(rays))
+    if len(rows) < ENOUGH_PAIRS:
+        return []
+    A = torch.cat(rows)
+    weight = torch.cat([torch.full((count,), 1 / count, dtype=torch.float64) for count in counts])
+    free = _reweighted(A, weight, lambda H: torch.linalg.eigh(H).eigenvectors[:, 0]).reshape(3, 3)
+    return [free, -free, _reweighted(A, weight, _near_identity).reshape(3, 3)]
+
+
+def _reweighted(
+    A: Float[Tensor, "n 9"], weight: Float[Tensor, "n"], solve: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "9"]:
+    """Return a robust solution of ``A b = 0``, where ``solve`` returns that of given normal equations (9x9)."""
+    share = weight
+    for _ in range(FIT_ROUNDS):
+        solution = solve(A.mT @ (share[:, None] * A))
+        off = (A @ solution).abs()
+        share = weight / (1 + (off / off.median().clamp(min=1e-9)) ** 2)
+    return solution
+
+
+def _near_identity(H: Float[Tensor, "9 9"]) -> Float[Tensor, "9"]:
+    """Minimize ``b H b + prior |b - 1|^2`` over matrices b of trace 3."""
+    identity = torch.eye(3, dtype=H.dtype).flatten()
+    prior = PRIOR * H.diagonal().mean()
+    system = torch.zeros((10, 10), dtype=H.dtype)
+    system[:9, :9] = H + prior * torch.eye(9, dtype=H.dtype)
+    system[:9, 9] = system[9, :9] = identity
+    right = torch.cat([prior * identity, identity.new_tensor([3.0])])
+    return torch.linalg.solve(system, right)[:9]
 
 
 def _pairs(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs that probably show the same things: nearby by the poses, whose axes may be wrong, or in the order given."""
+    """Return pairs that probably show the same things: nearby by the poses, which may be wrong, or in the order given."""
     count = len(images)
     pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}
     if count > 1:
@@ -155,26 +245,49 @@ def _pairs(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
     return ordered[:: max(1, -(-len(ordered) // MOST_PAIRS))]
 
 
+def _similar(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
+    """Return pairs of images that probably show the same things by their strongest keypoints, the most similar first."""
+    chosen = range(0, len(images), max(1, -(-len(images) // COMPARED_IMAGES)))
+    strongest = [images[i].keypoints.descriptors[:COMPARED_KEYPOINTS] for i in chosen]
+    found: dict[tuple[int, int], int] = {}
+    for a, b in itertools.combinations(range(len(strongest)), 2):
+        found[a, b] = len(_mutual(strongest[a], strongest[b])[0])
+    kept = set[tuple[int, int]]()
+    for number in range(len(strongest)):
+        own = sorted((pair for pair in found if number in pair), key=lambda pair: -found[pair])
+        kept |= {pair for pair in own[:PARTNERS] if found[pair] >= SIMILAR_MATCHES}
+    return [(chosen[a], chosen[b]) for a, b in sorted(kept, key=lambda pair: -found[pair])]
+
+
+def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+    """Return the rows of the descriptors that are mutual nearest neighbours and stand out from the next best."""
+    if min(len(a), len(b)) < 2:
+        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
+    distance = squared_distances(a, b)
+    nearest = distance.topk(2, largest=False)
+    partner = nearest.indices[:, 0]
+    mutual = distance.argmin(0)[partner] == torch.arange(len(partner))
+    rows = (mutual & (nearest.values[:, 0] < RATIO**2 * nearest.values[:, 1])).nonzero()[:, 0]
+    return rows, partner[rows]
+
+
 def _matched(images: Sequence[PosedKeypoints], i: int, j: int) -> _MatchedPair | None:
     """Return the matches of two images that agree on an essential matrix; None if these are too few."""
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
         return None
-    distance = squared_distances(a.keypoints.descriptors, b.keypoints.descriptors)
-    nearest = distance.topk(2, largest=False)
-    partner = nearest.indices[:, 0]
-    mutual = distance.argmin(0)[partner] == torch.arange(len(partner))
-    rows = (mutual & (nearest.values[:, 0] < RATIO**2 * nearest.values[:, 1])).nonzero()[:, 0]
+    rows, partner = _mutual(a.keypoints.descriptors, b.keypoints.descriptors)
     if len(rows) < ENOUGH_MATCHES:
         return None
-    first, second, focal = a.rays[rows], b.rays[partner[rows]], min(a.focal, b.focal)
+    first, second, focal = a.rays[rows], b.rays[partner], min(a.focal, b.focal)
+    pixel = max(1.0, focal / USUAL_FOCAL) / focal
     cv2.setRNGSeed(0)
     found, mask = cv2.findEssentialMat(
-        first[:, :2].numpy(), second[:, :2].numpy(), np.eye(3), cv2.RANSAC, prob=0.999, threshold=MATCH_PIXELS / focal
+        first[:, :2].numpy(), second[:, :2].numpy(), np.eye(3), cv2.RANSAC, prob=0.999, threshold=MATCH_PIXELS * pixel
     )  # fmt: skip
     if found is None or len(mask) != len(rows):
         return None
     kept = torch.from_numpy(mask[:, 0].astype(bool))
     if int(kept.sum()) < ENOUGH_MATCHES:
         return None
-    return _MatchedPair(a.T_world_camera, b.T_world_camera, first[kept], second[kept], focal)
+    return _MatchedPair(i, j, first[kept], second[kept], pixel)

@@ -15,13 +15,13 @@ from bidnerf_core.captures.cameras import (
     stored_cameras,
 )
 from bidnerf_core.captures.coverage import shows_distances
-from bidnerf_core.captures.pose_conventions import other_convention
+from bidnerf_core.captures.pose_conventions import pose_contradiction
 from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedViews, tracked_views
-from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, PosedKeypoints, TrackedViews, find_features, tracked_views
+from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, posed_keypoints
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
@@ -52,17 +52,21 @@ class TrainingViews:
 def prepared(
     views: Sequence[View], refinement: RefinementChoice = "auto",
     progress: ProgressCallback | None = None, cancel: Cancel | None = None, features: str = USUAL_FEATURES,
+    trust_poses: bool = False,
 ) -> TrainingViews:  # fmt: skip
     """Refine the poses of the views if requested, and find the landmarks that they show.
 
-    ``features`` is the name of the detector of their keypoints. Raises ``InputError`` where poses or depth are plainly in another convention or unit.
+    ``features`` is the name of the detector of their keypoints. Raises ``InputError`` where the poses contradict most pairs of
+    images, unless ``trust_poses`` is set, and where depth is plainly in another unit.
     """
     if refinement == "never":
-        tracked, seeing = located(views, progress, cancel, features)
+        tracked, seeing = located(views, progress, cancel, features, trust_poses)
+        if tracked is None and not trust_poses:
+            _check_poses(posed_keypoints(views, find_features(features)))
         return TrainingViews(
             seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
         )
-    tracked = _tracked(views, progress, cancel, features)
+    tracked = _tracked(views, progress, cancel, features, trust_poses)
     least = 0.0 if refinement == "always" else INCONSISTENT
     report = counter("poses", "image pairs", progress, cancel)
     found = training_poses(tracked, views, least, progress=report)
@@ -94,6 +98,7 @@ def located(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
     features: str = USUAL_FEATURES,
+    trust_poses: bool = False,
 ) -> tuple[TrackedViews | None, list[View]]:
     """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
@@ -102,7 +107,7 @@ def located(
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
-    tracked = _tracked(views, progress, cancel, features)
+    tracked = _tracked(views, progress, cancel, features, trust_poses)
     return tracked, _with_landmarks(views, tracked)
 
 
@@ -112,14 +117,29 @@ def _lacks_distances(view: View) -> bool:
 
 
 def _tracked(
-    views: Sequence[View], progress: ProgressCallback | None, cancel: Cancel | None, features: str
+    views: Sequence[View],
+    progress: ProgressCallback | None,
+    cancel: Cancel | None,
+    features: str,
+    trust_poses: bool,
 ) -> TrackedViews:
-    """Track the keypoints of the views. Raises ``InputError`` where poses or depth are plainly in another convention or unit."""
+    """Track the keypoints of the views. Raises ``InputError`` where poses contradict the images, or depth is in another unit.
+
+    The unit is blamed last: under wrong poses, triangulated distances say nothing about it.
+    """
     tracked = tracked_views(views, features, progress=counter("landmarks", "steps", progress, cancel))
-    if (other := other_convention(tracked.observations.images)) is not None:
-        raise InputError(other.sentence)
+    if not trust_poses:
+        _check_poses(tracked.observations.images)
     check_depth_unit(tracked)
     return tracked
+
+
+def _check_poses(images: Sequence[PosedKeypoints]) -> None:
+    """Raise ``InputError`` where the poses contradict most pairs of images."""
+    if (found := pose_contradiction(images)) is not None:
+        raise InputError(
+            f"{found.sentence} (--trust-poses, trust_poses in Python, trains with them all the same)"
+        )
 
 
 def check_depth_unit(tracked: TrackedViews) -> None:

@@ -85,6 +85,9 @@ def run(arguments: list[str]) -> None:
                 "refine the given poses by the keypoints that images share: always, never, or auto: if inconsistent",
             ),
         ] = "auto",
+        trust_poses: Annotated[
+            Flag, option(None, "train even if the given poses contradict most pairs of photos", "")
+        ] = False,
         landmark_features: FeaturesName = USUAL_FEATURES,
         device: Device = "cpu",
         no_bake: Annotated[
@@ -145,6 +148,7 @@ def run(arguments: list[str]) -> None:
                     overwrite=overwrite,
                     features=landmark_features,
                     largest=largest,
+                    trust_poses=trust_poses,
                     **same,
                 )
                 return

@@ -73,6 +73,7 @@ def train(
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     features: str = USUAL_FEATURES,
     largest: int | None = None,
+    trust_poses: bool = False,
 ) -> Map:
     """Train a map on posed images: check and refine their poses, train the field, and bake a surface and landmarks.
 
@@ -91,6 +92,7 @@ def train(
     sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the
     detector of the landmarks. Images with more than ``largest`` pixels along the longer side are reduced to that, by default
     to 1600, or fewer where they would take more than 2 GB or a quarter of the available memory; the map's cameras are scaled.
+    detector of the landmarks. Poses that contradict most pairs of images are refused unless ``trust_poses`` is set.
 
     Raises ``InputError`` where data, settings or folder are not usable; the folder must be empty unless ``overwrite`` is set.
     """
@@ -116,7 +118,7 @@ def train(
         part = f" in split {split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
             log.info(f"{read.place}: no measured depth{part}; training on colour only")
-        taken = prepared(read.views, refine_poses, progress, cancel, features)
+        taken = prepared(read.views, refine_poses, progress, cancel, features, trust_poses)
         if not taken.distances:
             log.info(
                 f"{read.place}: the photos are from one place and show no distances; the map's depth will be arbitrary, and"
@@ -170,7 +172,7 @@ def resume(
             scene = load_map(out, work.device, baked=False)
             return scene.with_baked_parts(views, work.bake or USUAL_BAKE, progress=progress, cancel=cancel)
         tracked, views = located(
-            views, progress, cancel, info.landmark_features
+            views, progress, cancel, info.landmark_features, trust_poses=True
         )  # the same as when the training began
         return _trained(load_backend(info.backend, str(out)), info, views, tracked, work)
 

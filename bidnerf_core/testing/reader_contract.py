@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from bidnerf_core.captures.pose_conventions import other_convention
+from bidnerf_core.captures.pose_conventions import pose_contradiction
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.reader import READERS, Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -97,7 +97,7 @@ class ReaderContract:
 
     def test_axes_are_those_of_opencv(self) -> None:
         tracked = self._tracked()
-        other = other_convention(tracked.observations.images)
+        other = pose_contradiction(tracked.observations.images)
         require_that(other is None, f"reader {self.name!r}: {'' if other is None else other.sentence}")
         seen, _ = tracked.triangulated(DEFAULT_LANDMARKS)
         count = seen.count

@@ -294,6 +294,11 @@ def _joined(images: Sequence[PosedKeypoints], pairs: list[list[int]], counter: _
     return TrackedKeypoints(images, label, torch.arange(len(label)))
 
 
+def posed_keypoints(views: Sequence[View], features: Features) -> list[PosedKeypoints]:
+    """Detect the keypoints of ``views``, which are not matched."""
+    return list(_mapped(lambda view: _detected(view, features), views))
+
+
 def _detected(view: View, features: Features) -> PosedKeypoints:
     intrinsics = view.frame.intrinsics
     keypoints = visible_keypoints(detected(features, view.frame.rgb), view.frame.hidden)
