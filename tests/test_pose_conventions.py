@@ -273,5 +273,5 @@ def test_training_refuses_contradicting_poses_unless_they_are_trusted() -> None:
     register("features", "points", points)
     wrong = [replace(view, T_ref_camera=view.T_ref_camera.inverse()) for view in views]
     with pytest.raises(InputError, match=r"contradict the photos.*inverses.*--trust-poses"):
-        prepared(wrong, "never", features="points")
+        prepared(wrong, features="points")
     assert prepared(wrong, "never", features="points", trust_poses=True).cameras

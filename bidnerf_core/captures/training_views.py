@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -20,9 +21,9 @@ from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, PosedKeypoints, TrackedViews, find_features, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, PosedKeypoints, TrackedViews, tracked_views
 from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, posed_keypoints
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.mapping.landmarks.features import SIFT, USUAL_FEATURES
 from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 
@@ -32,6 +33,8 @@ RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` refines them if they are inconsistent."""
 
 
+RUN, MOST_RUNS = 5, 12
+"""Number of successive views in a run, and largest number of runs, by which poses are checked where keypoints are not needed."""
 UNUSUAL_RATIO = 0.05
 """Least relative error of measured depth, compared with triangulated points, that is worth a remark."""
 OTHER_UNIT = 2.0
@@ -62,7 +65,7 @@ def prepared(
     if refinement == "never":
         tracked, seeing = located(views, progress, cancel, features, trust_poses)
         if tracked is None and not trust_poses:
-            _check_poses(posed_keypoints(views, find_features(features)))
+            _check_poses(posed_keypoints(_sample(views), SIFT))
         return TrainingViews(
             seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
         )
@@ -132,6 +135,13 @@ def _tracked(
         _check_poses(tracked.observations.images)
     check_depth_unit(tracked)
     return tracked
+
+
+def _sample(views: Sequence[View]) -> list[View]:
+    """Return runs of successive views, evenly spread, that suffice to check the poses."""
+    runs = max(1, math.ceil(len(views) / RUN))
+    every = max(1, math.ceil(runs / MOST_RUNS))
+    return [view for run in range(0, runs, every) for view in views[RUN * run : RUN * (run + 1)]]
 
 
 def _check_poses(images: Sequence[PosedKeypoints]) -> None:

@@ -92,7 +92,7 @@ def train(
     sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the
     detector of the landmarks. Images with more than ``largest`` pixels along the longer side are reduced to that, by default
     to 1600, or fewer where they would take more than 2 GB or a quarter of the available memory; the map's cameras are scaled.
-    detector of the landmarks. Poses that contradict most pairs of images are refused unless ``trust_poses`` is set.
+    Poses that contradict most pairs of images are refused unless ``trust_poses`` is set.
 
     Raises ``InputError`` where data, settings or folder are not usable; the folder must be empty unless ``overwrite`` is set.
     """
