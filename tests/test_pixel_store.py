@@ -18,6 +18,7 @@ from bidnerf_core.camera.batch import CameraBatch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.photos import nearby
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets.rgbd import reading_at
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.frames import image_pixels, pixel_store
@@ -201,3 +202,27 @@ def test_a_map_of_reduced_images_is_resumed_at_their_size(tmp_path: Path) -> Non
     info = load_info(out)
     assert longest_side(info) == 20
     assert resume(out, data).info.cameras == info.cameras
+
+
+@pytest.mark.parametrize("size", [(96, 64), (97, 64)], ids=["multiples", "others"])
+@pytest.mark.parametrize("mode", ["RGB", "L", "CMYK", "RGBA"])
+def test_images_that_are_reduced_while_read_are_those_reduced_afterwards(
+    mode: str, size: tuple[int, int], tmp_path: Path
+) -> None:
+    ramp = torch.linspace(0, 255, size[0]).byte().expand(size[1], size[0])
+    colours = torch.stack([ramp, ramp.flip(1), torch.full_like(ramp, 90)], dim=-1).numpy()
+    image = Image.fromarray(colours).convert(mode)
+    path = tmp_path / ("a.png" if mode == "RGBA" else "a.jpg")
+    image.save(path)
+    frame = {"file_path": path.name, "transform_matrix": torch.eye(4).tolist()}
+    content = {"fl_x": 80.0, "cx": 45.0, "cy": 30.0, "w": size[0], "h": size[1], "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    dataset = open_dataset(tmp_path)
+    (whole,) = dataset.views("train")
+    with reading_at(20):
+        (read,) = dataset.views("train")
+    small = whole.frame.at_most(20)
+    assert read.frame.intrinsics == small.intrinsics
+    assert read.frame.held_rgb.dtype == small.held_rgb.dtype == torch.uint8
+    torch.testing.assert_close(read.frame.rgb, small.rgb, atol=4 / 255, rtol=0)
+    assert (read.frame.alpha is None) == (small.alpha is None)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
 from jaxtyping import Bool
 from torch import Tensor
 
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.lenses import Camera
 from bidnerf_core.camera.source import Raster
 from bidnerf_core.depth.images import DepthImage
@@ -31,6 +34,22 @@ class DepthFile:
     )
 
 
+_largest: ContextVar[int | None] = ContextVar("largest", default=None)
+
+
+@contextmanager
+def reading_at(largest: int) -> Iterator[None]:
+    """Let ``read_rgbd`` reduce images to ``largest`` pixels along the longer side within the context, in this thread.
+
+    Images are then never in memory at their own size. Readers that do not use ``read_rgbd`` do without.
+    """
+    token = _largest.set(largest)
+    try:
+        yield
+    finally:
+        _largest.reset(token)
+
+
 def read_rgbd(
     name: str,
     image: Path,
@@ -47,8 +66,12 @@ def read_rgbd(
     measurement. Raises ``InputError`` for a file that is not readable, and for registered depth of another aspect ratio.
     """
     header = read_header(image)
-    camera = camera_of(header.width, header.height)
-    rgb, alpha = read_compact_image(image, background)
+    camera, size = camera_of(header.width, header.height), (header.width, header.height)
+    largest, reduced = _largest.get(), None
+    if largest is not None and isinstance(camera, Intrinsics) and max(size) > largest:
+        camera = camera.scaled(largest / max(size))
+        size = reduced = (camera.width, camera.height)
+    rgb, alpha = read_compact_image(image, background, reduced)
     metres = None
     if depth is not None:
         measured = depth.read(depth.path, depth.unit)
@@ -57,5 +80,5 @@ def read_rgbd(
         else:
             raster = Raster(rgb.shape[1], rgb.shape[0])
             metres = fit_depth(measured, raster, raster.size, f"{depth.path}: depth")
-    hidden = hidden_of(header.width, header.height)
+    hidden = hidden_of(*size)
     return Frame.taken(name, camera, Images(rgb, metres, alpha, hidden))

@@ -99,9 +99,14 @@ def read_image(
 
 
 def read_compact_image(
-    path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0)
+    path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
 ) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
-    """Read an image as ``read_image`` does, but leave colours as bytes (uint8) where the file has 8 bits and no alpha."""
+    """Read an image as ``read_image`` does, but leave colours as bytes (uint8) where the file has 8 bits and no alpha.
+
+    Images that are reduced to ``size`` (width, height) have bytes as well; a JPEG file is decoded no larger than needed.
+    """
+    if size is not None:
+        return _read_reduced(path, background, size)
     rgb = None
     with open_image(path) as image:
         if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
@@ -109,6 +114,33 @@ def read_compact_image(
                 colours = strip if strip.ndim == 3 else np.repeat(strip[..., None], 3, axis=2)
                 rgb = _placed(rgb, colours, top, image.height)
     return read_image(path, background) if rgb is None else (torch.from_numpy(rgb), None)
+
+
+def _read_reduced(
+    path: ImageSource, background: Sequence[float], size: tuple[int, int]
+) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+    with open_image(path) as image:
+        if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
+            _decode_smaller(image, size)
+            pixels = None
+            for top, strip in _strips(path, image):
+                pixels = _placed(pixels, strip, top, image.height)
+            assert pixels is not None  # no image is without rows
+            small = reduced(torch.from_numpy(pixels), *size)
+            return (small if small.ndim == 3 else small[..., None].expand(*small.shape, 3).contiguous()), None
+    rgb, alpha = read_image(path, background, size)
+    return (rgb * FULL_SCALE["uint8"]).round_().to(torch.uint8), alpha
+
+
+def _decode_smaller(image: Image.Image, size: tuple[int, int]) -> None:
+    """Make a JPEG file decode to a half, a quarter or an eighth of its pixels along each side, if that is no less than ``size``.
+
+    Sizes that are not multiples keep their pixels, since their last column or row would count for more than it shows.
+    """
+    factors = [f for f in (8, 4, 2) if image.width // f >= size[0] and image.height // f >= size[1]]
+    fitting = [f for f in factors if image.width % f == 0 and image.height % f == 0]
+    if image.format == "JPEG" and fitting:
+        image.draft(image.mode, (image.width // fitting[0], image.height // fitting[0]))
 
 
 def channels(

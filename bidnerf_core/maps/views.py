@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from typing import TypeAlias
 from bidnerf_core.datasets import Background, Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.dataset import Georeferenced, ReadingProgress
+from bidnerf_core.datasets.rgbd import reading_at
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import BLACK, Frame, View
 from bidnerf_core.frames.masks import INVERTED, WhollyHidden, masks_sentence
@@ -107,7 +109,7 @@ def _read(
     views: list[View] = []
     store, limit = PixelStore(0), largest or 0
     for place, name in enumerate(names):
-        for view in _one(data, split, name):
+        for view in _one(data, split, name, limit):
             if not views:
                 limit = largest or useful_size(view.frame, len(names))
                 small = view.frame.at_most(limit)
@@ -118,10 +120,14 @@ def _read(
     return views
 
 
-def _one(data: Dataset, split: str, name: str) -> list[View]:
-    """Read a frame; none where a mask hides all of it, as when a whole split is read."""
+def _one(data: Dataset, split: str, name: str, largest: int) -> list[View]:
+    """Read a frame, at most ``largest`` pixels wide and high unless that is 0.
+
+    Returns none where a mask hides all of it, as when a whole split is read.
+    """
     try:
-        return data.views(split, [name])
+        with reading_at(largest) if largest else contextlib.nullcontext():
+            return data.views(split, [name])
     except WhollyHidden:
         return []
 
