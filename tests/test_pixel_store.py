@@ -175,6 +175,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
         pose[0, 3] = number
         frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    monkeypatch.setattr(logging.getLogger("bidnerf"), "propagate", True)
     caplog.set_level(logging.INFO, "bidnerf")
     assert read_views(tmp_path).views[0].frame.intrinsics.width == 192
     assert "read at" not in caplog.text
