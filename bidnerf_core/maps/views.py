@@ -107,7 +107,7 @@ def _read(
     """Read the views of a split one after another, so that only one image is in memory at its own size."""
     names = data.frame_names(split)
     views: list[View] = []
-    store, limit = PixelStore(0), largest or 0
+    store, limit = PixelStore(0), 0  # the first image is read at its own size, which is reported
     for place, name in enumerate(names):
         for view in _one(data, split, name, limit):
             if not views:
