@@ -9,6 +9,7 @@ import os
 import random
 import shutil
 import signal
+import socket
 import struct
 import threading
 import time
@@ -17,6 +18,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -466,11 +468,13 @@ def test_every_path_is_described(service: Service) -> None:
     assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
 
 
-def test_the_client_asks_a_server(place: Place) -> None:
-    ready, stop, address = threading.Event(), threading.Event(), []
+@pytest.fixture(scope="module")
+def address(place: Place) -> Iterator[tuple[str, int]]:
+    """A service on a port of its own."""
+    ready, stop, told = threading.Event(), threading.Event(), []
 
-    def told(url: str, token: str | None) -> None:
-        address.extend([url, token])
+    def tell(url: str, token: str | None) -> None:
+        told.extend([url, token])
         ready.set()
 
     options: Any = {
@@ -478,24 +482,95 @@ def test_the_client_asks_a_server(place: Place) -> None:
         "config": CONFIG,
         "method": "bid",
         "settings": QUICK,
-        "ready": told,
+        "ready": tell,
         "stop": stop,
     }
     running = threading.Thread(target=serve, args=[place.folder / "map"], kwargs=options)
     running.start()
     try:
         assert ready.wait(60)
-        client = ServiceClient(address[0], timeout=30)
-        found = client.localize(place.folder / "photo.png", focal=32, start=json.loads(place.start))
-        assert (found["frame"], found["method"]) == ("photo", "bid")
-        with pytest.raises(ServiceError, match="no map of that name") as refused:
-            client.localize(place.photo, map="other")
-        assert refused.value.status == 404
+        assert told[1] is None  # this machine only needs no token
+        parts = urlsplit(told[0])
+        yield str(parts.hostname), int(parts.port or 0)
     finally:
         stop.set()
         running.join(30)
     with pytest.raises(ServiceError, match="refused"):
-        ServiceClient(address[0]).ask("/maps")
+        ServiceClient(told[0]).ask("/maps")
+
+
+def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> None:
+    client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
+    found = client.localize(place.folder / "photo.png", focal=32, start=json.loads(place.start))
+    assert (found["frame"], found["method"]) == ("photo", "bid")
+    with pytest.raises(ServiceError, match="no map of that name") as refused:
+        client.localize(place.photo, map="other")
+    assert refused.value.status == 404
+
+
+def spoken(address: tuple[str, int], content: bytes) -> bytes:
+    """Send bytes over a connection, and return what comes back until it ends."""
+    with socket.create_connection(address, timeout=20) as connection:
+        found = b""
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(content)
+            connection.shutdown(socket.SHUT_WR)
+            while part := connection.recv(65536):
+                found += part
+        return found
+
+
+def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, int]) -> None:
+    drawn, body = random.Random(1), form(photo=place.photo, focal="32", start=place.start)
+    head = f"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: {FORM}\r\nConnection: close\r\n"
+    statuses = set()
+    for number in range(150):
+        length = drawn.choice([len(body)] * 4 + [len(body) // 2, -1, 10**12])
+        content = bytearray(f"{head}Content-Length: {length}\r\n\r\n".encode() + body)
+        for _ in range(drawn.randrange(1, 9)):
+            at = drawn.randrange(len(head) + 20 if number % 2 else len(content))
+            content[at : at + drawn.randrange(5)] = drawn.randbytes(drawn.randrange(5))
+        answer = spoken(address, bytes(content))
+        statuses.add(answer[9:10] if answer.startswith(b"HTTP/1.1 ") else b"closed")
+    assert statuses <= {b"2", b"4", b"closed"}
+    for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
+        answer = spoken(
+            address, f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode()
+        )
+        assert answer.startswith(b"HTTP/1.1 404"), path
+    assert spoken(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
+
+
+def test_a_body_without_end_and_a_client_without_haste_are_cut_off(
+    place: Place, address: tuple[str, int]
+) -> None:
+    head = b"POST /localize HTTP/1.1\r\nHost: localhost\r\n"
+    for length in (b"Content-Length: 2000000000", b"Transfer-Encoding: chunked"):
+        sent, block = 0, bytes(2**16)
+        with (
+            socket.create_connection(address, timeout=20) as connection,
+            contextlib.suppress(ConnectionError),
+        ):
+            connection.sendall(head + length + b"\r\n\r\n")
+            while sent < 2 * 10**9:
+                connection.sendall(b"%x\r\n%s\r\n" % (len(block), block) if b"chunked" in length else block)
+                sent += len(block)
+        assert sent < 3 * 10**7, (
+            length
+        )  # what the buffers of the system take, beside the megabyte that is allowed
+    began = time.monotonic()
+    with socket.create_connection(address, timeout=20) as connection:
+        connection.sendall(head + b"Content-Length: 1000\r\n\r\nx")
+        assert connection.recv(100).startswith(b"HTTP/1.1 408")
+    assert time.monotonic() - began < 10
+    for _ in range(5):  # clients that leave before the answer
+        with socket.create_connection(address, timeout=20) as connection:
+            body = form(photo=place.photo, focal="32", start=place.start)
+            kind = f"Content-Type: {FORM}\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+            connection.sendall(head + kind + body)
+    client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
+    assert client.localize(place.photo, focal=32, start=json.loads(place.start))["method"] == "bid"
+    quickly(lambda: client.ask("/health")["waiting"] == 0)
 
 
 def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidnerf: Run) -> None:
