@@ -24,7 +24,18 @@ import _lab
 import torch
 from torch import Tensor
 
-from bidnerf_core import Localizer, Map, View, open_dataset, render_image, rendering_scores, train
+from bidnerf_core import (
+    InputError,
+    Localizer,
+    Map,
+    View,
+    load_map,
+    open_dataset,
+    render_image,
+    rendering_scores,
+    resume,
+    train,
+)
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, tracked_views
 
 GROWN = 3
@@ -119,13 +130,23 @@ def tested(scene: Map, views: Sequence[View], share: float) -> dict[str, Any]:
     return found
 
 
-def measured(data: Path, way: str, steps: int, share: float) -> dict[str, Any]:
+def trained(out: Path, views: Sequence[View], steps: int, background: tuple[float, float, float]) -> Map:
+    """Train a map in the folder ``out``, or go on where that was interrupted."""
+    if (out / "map.json").exists():
+        try:
+            return resume(out, views, background=background, checkpoint_seconds=30)
+        except InputError:  # nothing is left to do
+            return load_map(out)
+    return train(views, out=out, config={"steps": steps}, background=background, checkpoint_seconds=30)
+
+
+def measured(data: Path, way: str, steps: int, share: float, work: Path) -> dict[str, Any]:
     dataset = open_dataset(data)
     views, places = capture(dataset.views("train"), way, share)
     counts = landmarks(views, places)
     print(data.name, way, counts, flush=True)
     began = time.monotonic()
-    scene = train(views, config={"steps": steps}, background=dataset.background)
+    scene = trained(work / f"{data.name} {way} {steps}", views, steps, dataset.background)
     seconds = time.monotonic() - began
     test = dataset.views("test", _lab.held_out(dataset.frame_names("test")))
     return {**counts, "train_seconds": seconds, **tested(scene, test, share)}
@@ -136,6 +157,7 @@ def main() -> None:
     arguments.add_argument("data", nargs="+", type=Path, metavar="DATA")
     arguments.add_argument("--steps", type=int, default=600)
     arguments.add_argument("--share", type=float, default=0.15)
+    arguments.add_argument("--work", type=Path, default=Path("masks-work"), help="folder of the maps")
     given = arguments.parse_args()
     _lab.one_thread()
     file = _lab.RESULTS / f"{given.name}.rows.jsonl"
@@ -146,7 +168,7 @@ def main() -> None:
         for way in WAYS:
             key = [data.name, way, given.steps, given.share]
             if json.dumps(key) not in rows:
-                rows[json.dumps(key)] = measured(data, way, given.steps, given.share)
+                rows[json.dumps(key)] = measured(data, way, given.steps, given.share, given.work)
                 with file.open("a") as stream:
                     stream.write(json.dumps({"key": key, "found": rows[json.dumps(key)]}) + "\n")
             results.setdefault(data.name, {})[way] = rows[json.dumps(key)]

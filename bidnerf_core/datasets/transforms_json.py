@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from bidnerf_core.camera.files import CameraRecord, camera_record
 from bidnerf_core.camera.lenses import PANORAMA, PANORAMA_FACES
@@ -13,7 +15,7 @@ from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.panoramas import panorama_pose
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry.pose_rows import pose_and_scale
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import IMAGE_SUFFIXES
@@ -86,12 +88,15 @@ def _cut(splits: dict[str, list[FrameRecord]]) -> dict[str, list[FrameRecord]]:
 
 
 def read_frames(file: Record) -> list[FrameRecord]:
-    """Read every entry of ``frames``. Raises ``InputError`` where two have the same image."""
+    """Read every entry of ``frames`` that has a pose; a remark counts the others.
+
+    Raises ``InputError`` where two have the same image, and where none has a pose.
+    """
     entries = file.items("frames")
     if not entries:
         found = "no frames" if entries is None else "frames is empty"
         raise file.error(f"{found}, expected a list of objects with file_path and transform_matrix")
-    frames = [_frame(file, number, entry) for number, entry in enumerate(entries)]
+    frames = [_frame(file, number, entry) for number, entry in _posed(file, entries)]
     seen: dict[tuple[str, ...], int] = {}
     for number, frame in enumerate(frames):
         first = seen.setdefault(frame.parts, number)
@@ -103,6 +108,34 @@ def read_frames(file: Record) -> list[FrameRecord]:
     ):
         remark(file.where, "enable_depth_loading is false, so the images of depth_path are not read")
     return frames
+
+
+def _posed(file: Record, entries: list[Any]) -> list[tuple[int, Any]]:
+    """Return the numbered entries but for those without a pose, unless that is all of them."""
+    kept = [(number, entry) for number, entry in enumerate(entries) if not _lacks_pose(entry)]
+    if kept and len(kept) < len(entries):
+        first = next(entry for entry in entries if _lacks_pose(entry))
+        remark(
+            file.where,
+            f"{len(entries) - len(kept)} of {amount(len(entries), 'frame')} have no pose (transform_matrix is missing, zero or"
+            f" not finite) and are left out, the first is {first.get('file_path')}",
+        )
+    return kept or list(enumerate(entries))
+
+
+def _lacks_pose(entry: Any) -> bool:
+    """Return whether a frame has no matrix, or one of zeros or with numbers that are not finite."""
+    if not isinstance(entry, dict):
+        return False
+    rows = entry.get("transform_matrix")
+    if rows is None:
+        return True
+    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+        return False
+    numbers = [value for row in rows for value in row]
+    if any(isinstance(value, float) and not math.isfinite(value) for value in numbers):
+        return True
+    return bool(numbers) and all(value in (0, None) for row in rows[:3] for value in row[:3])
 
 
 def _remark_scales(file: Record, frames: list[FrameRecord]) -> None:
