@@ -99,6 +99,8 @@ if TYPE_CHECKING:
     from bidnerf_core.service.server import serve as serve
     from bidnerf_core.service.server import service_app as service_app
     from bidnerf_core.service.settings import ServiceConfig as ServiceConfig
+    from bidnerf_core.structure.poses import find_poses as find_poses
+    from bidnerf_core.structure.record import FoundPoses as FoundPoses
     from bidnerf_core.training import Supervision as Supervision
     from bidnerf_core.training import SupervisionConfig as SupervisionConfig
 
@@ -111,6 +113,7 @@ HOMES = {
     "DEPTH_RESIDUALS": "fields.residuals",
     "Dataset": "datasets",
     "FieldValues": "fields.contract",
+    "FoundPoses": "structure.record",
     "Frame": "frames.frame",
     "FrameSequence": "datasets",
     "HitField": "fields.contract",
@@ -160,6 +163,7 @@ HOMES = {
     "extend": "maps.extending",
     "factor_of_distance": "maps.scaling",
     "factor_of_poses": "maps.scaling",
+    "find_poses": "structure.poses",
     "levels": "fields.contract",
     "list_plugins": "registry",
     "load_backend": "backend",

@@ -65,8 +65,8 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
 
     It is 1 for all photos but those that stand out as blurred.
     """
-    sharpness = torch.tensor([_sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
-    lacking = -above_neighbours(sharpness, nearby(views))
+    found = torch.tensor([sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
+    lacking = -above_neighbours(found, nearby(views))
     return torch.where(standing_out(lacking, LEAST_BLUR), torch.exp2(-lacking), 1.0)
 
 
@@ -82,7 +82,7 @@ def _measured(frame: Frame) -> tuple[float, float, float, float]:
     shown = image[inside] if inside.any() else image.reshape(-1, 3)
     brightest = shown.max(-1)
     light = float(np.median(log_light(shown.mean(-1))))
-    return _sharpness(image.mean(-1), frame.hidden), light, float((brightest >= OVEREXPOSED).mean()), float(
+    return sharpness(image.mean(-1), frame.hidden), light, float((brightest >= OVEREXPOSED).mean()), float(
         (brightest <= UNDEREXPOSED).mean()
     )  # fmt: skip
 
@@ -92,7 +92,7 @@ def log_light(values: np.ndarray) -> np.ndarray:
     return GAMMA * np.log2(np.maximum(values, DARKEST))
 
 
-def _sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
+def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
     """Return log2 of the ratio of fine to coarse energy, where contrast cancels; the least of four directions.
 
     Pixels that hidden ones influence do not count, unless no others are left.

@@ -36,7 +36,7 @@ def bake(
             "rendered images only",
         ),
     ] = None,
-    split: Annotated[str, option("NAME", "split of the dataset")] = "train",
+    split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "train",
     camera: DatasetCamera = None,
     register_depth: RegisterDepth = None,
     depth_unit: DatasetDepthUnit = None,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+import tyro
+
 from bidnerf_core.backend import load_backend
 from bidnerf_core.captures.training_views import RefinementChoice
 from bidnerf_core.cli.camera_options import (
@@ -19,7 +21,6 @@ from bidnerf_core.cli.camera_options import (
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import (
     DEFAULT_BACKEND,
-    DataFolder,
     Device,
     FeaturesName,
     Flag,
@@ -40,8 +41,10 @@ from bidnerf_core.io.json import from_plain
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.maps import training
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS
-from bidnerf_core.maps.description import MapInfo, load_info, longest_side
+from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
+from bidnerf_core.maps.views import Images
 from bidnerf_core.settings import to_flat
+from bidnerf_core.structure.sources import lacks_poses
 
 
 def run(arguments: list[str]) -> None:
@@ -52,10 +55,14 @@ def run(arguments: list[str]) -> None:
     default = load_backend(name, str(resumed[0]) if resumed else "").config_type()
 
     def train(
-        data: DataFolder,
+        data: Annotated[
+            Path,
+            tyro.conf.Positional,
+            option("DATA", "folder of a dataset, or of photos without poses; or a video"),
+        ],
         out: Annotated[Path, option("MAP", "folder for the map")],
         backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
-        split: Annotated[str, option("NAME", "split of the dataset to train on")] = "train",
+        split: Annotated[str, option("NAME", "split of the dataset to train on; all: every image")] = "train",
         camera: DatasetCamera = None,
         register_depth: RegisterDepth = None,
         depth_unit: DatasetDepthUnit = None,
@@ -96,9 +103,10 @@ def run(arguments: list[str]) -> None:
         model_points: SparseChoice = SparseChoice(),
         config: Any = None,
     ) -> None:
-        """Make a map of a dataset.
+        """Make a map of a dataset, or of photos without poses.
 
-        Ctrl-C stops after a step and saves the map; --resume continues from there, or from the last checkpoint if the
+        The poses of photos, or of a video's frames, that have none are found first, as by 'bidnerf poses', and kept in the
+        folder MAP-poses. Ctrl-C stops after a step and saves the map; --resume continues from there, or from the last checkpoint if the
         program was killed, with the same result as an uninterrupted training. It also bakes a map that is trained but not
         baked.
         """
@@ -113,6 +121,17 @@ def run(arguments: list[str]) -> None:
         check_folder(out, (data,), may_be_map=True)
         working_device(device)
         begun: Background | None = background
+        photos = lacks_poses(data)
+        if photos and (depth_unit is not None or register_depth is not None):
+            raise UsageError(
+                f"{data}: photos without poses have no depth; leave --depth-unit and --register-depth out"
+            )
+        if photos and masks is not None:
+            raise UsageError(
+                f"{data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
+            )
+        if photos and not (out / DESCRIPTION).exists():
+            resume = False  # it was interrupted while poses were sought, which go on by themselves
         if resume:
             info = training.interrupted(out, not no_bake)
             _check_unchanged(out, info, named, default, config)
@@ -125,22 +144,21 @@ def run(arguments: list[str]) -> None:
                 began = f"--landmark-features {info.landmark_features}"
                 raise UsageError(f"{out}: was begun with {began}, got {landmark_features}; leave it out")
             begun = info.bounds.background if background is None else background
-        dataset = open_dataset(
-            data,
-            begun,
-            camera=camera,
-            register_depth=depth_registration(register_depth),
-            depth_unit=depth_unit,
-            masks=mask_folder(masks, mask_hides),
-        )
+        images: Images = data
+        if not photos:
+            registration, hidden = depth_registration(register_depth), mask_folder(masks, mask_hides)
+            images = open_dataset(
+                data, begun, camera=camera, register_depth=registration, depth_unit=depth_unit, masks=hidden
+            )
         with stopped_by_ctrl_c() as cancel, Display() as progress:
             same: dict[str, Any] = {
                 "split": split, "bake": not no_bake, "device": device, "progress": progress, "cancel": cancel,
                 "depth_points": depth_points, "point_choice": model_points, "checkpoint_seconds": checkpoint_every,
+                "background": begun if photos else None, "camera": camera if photos else None,
             }  # fmt: skip
             if not resume:
                 training.train(
-                    dataset,
+                    images,
                     name,
                     out,
                     config,
@@ -153,7 +171,7 @@ def run(arguments: list[str]) -> None:
                 )
                 return
             try:
-                training.resume(out, dataset, **same)
+                training.resume(out, images, **same)
             except training.OtherSettings as error:
                 raise UsageError(str(error)) from error
 

@@ -192,7 +192,7 @@ def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:
     if not photos:
         return f"no dataset found, {expected}"
     return (
-        f"no dataset found: {amount(len(photos), 'photo')} without poses; COLMAP finds poses for them, or give"
+        f"no dataset found: {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give"
         f" those of an AR framework or a robot; {expected}"
     )
 

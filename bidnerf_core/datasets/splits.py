@@ -84,6 +84,16 @@ class Splits(Generic[F]):
         }
         return list(found.values())
 
+    def distinct_names(self) -> list[tuple[str, str]]:
+        """Return the first split, and the name there, of each description; splits may share frames."""
+        seen, found = set[int](), list[tuple[str, str]]()
+        for split, group in self._frames.items():
+            for name, frame in zip(self._names[split], group, strict=True):
+                if id(frame) not in seen:
+                    seen.add(id(frame))
+                    found.append((split, name))
+        return found
+
     def _known(self, split: str) -> None:
         if split not in self._frames:
             raise InputError(f"{self.path}: no split {split!r}, expected one of {', '.join(self.splits)}")
@@ -135,6 +145,10 @@ class SplitDataset(ABC, Generic[F]):
             if progress is not None:
                 progress(done, len(frames))
         return views
+
+    def distinct_names(self) -> list[tuple[str, str]]:
+        """Return the first split, and the name there, of each frame; splits may share frames."""
+        return self._frames.distinct_names()
 
     def sequence(self, others: Sequence[F] = ()) -> FrameSequence:
         """Return the frames of all splits in chronological order, or in that of file names where times are not recorded.

@@ -52,22 +52,8 @@ class Video:
         return self.count
 
     def __iter__(self) -> Iterator[TimedFrame]:
-        number = 0
-        with opened_video(self.path) as (container, stream):
-            decoded = container.decode(stream)
-            while True:
-                try:
-                    if (picture := next(decoded, None)) is None:
-                        break
-                    time, pixels = _time(container, picture), _upright(picture)
-                except (OSError, ValueError, MemoryError) as error:
-                    raise self._broken(number, error) from error
-                if time < 0:  # trimmed, but needed to decode what follows
-                    continue
-                yield TimedFrame(time, self._frame(pixels, number))
-                number += 1
-        if number == 0:
-            raise self._broken(0, ValueError("no frame could be decoded"))
+        for number, (time, pixels) in enumerate(pictures(self.path)):
+            yield TimedFrame(time, self._frame(pixels, number))
 
     def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
         rgb = as_floats(torch.from_numpy(pixels))  # at once, as a tracker reads them often
@@ -77,10 +63,32 @@ class Video:
             focal_is_approximate=found.approximate,
         )  # fmt: skip
 
-    def _broken(self, number: int, error: Exception) -> InputError:
-        return InputError(
-            f"{self.path}: breaks off at frame {number} ({reason(error)}), expected a whole video file"
-        )
+
+def pictures(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
+    """Yield the time (seconds) and the upright pixels of each frame of a video that ``open_video`` has accepted.
+
+    Raises ``InputError`` where the file breaks off.
+    """
+    number = 0
+    with opened_video(path) as (container, stream):
+        decoded = container.decode(stream)
+        while True:
+            try:
+                if (picture := next(decoded, None)) is None:
+                    break
+                time, pixels = _time(container, picture), _upright(picture)
+            except (OSError, ValueError, MemoryError) as error:
+                raise _broken(path, number, error) from error
+            if time < 0:  # trimmed, but needed to decode what follows
+                continue
+            yield time, pixels
+            number += 1
+    if number == 0:
+        raise _broken(path, 0, ValueError("no frame could be decoded"))
+
+
+def _broken(path: Path, number: int, error: Exception) -> InputError:
+    return InputError(f"{path}: breaks off at frame {number} ({reason(error)}), expected a whole video file")
 
 
 def is_video(path: Path) -> bool:
@@ -100,6 +108,12 @@ def open_video(path: Path, camera: CameraSource) -> Video:
     """Open a video file. Raises ``InputError`` if it is not one, if there is no camera, and if the extra is missing."""
     require_av(path)
     camera.require(path, "a video does not record its focal length")
+    return Video(path, camera, frame_count(path))
+
+
+def frame_count(path: Path) -> int:
+    """Return the number of frames in a video file; none is decoded. Raises ``InputError`` as ``open_video`` does."""
+    require_av(path)
     with open_binary(path, "a video file"):
         pass
     with opened_video(path) as (container, stream):
@@ -113,7 +127,7 @@ def open_video(path: Path, camera: CameraSource) -> Video:
             raise _no_video(path, reason(error)) from error
     if not shown:
         raise _no_video(path, "it has no frames")
-    return Video(path, camera, len(shown))
+    return len(shown)
 
 
 def require_av(path: Path) -> None:

@@ -15,6 +15,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.transforms_json import METRES_PER_DEPTH_UNIT, SPLITS, file_of
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
@@ -52,12 +53,8 @@ def write_transforms(
 def _written(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
     """Write the images of a frame and return its entry."""
     frame = view.frame
-    T_world_camera = view.T_ref_camera.to(torch.float64).matrix()
-    entry: dict[str, Any] = {
-        "file_path": f"images/{split}/{frame.name}.png",
-        "transform_matrix": (T_world_camera * T_world_camera.new_tensor(OPENCV_TO_OPENGL)).tolist(),
-        **camera_entry(frame.intrinsics, frame.name),
-    }
+    file = f"images/{split}/{frame.name}.png"
+    entry = frame_entry(file, frame.name, frame.intrinsics, view.T_ref_camera)
     _write(folder / entry["file_path"], _colours(frame, background))
     if frame.depth is not None:
         unit = max(METRES_PER_DEPTH_UNIT, float(frame.depth.max()) / LARGEST_DEPTH)
@@ -65,6 +62,22 @@ def _written(folder: Path, split: str, view: View, background: tuple[float, floa
         steps = (frame.depth.double() / unit).round().clamp(0, LARGEST_DEPTH)
         _write(folder / entry["depth_file_path"], steps.cpu().numpy().astype(np.uint16))
     return entry
+
+
+def frame_entry(
+    file_path: str, name: str, camera: Intrinsics, T_world_camera: SE3, time: float | None = None
+) -> dict[str, Any]:
+    """Return an entry of ``frames`` of a ``transforms.json``: an image, its camera, its pose and its time (seconds).
+
+    Raises ``InputError`` for a lens that the format cannot describe.
+    """
+    matrix = T_world_camera.to("cpu", torch.float64).matrix()
+    return {
+        "file_path": file_path,
+        "transform_matrix": (matrix * matrix.new_tensor(OPENCV_TO_OPENGL)).tolist(),
+        **({} if time is None else {"time": time}),
+        **camera_entry(camera, name),
+    }
 
 
 def camera_entry(camera: Intrinsics, name: str) -> dict[str, float]:

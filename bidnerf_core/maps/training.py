@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from bidnerf_core.backend import Backend, load_backend
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_cameras
 from bidnerf_core.captures.training_views import RefinementChoice, located, prepared
 from bidnerf_core.carving import estimate_bounds
@@ -29,6 +30,7 @@ from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS, Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.files import load_state, map_folder
 from bidnerf_core.maps.map import Map, build_field, frozen_field, load_map
+from bidnerf_core.maps.photos import posed_images
 from bidnerf_core.maps.views import Images, ReadViews, checked_side, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
 from bidnerf_core.registry import PluginError
@@ -74,10 +76,14 @@ def train(
     features: str = USUAL_FEATURES,
     largest: int | None = None,
     trust_poses: bool = False,
+    camera: Intrinsics | str | Path | None = None,
 ) -> Map:
-    """Train a map on posed images: check and refine their poses, train the field, and bake a surface and landmarks.
+    """Train a map on images: check and refine their poses, train the field, and bake a surface and landmarks.
 
-    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``split`` names the views of a dataset.
+    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``split`` names the views of a dataset,
+    and "all" stands for those of all splits. The path may also be that of a folder of photos without poses, or of a video:
+    ``find_poses`` then finds the poses first, in the folder OUT-poses beside the map. ``camera`` (intrinsics or a file) is for
+    such photos, and for the path to a dataset without a camera of its own.
     ``backend`` is the name of an installed backend, and ``config`` holds its settings: an object of its ``config_type``, or a
     dict of those that differ from the defaults. The map is stored in folder ``out`` while it is trained, and stays in memory
     only if that is None. ``refine_poses`` is "always", "never", or "auto": if the images contradict the given poses. ``bake`` may hold
@@ -103,17 +109,13 @@ def train(
         choices = ", ".join(get_args(RefinementChoice))
         raise InputError(f"refine_poses is {refine_poses!r}, expected one of {choices}")
     work = _work(out, bake, device, checkpoint_seconds, progress, cancel)
-    with contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite):
+    with (
+        contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite),
+        posed_images(data, split, work.out, camera, overwrite, progress, cancel) as (images, camera),
+    ):
+        side = checked_side(largest)
         read = read_views(
-            data,
-            split,
-            background,
-            depth_points,
-            point_choice,
-            progress,
-            cancel,
-            checked_side(largest),
-            work.out,
+            images, split, background, depth_points, point_choice, progress, cancel, side, work.out, camera
         )
         part = f" in split {split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
@@ -148,22 +150,27 @@ def resume(
     depth_points: str | Path | None = None,
     point_choice: SparseChoice | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    camera: Intrinsics | str | Path | None = None,
 ) -> Map:
     """Go on with the interrupted training of the map in ``folder``, with the same result as an uninterrupted one.
 
     A map that is trained but not baked is baked. Backend, settings and poses are those that the training was begun with;
-    ``data``, ``split``, ``background``, ``depth_points`` and ``point_choice`` must give the same views. The other arguments,
+    ``data``, ``split``, ``background``, ``depth_points``, ``point_choice`` and ``camera`` must give the same views. The other arguments,
     and what is raised, are as for ``train``. Raises ``InputError`` where nothing is left to do.
     """
     work = _work(folder, bake, device, checkpoint_seconds, progress, cancel)
     out = Path(folder)
     interrupted(out, work.bake is not None)
-    with map_folder(out, overwrite=True):
+    with (
+        map_folder(out, overwrite=True),
+        posed_images(data, split, out, camera, False, progress, cancel) as (images, camera),
+    ):
         info = interrupted(out, work.bake is not None)  # another process may have finished meanwhile
-        if background is None and isinstance(data, str | Path):
+        if background is None and isinstance(images, str | Path):
             background = info.bounds.background
+        side = longest_side(info)
         read = read_views(
-            data, split, background, depth_points, point_choice, progress, cancel, longest_side(info), out
+            images, split, background, depth_points, point_choice, progress, cancel, side, out, camera
         )
         _check_same_views(out, info, read, split)
         views = at_stored_poses(read.views, info.cameras)

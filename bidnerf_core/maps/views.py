@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Background, Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.dataset import Georeferenced, ReadingProgress
 from bidnerf_core.datasets.rgbd import reading_at
+from bidnerf_core.datasets.whole import with_all
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import BLACK, Frame, View
 from bidnerf_core.frames.masks import INVERTED, WhollyHidden, masks_sentence
@@ -54,24 +56,33 @@ def read_views(
     cancel: Cancel | None = None,
     largest: int | None = None,
     folder: Path | None = None,
+    camera: Intrinsics | str | Path | None = None,
 ) -> ReadViews:
-    """Read the views of ``data``; ``split`` names those of a dataset.
+    """Read the views of ``data``; ``split`` names those of a dataset, and "all" stands for those of all splits.
 
     Images of a dataset with more than ``largest`` pixels along the longer side are reduced to that, by default to what
     ``useful_size`` says. They are held as bytes, and where they are many in a nameless file in ``folder``, see ``PixelStore``.
 
     ``background`` is the colour behind images with an alpha channel, by default that of the dataset. Images without depth take
-    that of the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``. Raises ``InputError`` where there
+    that of the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``. ``camera`` is for the path to a
+    dataset without a camera of its own. Raises ``InputError`` where there
     are no views, and where they or the model are not usable.
     """
     stated: LengthUnit | None = None
     up: tuple[float, float, float] | None = None
     if isinstance(data, str | Path):
-        data = open_dataset(data, background)
+        data, camera = open_dataset(data, background, camera=camera), None
         background = None
+    if camera is not None:
+        raise InputError(
+            "camera is given for images that have cameras; expected it for the path to images without"
+        )
     if isinstance(data, Dataset):
         if background is not None and background_colour(background) != data.background:
             raise InputError(f"{data.path}: was opened over background {data.background}, got {background!r}")
+        if isinstance(data, Georeferenced):
+            stated, up = data.unit, data.up
+        data = with_all(data, split)
         if not data.frame_names(split):
             raise InputError(f"{data.path}: split {split!r} has no frames")
         views = _read(data, split, largest, folder, counter("reading", "images", progress, cancel))
@@ -80,8 +91,6 @@ def read_views(
         if not views:
             raise InputError(f"{data.path}: masks hide all of every image in split {split!r}; {INVERTED}")
         source, place, colour = data.path.resolve().name, str(data.path), data.background
-        if isinstance(data, Georeferenced):
-            stated, up = data.unit, data.up
     else:
         views, source, place = _checked(data), "", "views in memory"
         colour = BLACK if background is None else background_colour(background)

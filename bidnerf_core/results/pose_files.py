@@ -20,7 +20,7 @@ from torch import Tensor
 from bidnerf_core.camera.exif import read_exif
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.datasets.writing import OPENCV_TO_OPENGL, camera_entry
+from bidnerf_core.datasets.writing import frame_entry
 from bidnerf_core.errors import InputError, UsageError, printable, spelling_hint
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.geometry.units import LengthUnit
@@ -116,14 +116,8 @@ def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
 def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
     orientation = UPRIGHT if image.file is None else read_exif(image.file).orientation
     intrinsics, pose = as_stored(image, orientation)
-    matrix = pose.matrix()
     place = image.name if image.file is None else os.path.relpath(image.file.resolve(), folder.resolve())
-    return {
-        "file_path": Path(place).as_posix(),
-        "transform_matrix": (matrix * matrix.new_tensor(OPENCV_TO_OPENGL)).tolist(),
-        **({} if image.time is None else {"time": image.time}),
-        **camera_entry(intrinsics, image.name),
-    }
+    return frame_entry(Path(place).as_posix(), image.name, intrinsics, pose, image.time)
 
 
 def poses_json(images: Sequence[PosedImage]) -> str:

@@ -1,0 +1,79 @@
+"""All views of a dataset, whatever their split: ``--split all``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress, positions, unique_names
+from bidnerf_core.datasets.splits import SplitDataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import View
+
+ALL = "all"
+"""The name by which all splits together are asked for, unless a dataset has a split of that name."""
+
+
+@dataclass(frozen=True, eq=False)
+class WholeDataset:
+    """A ``Dataset`` with one split, ALL, that holds each view of another dataset once.
+
+    Views of one name in two splits have the name of their split in front.
+    """
+
+    parts: Dataset
+
+    @property
+    def path(self) -> Path:
+        return self.parts.path
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return (ALL,)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        return self.parts.background
+
+    @cached_property
+    def _listed(self) -> list[tuple[str, str]]:
+        """The split and the name in it of each view."""
+        if isinstance(self.parts, SplitDataset):  # which knows what its splits share
+            return self.parts.distinct_names()
+        return [(split, name) for split in self.parts.splits for name in self.parts.frame_names(split)]
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return unique_names(self._listed)
+
+    def frame_names(self, split: str) -> list[str]:
+        if split != ALL:
+            raise InputError(f"{self.path}: no split {split!r}, expected {ALL}")
+        return list(self._names)
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        known = self.frame_names(split)
+        stems = [name for _, name in self._listed]
+        asked = positions(known, stems, known if names is None else names, f"{self.path}: split {split!r}")
+        found = list[View]()
+        for done, place in enumerate(asked, start=1):
+            of, name = self._listed[place]
+            views = self.parts.views(of, [name])
+            found += [replace(view, frame=replace(view.frame, name=known[place])) for view in views]
+            if progress is not None:
+                progress(done, len(asked))
+        return found
+
+
+def with_all(dataset: Dataset, split: str) -> Dataset:
+    """Return a dataset that has ``split``, where this is ALL, and otherwise the dataset itself."""
+    return WholeDataset(dataset) if split == ALL and ALL not in dataset.splits else dataset
+
+
+def all_views(dataset: Dataset) -> list[View]:
+    """Read the views of all splits, each once. Raises ``InputError`` as ``Dataset.views`` does."""
+    return with_all(dataset, ALL).views(ALL)

@@ -1,0 +1,53 @@
+"""Photos without poses as the images of a map: their poses are found first, in a folder beside the map."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.datasets.splits import HOLD_OUT_EVERY
+from bidnerf_core.errors import amount
+from bidnerf_core.maps.views import Images
+from bidnerf_core.progress import Cancel, ProgressCallback
+from bidnerf_core.structure.sources import lacks_poses
+
+log = logging.getLogger("bidnerf")
+
+
+def poses_folder(out: Path) -> Path:
+    """Return the folder beside a map in which the poses of its photos are kept: MAP-poses."""
+    return out.with_name(f"{out.name}-poses")
+
+
+@contextlib.contextmanager
+def posed_images(
+    data: Images, split: str, out: Path | None, camera: Intrinsics | str | Path | None = None, overwrite: bool = False,
+    progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+) -> Iterator[tuple[Images, Intrinsics | str | Path | None]]:  # fmt: skip
+    """Yield images with poses, and the camera with which a dataset of them is to be opened.
+
+    For a folder of photos without poses, or a video, that is the dataset of the poses found by structure from motion, beside
+    the map ``out``, or in a temporary folder for a map in memory; poses that were found there before are used. Anything else
+    is yielded as it is.
+    """
+    if not isinstance(data, str | Path) or not lacks_poses(data):
+        yield data, camera
+        return
+    from bidnerf_core.structure.poses import find_poses
+
+    with (
+        tempfile.TemporaryDirectory()
+        if out is None
+        else contextlib.nullcontext(str(poses_folder(out))) as folder
+    ):
+        found = find_poses(data, folder, camera, overwrite, progress, cancel, reuse=True)
+        if split == "train":
+            held = len(range(0, found.placed, HOLD_OUT_EVERY))
+            log.info(
+                f"{folder}: {amount(held, 'photo')} of {found.placed} are held out to test the map; split 'all' trains on all"
+            )
+        yield folder, None

@@ -1,0 +1,182 @@
+"""Keypoints of photos in COLMAP's database, with the cameras that probably took the photos.
+
+Photos of one size whose EXIF states the same lens share a camera. Its focal length begins as EXIF states it, or as that of a
+usual lens, and is estimated with the poses. A camera that is given stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidnerf_core.camera.exif import Exif, read_exif
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT, Orientation
+from bidnerf_core.camera.source import CameraSource, Raster, camera_from_exif
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.images import read_header, read_image
+from bidnerf_core.mapping.landmarks.features import Keypoints, Sift
+from bidnerf_core.structure.library import to_colmap
+from bidnerf_core.structure.sources import SourceImage
+
+LARGEST = 1600
+"""Pixels along the longer side to which photos are reduced: more give somewhat more accurate poses, but take far longer."""
+DETECTOR = Sift(count=4096, largest=LARGEST)
+USUAL_FOCAL = 1.2
+"""Focal length, in longer sides of the image, of a camera of which nothing is known (COLMAP's default)."""
+HALF = 0.5
+"""Opacity below which a pixel shows the background."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo that can be read: its size as stored, that at which its keypoints are found, and its number of a camera."""
+
+    image: SourceImage
+    number: int  # in the database, from 1
+    size: tuple[int, int]  # width and height as stored
+    reduced: tuple[int, int]
+    exif: Exif
+    camera: int = 0  # in the database, from 1
+
+    @property
+    def orientation(self) -> Orientation:
+        return self.exif.orientation
+
+
+@dataclass(frozen=True)
+class Described:
+    """The photos that can be read, and why the others cannot."""
+
+    photos: list[Photo]
+    cameras: dict[int, Intrinsics]  # of reduced photos, by number
+    known_focal: dict[int, bool]  # whether EXIF or the user states the focal length
+    unusable: dict[str, str]  # reasons by name
+
+
+def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> Described:
+    """Read the headers of photos, and group the photos by camera. Raises ``InputError`` for a ``given`` camera that does not fit."""
+    photos, unusable = list[Photo](), dict[str, str]()
+    for number, image in enumerate(images, start=1):
+        try:
+            header, exif = read_header(image.file), read_exif(image.file)
+        except InputError as error:
+            unusable[image.name] = _without_file(error, image)
+            continue
+        size = (header.width, header.height)
+        factor = min(1.0, LARGEST / max(size))
+        reduced = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
+        photos.append(Photo(image, number, size, reduced, exif))
+    numbers: dict[Any, int] = {}
+    cameras, known = dict[int, Intrinsics](), dict[int, bool]()
+    for place, photo in enumerate(photos):
+        number = numbers.setdefault((photo.size, replace(photo.exif, orientation=UPRIGHT)), len(numbers) + 1)
+        photos[place] = replace(photo, camera=number)
+        if number not in cameras:
+            camera, known[number] = _first_guess(photo, given)
+            cameras[number] = camera.resized(*photo.reduced)
+    return Described(photos, cameras, known, unusable)
+
+
+def _first_guess(photo: Photo, given: Intrinsics | str | Path | None) -> tuple[Intrinsics, bool]:
+    raster = Raster(*photo.size)
+    if given is not None:
+        return CameraSource(given).find(photo.image.file, raster).intrinsics, True
+    exif = replace(photo.exif, orientation=UPRIGHT)
+    if exif.has_focal_length:
+        try:
+            return camera_from_exif(str(photo.image.file), raster, exif).intrinsics, True
+        except InputError:  # cropped after it was taken
+            pass
+    return Intrinsics.from_focal(USUAL_FOCAL * max(photo.size), *photo.size), False
+
+
+def key(number: int) -> str:
+    """Return the name of a photo in the database; its own may hold blanks, which COLMAP's lists of pairs do not allow."""
+    return f"{number:06d}"
+
+
+def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -> None:
+    """Write cameras and photos to an empty database. The lens of a camera that is not ``fixed`` has one radial coefficient."""
+    with pycolmap.DatabaseTransaction(database):
+        for number, intrinsics in found.cameras.items():
+            camera = (
+                to_colmap(intrinsics, number, pycolmap) if fixed else _unknown(intrinsics, number, pycolmap)
+            )
+            camera.has_prior_focal_length = found.known_focal[number]
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=number)
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        for photo in found.photos:
+            image = pycolmap.Image(name=key(photo.number), camera_id=photo.camera, image_id=photo.number)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=photo.number, rig_id=photo.camera)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+
+
+def _unknown(guess: Intrinsics, number: int, pycolmap: Any) -> Any:
+    parameters = [guess.fx, guess.width / 2, guess.height / 2, 0.0]
+    return pycolmap.Camera(
+        camera_id=number, model="SIMPLE_RADIAL", width=guess.width, height=guess.height, params=parameters
+    )
+
+
+def write_keypoints(
+    database: Any, found: Described, pycolmap: Any, count: Callable[[int, int], None]
+) -> dict[str, str]:
+    """Find the keypoints that the database lacks, and return why photos could not be decoded, by name.
+
+    ``count`` receives the number of photos that are done, and may raise to stop; what was found until then is stored.
+    """
+    missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
+    done, total = len(found.photos) - len(missing), len(found.photos)
+    unusable = dict[str, str]()
+    for photo, keypoints in _detected(missing):
+        if isinstance(keypoints, InputError):
+            unusable[photo.image.name] = _without_file(keypoints, photo.image)
+        else:
+            with pycolmap.DatabaseTransaction(database):
+                _write(database, photo.number, keypoints, pycolmap)
+        done += 1
+        count(done, total)
+    return unusable
+
+
+def _detected(photos: Sequence[Photo]) -> Iterator[tuple[Photo, Keypoints | InputError]]:
+    with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
+        try:
+            yield from zip(photos, pool.map(_keypoints, photos), strict=True)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _keypoints(photo: Photo) -> Keypoints | InputError:
+    """Return the keypoints of the reduced photo, without those on its background."""
+    try:
+        rgb, alpha = read_image(photo.image.file, size=photo.reduced)
+    except InputError as error:
+        return error
+    found = DETECTOR(rgb)
+    if alpha is None:
+        return found
+    columns, rows = found.pixels.long().unbind(-1)
+    inside = alpha[rows.clamp(0, alpha.shape[0] - 1), columns.clamp(0, alpha.shape[1] - 1)] > HALF
+    return found[inside]
+
+
+def _write(database: Any, number: int, found: Keypoints, pycolmap: Any) -> None:
+    database.write_keypoints(number, found.pixels.float().numpy())
+    descriptors = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found.descriptors.numpy())
+    database.write_descriptors(number, descriptors)
+
+
+def _without_file(error: InputError, image: SourceImage) -> str:
+    """Return a message without the file's path in front, which stands beside it anyway."""
+    return str(error).removeprefix(f"{image.file}: ")

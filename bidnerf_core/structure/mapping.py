@@ -1,0 +1,176 @@
+"""Placing photos: COLMAP's incremental mapper, and the model that is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bidnerf_core.errors import amount
+from bidnerf_core.structure.keypoints import Described, Photo
+from bidnerf_core.structure.matching import Overlaps
+
+LEAST_PHOTOS = 3
+"""Photos of the smallest model: two have one baseline, from which no camera can be checked."""
+LEAST_POINTS = 15
+"""Triangulated points that a placed photo must show. COLMAP also places photos by matches without depth, which it finds in
+photos from one place.
+"""
+FEW_KEYPOINTS = 100
+"""Number of keypoints below which a photo that is left out shows too little."""
+MOST_MODELS = 20
+SPREAD = 0.02
+"""Least ratio of the second smallest to the largest spread of horizontal axes by which they determine the vertical."""
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """The reconstructions of the photos, the largest first; parts of the photos that share nothing have one each."""
+
+    all: list[Any]
+
+    @property
+    def largest(self) -> Any:
+        return self.all[0]
+
+    @property
+    def sizes(self) -> list[int]:
+        """Numbers of photos."""
+        return [model.num_reg_images() for model in self.all]
+
+
+def reconstructed(
+    database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any,
+    count: Callable[[int, int], None],
+) -> Models:  # fmt: skip
+    """Place the photos of a database, with the cameras as they are if they are ``fixed``; models are written to ``folder``.
+
+    ``count`` receives the number of photos that are placed, and may raise to stop. There may be no model at all.
+    """
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=threads,
+        random_seed=0,
+        extract_colors=False,
+        min_model_size=LEAST_PHOTOS,
+        max_num_models=MOST_MODELS,
+    )
+    if fixed:
+        options.constant_cameras = set(found.cameras)
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    total, placed = len(found.photos), 0
+
+    def begin() -> None:
+        nonlocal placed
+        placed = 2
+        count(placed, total)
+
+    def place() -> None:
+        nonlocal placed
+        placed = min(placed + 1, total)
+        count(placed, total)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    models = pycolmap.incremental_mapping(
+        database, folder, folder, options, initial_image_pair_callback=begin, next_image_callback=place
+    )
+    for model in models.values():
+        for number in list(model.reg_image_ids()):
+            if model.image(number).num_points3D < LEAST_POINTS:
+                model.deregister_frame(model.image(number).frame_id)
+    good = [model for model in models.values() if model.num_reg_images() >= LEAST_PHOTOS]
+    return Models(sorted(good, key=lambda model: (-model.num_reg_images(), -model.num_points3D())))
+
+
+def turn_upright(model: Any, photos: Mapping[int, Photo], pycolmap: Any) -> None:
+    """Turn the world of a model so that z points up, and move its origin to the middle of the cameras."""
+    horizontal, up, centres = [], [], []
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        R_world_camera = image.cam_from_world().inverse().rotation.matrix()
+        right, above = _upright_axes(photos[number])
+        horizontal.append(R_world_camera @ right)
+        up.append(R_world_camera @ above)
+        centres.append(image.projection_center())
+    R = _rotation_to_z(vertical(np.stack(horizontal), np.stack(up)))
+    centre = np.mean(centres, axis=0)
+    model.transform(pycolmap.Sim3d(np.concatenate([R, -(R @ centre)[:, None]], axis=1)))
+
+
+def vertical(right: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the direction that points up, given the horizontal and the upward axes (n, 3) of upright photos.
+
+    Photographers hold cameras level from left to right but tilt them up and down, so the vertical is the direction that is
+    most nearly at right angles to all horizontal axes, if these differ enough.
+    """
+    mean = up.mean(axis=0)
+    spread, axes = np.linalg.eigh(right.T @ right)
+    found = axes[:, 0] if spread[1] > SPREAD * spread[2] else mean
+    found = found if float(found @ mean) >= 0 else -found
+    return found / max(float(np.linalg.norm(found)), 1e-12)
+
+
+def _upright_axes(photo: Photo) -> tuple[np.ndarray, np.ndarray]:
+    """Return the axes to the right and up of the upright photo, in the camera of the photo as stored (x right, y down)."""
+    turned = photo.orientation
+    x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
+    if turned.transposes:
+        return np.array([0.0, y, 0.0]), np.array([-x, 0.0, 0.0])
+    return np.array([x, 0.0, 0.0]), np.array([0.0, -y, 0.0])
+
+
+def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation that takes a unit vector to the z axis."""
+    x, y, z = direction
+    if z < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0.0]])  # of direction x (0, 0, 1)
+    found: np.ndarray = np.eye(3) + cross + cross @ cross / (1 + z)
+    return found
+
+
+def full_size(model: Any, photos: Mapping[int, Photo]) -> None:
+    """Scale the cameras and keypoints of a model from reduced photos to photos as stored."""
+    sizes = {photo.camera: photo for photo in photos.values()}
+    for number, photo in sizes.items():
+        if model.exists_camera(number):
+            model.camera(number).rescale(*photo.size)
+    for number in model.reg_image_ids():
+        photo = photos[number]
+        scale = np.array(photo.size) / np.array(photo.reduced)
+        if (scale != 1).any():
+            for point in model.image(number).points2D:
+                point.xy = point.xy * scale
+
+
+def left_out(
+    found: Described, models: Models, overlaps: Overlaps, keypoints: Mapping[int, int]
+) -> dict[str, str]:
+    """Return why photos are in no model or not in the largest, by name; ``keypoints`` are numbers of them."""
+    of_model = {
+        number: place
+        for place, model in reversed(list(enumerate(models.all)))
+        for number in model.reg_image_ids()
+    }
+    reasons = dict(found.unusable)
+    for photo in found.photos:
+        place = of_model.get(photo.number)
+        if place != 0:
+            reasons[photo.image.name] = _reason(
+                photo, None if place is None else models.sizes[place], overlaps, keypoints
+            )
+    return reasons
+
+
+def _reason(photo: Photo, model: int | None, overlaps: Overlaps, keypoints: Mapping[int, int]) -> str:
+    count, partners = keypoints.get(photo.number, 0), overlaps.partners[photo.number]
+    if model is not None:
+        return f"belongs to another model, of {amount(model, 'photo')}, that the largest has no connection to"
+    if not partners and count < FEW_KEYPOINTS:
+        return f"has {amount(count, 'keypoint')}: a plain surface, blurred, or dark"
+    if not partners:
+        return "shows the same as no other photo, by its keypoints"
+    return f"shows the same as {amount(partners, 'other photo')}, but too little of what the placed ones show"

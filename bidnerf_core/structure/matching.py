@@ -1,0 +1,67 @@
+"""Matching the keypoints of pairs of photos, and checking the matches by the geometry of two views, by COLMAP."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.structure.keypoints import key
+from bidnerf_core.structure.pairs import Pairs
+
+FIRST_BATCH, BATCH_SECONDS = 32, 2.0
+"""Pairs that are matched at first without an interruption, and how long later batches take."""
+FROM_ONE_PLACE = ("PANORAMIC", "PLANAR_OR_PANORAMIC")
+"""Configurations of pairs that show no parallax."""
+
+
+def match(
+    database: Path, numbers: Sequence[int], pairs: Pairs, threads: int, pycolmap: Any,
+    count: Callable[[int, int], None],
+) -> None:  # fmt: skip
+    """Match those of the ``pairs`` of photos that the database lacks; ``numbers`` are those of the photos in the database.
+
+    ``count`` receives the number of pairs that are done, and may raise to stop; what was found until then is stored.
+    """
+    with pycolmap.Database.open(database) as stored:
+        todo = [(i, j) for i, j in pairs if not stored.exists_two_view_geometry(numbers[i], numbers[j])]
+    done, size = len(pairs) - len(todo), FIRST_BATCH
+    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    listed = database.with_name("pairs.txt")
+    count(done, len(pairs))
+    while todo:
+        batch, todo = todo[:size], todo[size:]
+        listed.write_text("".join(f"{key(numbers[i])} {key(numbers[j])}\n" for i, j in batch))
+        began = time.monotonic()
+        pycolmap.match_image_pairs(
+            database, matching, pycolmap.ImportedPairingOptions(match_list_path=listed), verification,
+            device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        each = (time.monotonic() - began) / len(batch)
+        size = max(1, min(2 * size, round(BATCH_SECONDS / max(each, 1e-6))))
+        done += len(batch)
+        count(done, len(pairs))
+
+
+class Overlaps:
+    """What the matches of a database say about the photos."""
+
+    def __init__(self, database: Any, pycolmap: Any) -> None:
+        self.partners: Counter[int] = Counter()  # photos that show the same as each, by number
+        self.pairs = self.from_one_place = 0
+        still = [int(getattr(pycolmap.TwoViewGeometryConfiguration, name)) for name in FROM_ONE_PLACE]
+        for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+            if not len(geometry.inlier_matches):
+                continue
+            self.partners.update(pycolmap.pair_id_to_image_pair(pair))
+            self.pairs += 1
+            self.from_one_place += int(geometry.config) in still
+
+    @property
+    def without_parallax(self) -> bool:
+        """Whether most pairs look as if the camera was turned only."""
+        return self.pairs > 0 and self.from_one_place > self.pairs / 2

@@ -1,0 +1,277 @@
+"""Finding the poses of photos that have none: from a folder of photos, or a video, to a dataset."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.datasets.video import is_video
+from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.folders import output_folder
+from bidnerf_core.io.json import read_json
+from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.structure import video_frames
+from bidnerf_core.structure.keypoints import Described, described, write_cameras, write_keypoints
+from bidnerf_core.structure.library import pycolmap_for
+from bidnerf_core.structure.mapping import (
+    LEAST_PHOTOS,
+    Models,
+    full_size,
+    left_out,
+    reconstructed,
+    turn_upright,
+)
+from bidnerf_core.structure.matching import Overlaps, match
+from bidnerf_core.structure.pairs import Pairs, all_pairs, chosen_pairs, few
+from bidnerf_core.structure.record import (
+    FRAMES,
+    RECORD,
+    FoundPoses,
+    LeftOut,
+    begin,
+    begun_with,
+    clear,
+    digest,
+    is_ours,
+    read_found,
+    relative,
+    write_dataset,
+    write_found,
+)
+from bidnerf_core.structure.sources import SourceImage, photos_of
+
+log = logging.getLogger("bidnerf")
+
+ADVICE = "photos that overlap by two thirds, taken while moving sideways"
+
+
+def find_poses(
+    photos: str | Path,
+    out: str | Path,
+    camera: Intrinsics | str | Path | None = None,
+    overwrite: bool = False,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+    *,
+    reuse: bool = False,
+) -> FoundPoses:
+    """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset into ``out``.
+
+    ``photos`` is a folder of photos, or a video, of which frames are chosen by motion and sharpness and written as images.
+    ``camera`` (intrinsics or a file of them) is kept as it is; without it, focal length and radial distortion are estimated,
+    beginning with EXIF. If the photos fall into several models, the largest is kept.
+
+    The dataset is a ``transforms.json`` that refers to the photos where they are; ``poses.json`` lists those that were left out
+    and why, and ``sparse/0`` is the model for COLMAP. The unit of length is arbitrary, and z points up. Work that was
+    interrupted in the same folder goes on; poses that were found there for the same photos are returned at once, unless
+    ``overwrite`` is set and ``reuse`` is not.
+
+    ``progress`` receives each step; once ``cancel`` returns True, ``Cancelled`` is raised. Raises ``InputError`` where fewer than
+    three photos can be read or placed, where poses are known already, where the folder holds something else and
+    ``overwrite`` is not set, and where pycolmap is missing.
+    """
+    source, folder = Path(photos), Path(out)
+    pycolmap = pycolmap_for(str(source))
+    images = [] if is_video(source) else photos_of(source, folder)
+    inputs = digest([image.file for image in images] or [_video(source)], camera)
+    known = found_before(folder, inputs) if reuse or not overwrite else None
+    if known is not None:
+        log.info(f"{folder}: has the poses of these photos already")
+        return known
+    with _folder(folder, inputs, overwrite):
+        if overwrite:
+            clear(folder)
+        work = begin(folder, inputs)
+        try:
+            return _Search(source, folder, work, inputs, camera, progress, cancel, pycolmap).run(images)
+        except Cancelled as stopped:
+            raise Cancelled(f"{folder}: {stopped}; the same command goes on from there") from stopped
+        except InputError:
+            clear(folder)
+            raise
+
+
+def found_before(folder: Path, inputs: str | None = None) -> FoundPoses | None:
+    """Return the poses in a folder if they were found for the photos with the digest ``inputs``."""
+    known = read_found(folder)
+    return known if known is not None and inputs in (None, known.inputs) else None
+
+
+def _video(path: Path) -> Path:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, expected a video or a folder of photos")
+    return path
+
+
+@contextlib.contextmanager
+def _folder(out: Path, inputs: str, overwrite: bool) -> Iterator[None]:
+    """Hold the lock of the folder of the poses, which is empty, or holds interrupted work on the same photos."""
+    goes_on = begun_with(out) == inputs
+
+    def describe(folder: Path) -> str | None:
+        if (folder / RECORD).exists():
+            return "holds the poses of other photos"
+        return "holds interrupted work on other photos" if begun_with(folder) else None
+
+    with output_folder(out, overwrite, lambda file: goes_on and is_ours(file), describe):
+        yield
+
+
+class _Search:
+    """One search for the poses of some photos."""
+
+    def __init__(
+        self, source: Path, folder: Path, work: Path, inputs: str, camera: Intrinsics | str | Path | None,
+        progress: ProgressCallback | None, cancel: Cancel | None, pycolmap: Any,
+    ) -> None:  # fmt: skip
+        self._source, self._folder, self._work, self._inputs = source, folder, work, inputs
+        self._camera, self._progress, self._cancel = camera, progress, cancel
+        self._pycolmap, self._began = pycolmap, time.monotonic()
+        self._database = work / "database.db"
+        self._threads = max(1, torch.get_num_threads())
+
+    def run(self, images: list[SourceImage]) -> FoundPoses:
+        ordered = not images
+        if ordered:
+            images = self._frames()
+        found = self._described(images)
+        keypoints = self._keypoints(found)
+        self._match(found, keypoints, ordered)
+        count = self._counter("placing photos", "photos")
+        models = reconstructed(
+            self._database,
+            self._work / "models",
+            found,
+            self._camera is not None,
+            self._threads,
+            self._pycolmap,
+            count,
+        )
+        with self._pycolmap.Database.open(self._database) as database:
+            overlaps = Overlaps(database, self._pycolmap)
+        if not models.all:
+            raise InputError(f"{self._source}: {_unplaced(found, overlaps)}; expected {ADVICE}")
+        return self._written(images, found, models, left_out(found, models, overlaps, keypoints))
+
+    def _counter(self, stage: str, unit: str) -> Callable[[int, int], None]:
+        return counter(stage, unit, self._progress, self._cancel)
+
+    def _frames(self) -> list[SourceImage]:
+        """Return the chosen frames of a video, which are written as images unless they were before."""
+        listed = self._work / "frames.json"
+        if listed.exists():
+            return [
+                SourceImage(name, Path(file), at) for name, file, at in read_json(listed, "a list of frames")
+            ]
+        measures = video_frames.measured(self._source, self._counter("measuring frames", "frames"))
+        wanted = video_frames.chosen(measures)
+        log.info(
+            f"{self._source}: {len(wanted)} of {amount(len(measures), 'frame')} chosen by motion and sharpness"
+        )
+        count = self._counter("writing frames", "frames")
+        images = video_frames.write_frames(self._source, self._folder / FRAMES, wanted, count)
+        rows = [[image.name, str(image.file), image.time] for image in images]
+        write_file(listed, json.dumps(rows).encode())
+        return images
+
+    def _described(self, images: list[SourceImage]) -> Described:
+        found = described(images, self._camera)
+        self._require_enough(found, len(images))
+        sizes = {photo.size for photo in found.photos}
+        size = "x".join(map(str, next(iter(sizes)))) if len(sizes) == 1 else f"{len(sizes)} sizes"
+        focal = "from EXIF" if all(found.known_focal.values()) else "to be estimated"
+        if self._camera is not None:
+            focal = "as given"
+        log.info(
+            f"{self._source}: no poses known; finding them for {amount(len(found.photos), 'photo')} of {size},"
+            f" {amount(len(found.cameras), 'camera')}, focal length {focal}"
+        )
+        return found
+
+    def _require_enough(self, found: Described, total: int) -> None:
+        if len(found.photos) >= LEAST_PHOTOS:
+            return
+        first = next(iter(found.unusable.items()), None)
+        why = "" if first is None else f" that can be read, of {total} ({first[0]}: {first[1]})"
+        raise InputError(
+            f"{self._source}: {amount(len(found.photos), 'photo')}{why}, expected at least {LEAST_PHOTOS} of one scene,"
+            " taken from different places"
+        )
+
+    def _keypoints(self, found: Described) -> dict[int, int]:
+        """Fill the database, and return the number of keypoints of each photo by its number."""
+        count = self._counter("finding keypoints", "photos")
+        with self._pycolmap.Database.open(self._database) as database:
+            if not database.num_images():
+                write_cameras(database, found, self._camera is not None, self._pycolmap)
+            found.unusable.update(write_keypoints(database, found, self._pycolmap, count))
+            found.photos[:] = [photo for photo in found.photos if photo.image.name not in found.unusable]
+            self._require_enough(found, len(found.photos) + len(found.unusable))
+            return {photo.number: database.num_keypoints_for_image(photo.number) for photo in found.photos}
+
+    def _match(self, found: Described, keypoints: dict[int, int], ordered: bool) -> None:
+        numbers = [photo.number for photo in found.photos]
+        pairs = self._pairs(numbers, ordered)
+        pairs = [(i, j) for i, j in pairs if keypoints[numbers[i]] and keypoints[numbers[j]]]
+        match(
+            self._database,
+            numbers,
+            pairs,
+            self._threads,
+            self._pycolmap,
+            self._counter("matching photos", "pairs"),
+        )
+
+    def _pairs(self, numbers: list[int], ordered: bool) -> Pairs:
+        if few(len(numbers), ordered):
+            return all_pairs(len(numbers))
+        stored = self._work / "pairs.json"
+        if not stored.exists():
+            with self._pycolmap.Database.open(self._database) as database:
+                pairs = chosen_pairs([database.read_descriptors(number).data for number in numbers])
+            log.info(f"{self._source}: {len(pairs)} pairs of neighbours and of photos that look alike")
+            write_file(stored, json.dumps(pairs).encode())
+        return [(i, j) for i, j in read_json(stored, "a list of pairs")]
+
+    def _written(
+        self, images: list[SourceImage], found: Described, models: Models, reasons: dict[str, str]
+    ) -> FoundPoses:
+        photos, model = {photo.number: photo for photo in found.photos}, models.largest
+        error = model.compute_mean_reprojection_error()
+        turn_upright(model, photos, self._pycolmap)
+        full_size(model, photos)
+        base = self._folder / FRAMES if is_video(self._source) else self._source
+        names = {number: relative(photo.image.file, base) for number, photo in photos.items()}
+        write_dataset(self._folder, photos, model, names)
+        left = [
+            LeftOut(image.name, relative(image.file, self._folder), reasons[image.name])
+            for image in images
+            if image.name in reasons
+        ]
+        result = FoundPoses(
+            self._source.name, len(images), model.num_reg_images(), tuple(models.sizes), tuple(left), model.num_points3D(),
+            error, round(time.monotonic() - self._began, 1), self._inputs, self._pycolmap.__version__,
+        )  # fmt: skip
+        write_found(self._folder, result)
+        for line in str(result).splitlines():
+            log.info(f"{self._source}: {line}")
+        return result
+
+
+def _unplaced(found: Described, overlaps: Overlaps) -> str:
+    """Return why no three photos could be placed."""
+    of = f"no three of {amount(len(found.photos), 'photo')} could be placed"
+    if not overlaps.pairs:
+        return f"{of}: no two show enough of the same"
+    if overlaps.without_parallax:
+        return f"{of}: they look as if taken from one place, which shows no distances"
+    return f"{of}, though {amount(overlaps.pairs, 'pair')} show the same"

@@ -1,0 +1,171 @@
+"""What was found of photos without poses, and the files of a folder of poses.
+
+``poses.json`` is written last: a folder that holds it is complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.datasets.writing import frame_entry
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.json import from_plain, read_json, to_plain
+from bidnerf_core.structure.keypoints import DETECTOR, Photo
+from bidnerf_core.structure.library import from_colmap
+
+RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
+MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
+FRAME_FILE = re.compile(r"\d{6,}\.jpg")
+LARGEST_NAMED = 5
+"""Photos that a remark names."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A photo without a pose."""
+
+    photo: str  # its name, as a frame of the dataset would be called
+    file: str  # relative to the folder of the poses
+    reason: str
+
+
+@dataclass(frozen=True)
+class FoundPoses:
+    """The poses that structure from motion found; the dataset beside this record holds them.
+
+    The world has the unit of the first pair of photos, not metres, and z points up as far as the photos tell. ``str()`` of it
+    is a summary for people.
+    """
+
+    source: str  # name of the folder of photos, or of the video
+    photos: int  # with those that cannot be read
+    placed: int  # photos with a pose
+    models: tuple[int, ...]  # photos of each model, the largest first; only this one is in the dataset
+    left_out: tuple[LeftOut, ...]
+    points: int  # triangulated points of the largest model
+    reprojection_error: float  # mean, in pixels of photos of at most 1600 pixels
+    seconds: float  # of the run that finished
+    inputs: str  # digest of the names, sizes and times of the files, and of the camera
+    pycolmap: str  # its version
+
+    def __str__(self) -> str:
+        lines = [
+            f"poses of {self.placed} of {amount(self.photos, 'photo')}; {amount(self.points, 'point')}, mean error"
+            f" {self.reprojection_error:.2f} px"
+        ]
+        if len(self.models) > 1:
+            sizes = ", ".join(map(str, self.models))
+            lines.append(
+                f"the photos fall into {len(self.models)} models without a connection, of {sizes} photos; the largest is kept"
+            )
+        lines += [f"left out {left.photo}: {left.reason}" for left in self.left_out[:LARGEST_NAMED]]
+        more = len(self.left_out) - LARGEST_NAMED
+        if more > 0:
+            lines.append(f"left out {more} more, see {RECORD}")
+        return "\n".join(lines)
+
+
+def digest(files: Sequence[Path], camera: Intrinsics | str | Path | None) -> str:
+    """Return what identifies the photos and the way in which their poses are sought."""
+    facts = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    given = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]
+    return hashlib.blake2b(json.dumps([facts, given]).encode(), digest_size=16).hexdigest()
+
+
+def read_found(folder: Path) -> FoundPoses | None:
+    """Return the record in a folder of poses, or None where there is none. Raises ``InputError`` for a damaged one."""
+    if not (folder / RECORD).is_file() or not (folder / TRANSFORMS).is_file():
+        return None
+    return from_plain(
+        FoundPoses, read_json(folder / RECORD, "the record of found poses"), str(folder / RECORD)
+    )
+
+
+def begun_with(folder: Path) -> str | None:
+    """Return the digest of the photos with which interrupted work in a folder was begun, or None where there is none."""
+    try:
+        found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
+    except InputError:
+        return None
+    return found.get("inputs") if isinstance(found, dict) else None
+
+
+def begin(folder: Path, inputs: str) -> Path:
+    """Return the folder of the work, emptied unless it was begun with the same inputs."""
+    work = folder / WORK
+    if begun_with(folder) != inputs:
+        clear(folder)
+        work.mkdir(parents=True, exist_ok=True)
+        write_file(work / "begun.json", json.dumps({"inputs": inputs}).encode())
+    return work
+
+
+def is_ours(file: Path) -> bool:
+    """Return whether a file or folder in a folder of poses is one that this module writes."""
+    if file.name == FRAMES:
+        return file.is_dir() and all(FRAME_FILE.fullmatch(each.name) for each in file.iterdir())
+    return file.name in (RECORD, TRANSFORMS, WORK, MODEL.partition("/")[0])
+
+
+def clear(folder: Path) -> None:
+    """Remove all that this module wrote; other files stay."""
+    for name in (RECORD, TRANSFORMS):
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / WORK, ignore_errors=True)
+    for name in MODEL_FILES:
+        (folder / MODEL / name).unlink(missing_ok=True)
+    if (folder / FRAMES).is_dir() and is_ours(folder / FRAMES):
+        shutil.rmtree(folder / FRAMES)
+
+
+def write_dataset(folder: Path, photos: Mapping[int, Photo], model: Any, names: Mapping[int, str]) -> None:
+    """Write a model, whose cameras are those of the photos as stored, and a ``transforms.json`` of it.
+
+    ``photos`` and ``names`` (for the model) are by the number of an image.
+    """
+    entries = []
+    for number in sorted(model.reg_image_ids()):
+        photo, image = photos[number], model.image(number)
+        image.name = names[number]
+        camera = from_colmap(model.camera(image.camera_id))
+        T_world_camera = _pose(image.cam_from_world()).inverse()
+        place = relative(photo.image.file, folder)
+        entries.append(frame_entry(place, photo.image.name, camera, T_world_camera, photo.image.time))
+    (folder / MODEL).mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder / MODEL)
+    content = json.dumps(
+        {"camera_model": "OPENCV", "unit": "units", "frames": entries}, indent=1, allow_nan=False
+    )
+    write_file(folder / TRANSFORMS, content.encode())
+
+
+def write_found(folder: Path, found: FoundPoses) -> None:
+    """Write the record, and remove what the work left behind."""
+    write_file(folder / RECORD, json.dumps(to_plain(found), indent=1, allow_nan=False).encode())
+    shutil.rmtree(folder / WORK, ignore_errors=True)
+
+
+def relative(file: Path, folder: Path) -> str:
+    """Return the path of a file from a folder; an absolute one where they are on different drives."""
+    try:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return file.resolve().as_posix()
+
+
+def _pose(rigid: Any) -> SE3:
+    matrix = torch.from_numpy(rigid.matrix()).double()
+    return SE3(matrix[:, :3].clone(), matrix[:, 3].clone())

@@ -1,0 +1,88 @@
+"""The photos whose poses are sought: those of a folder, or of the folders in it, and videos."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.reader import expected_files, find_reader
+from bidnerf_core.datasets.video import VIDEO_SUFFIXES, is_video
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.photos import natural_order, photos_in
+
+NOT_PHOTOS = ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
+"""Names of folders whose images are no photos."""
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """A photo, or a frame of a video that was written as an image."""
+
+    name: str  # unique among the images: the stem, with as many folders as make it so
+    file: Path
+    time: float | None = None  # seconds, of a frame of a video
+
+
+def lacks_poses(path: str | Path) -> bool:
+    """Return whether a path is a video, or a folder with photos, that no reader of datasets recognises."""
+    place = Path(path)
+    if find_reader(place) is not None:
+        return False
+    return bool(_listed(place, None)) if place.is_dir() else is_video(place)
+
+
+def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
+    """Return the photos of a folder in the natural order of their names.
+
+    Where the folder itself has none, those of the folders in it are taken, except for depth, masks and the like, and for
+    ``out``. Raises ``InputError`` where there is no such folder, where there are no photos, and where poses are known.
+    """
+    if not folder.exists():
+        raise InputError(f"{folder}: no such file or folder, expected photos or a video")
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: is a file, expected a folder of photos or a video ({', '.join(VIDEO_SUFFIXES)})"
+        )
+    reader = find_reader(folder)
+    if reader is not None:
+        raise InputError(
+            f"{folder}: is a dataset whose poses are known ({reader.expected}); train with it as it is, or give the folder of"
+            " the photos alone to find their poses anew"
+        )
+    files = _listed(folder, out)
+    if not files:
+        raise InputError(f"{folder}: no photos in it, nor in the folders in it ({expected_files()})")
+    names = unique_names([(*file.relative_to(folder).parts[:-1], file.stem) for file in files])
+    return [SourceImage(name, file) for name, file in zip(names, files, strict=True)]
+
+
+def _listed(folder: Path, out: Path | None) -> list[Path]:
+    own, _ = photos_in(folder)
+    if own:
+        return own
+    found = list(_below(folder, out))
+    return sorted(found, key=lambda file: natural_order(file.relative_to(folder).as_posix()))
+
+
+def _below(folder: Path, out: Path | None) -> Iterator[Path]:
+    """Yield the photos of the folders in ``folder`` at any depth, except those of datasets."""
+    for place, inside, _ in os.walk(folder):
+        inside[:] = sorted(
+            name
+            for name in inside
+            if not name.startswith(".")
+            and name.lower() not in NOT_PHOTOS
+            and not _same(Path(place, name), out)
+        )
+        if Path(place) != folder:
+            if find_reader(Path(place)) is not None:
+                inside.clear()
+                continue
+            yield from photos_in(place)[0]
+
+
+def _same(folder: Path, out: Path | None) -> bool:
+    return out is not None and out.exists() and folder.samefile(out)

@@ -1,0 +1,139 @@
+"""The frames of a video that are worth placing: as many as the motion of the image asks for, the sharpest of their neighbours.
+
+The motion of the image is the displacement of tracked corners, accumulated along the video. A shaking camera does not add to
+it, since corners are followed from one anchor frame until they are a few percent of the image away. Frames are chosen at equal
+steps of the accumulated motion: none while the camera rests, many while it turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from bidnerf_core.captures.photos import sharpness
+from bidnerf_core.datasets.video import frame_count, pictures
+from bidnerf_core.structure.sources import SourceImage
+
+STEP = 0.04
+"""Motion of the image between chosen frames, in diagonals."""
+ANCHOR = 0.02
+"""Motion of the image, in diagonals, after which corners are found anew."""
+MOST = 400
+"""Largest number of chosen frames: longer videos take longer steps."""
+WINDOW = 0.3
+"""Share of a step on either side within which the sharpest frame is chosen."""
+LEAST_TRACKED = 0.5
+"""Share of the corners that must still be tracked."""
+CORNERS, QUALITY, APART = 200, 0.01, 7
+"""Number of corners, their least quality relative to the best, and their least distance in pixels (Shi and Tomasi 1994)."""
+WIDTH = 320
+"""Pixels along the longer side of the images that corners are tracked in."""
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class FrameMeasure:
+    """The time of a frame (seconds), the accumulated motion until then (diagonals), and its sharpness (octaves)."""
+
+    time: float
+    motion: float
+    sharpness: float
+
+
+def measured(video: Path, count: Callable[[int, int], None]) -> list[FrameMeasure]:
+    """Measure each frame of a video; ``count`` receives the number of frames that are done, and may raise to stop."""
+    total = frame_count(video)
+    path, found = _Motion(), list[FrameMeasure]()
+    for time, pixels in pictures(video):
+        grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        found.append(FrameMeasure(time, path.advance(_small(grey)), sharpness(grey.astype(np.float32) / 255)))
+        count(min(len(found), total), total)
+    return found
+
+
+def chosen(frames: Sequence[FrameMeasure]) -> list[int]:
+    """Return the indices of the frames to place: one for each step of motion, the sharpest near it."""
+    motion = np.array([frame.motion for frame in frames])
+    sharp = np.array([frame.sharpness for frame in frames])
+    step = max(STEP, float(motion[-1]) / (MOST - 1))
+    found = set[int]()
+    for place in np.arange(round(float(motion[-1]) / step) + 1) * step:
+        away = np.abs(motion - place)
+        near = np.flatnonzero(away <= WINDOW * step)
+        found.add(int(near[sharp[near].argmax()]) if len(near) else int(away.argmin()))
+    return sorted(found)
+
+
+def write_frames(
+    video: Path, folder: Path, wanted: Sequence[int], count: Callable[[int, int], None]
+) -> list[SourceImage]:
+    """Write the frames of the indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
+    folder.mkdir(parents=True, exist_ok=True)
+    asked, found = set(wanted), list[SourceImage]()
+    for number, (time, pixels) in enumerate(pictures(video)):
+        if number in asked:
+            image = SourceImage(f"{number:06d}", folder / f"{number:06d}.jpg", time)
+            Image.fromarray(pixels).save(image.file, quality=JPEG_QUALITY, subsampling=0)
+            found.append(image)
+            count(len(found), len(asked))
+        if len(found) == len(asked):
+            break
+    return found
+
+
+class _Motion:
+    """The accumulated motion of the image, in diagonals."""
+
+    def __init__(self) -> None:
+        self._before: np.ndarray | None = None
+        self._points: np.ndarray = np.zeros((0, 1, 2), np.float32)
+        self._start = self._points
+        self._found = 0
+        self._until_anchor = self._total = 0.0
+
+    def advance(self, grey: np.ndarray) -> float:
+        """Return the motion until the next frame."""
+        if self._before is None:
+            self._anchor(grey)
+        elif not len(self._points):  # nothing to follow: unknown motion, which is assumed as large as a step
+            self._until_anchor = self._total = self._total + STEP
+            self._anchor(grey)
+        else:
+            self._follow(grey)
+        self._before = grey
+        return self._total
+
+    def _anchor(self, grey: np.ndarray) -> None:
+        found = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, APART)
+        self._points = np.zeros((0, 1, 2), np.float32) if found is None else np.asarray(found)
+        self._start = self._points
+        self._found = len(self._points)
+
+    def _follow(self, grey: np.ndarray) -> None:
+        assert self._before is not None
+        moved, kept, _ = cv2.calcOpticalFlowPyrLK(
+            self._before, grey, self._points, np.empty_like(self._points)
+        )
+        ok = kept.reshape(-1) == 1
+        self._points, self._start = moved[ok], self._start[ok]
+        diagonal = float(np.hypot(*grey.shape))
+        if not len(self._points):
+            return
+        away = float(np.median(np.linalg.norm(self._points - self._start, axis=-1))) / diagonal
+        self._total = max(self._total, self._until_anchor + away)
+        if away > ANCHOR or len(self._points) < LEAST_TRACKED * self._found:
+            self._until_anchor = self._total
+            self._anchor(grey)
+
+
+def _small(grey: np.ndarray) -> np.ndarray:
+    factor = WIDTH / max(grey.shape)
+    if factor >= 1:
+        return grey
+    size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
+    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
