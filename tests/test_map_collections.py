@@ -26,6 +26,12 @@ from commands import Run
 SEEDS = (0, 4, 5)
 
 
+def photo(seed: int) -> bn.View:
+    """Return an unseen image of a ground, without depth."""
+    image = view(POSES[1], "unseen", seed)
+    return replace(image, frame=replace(image.frame, depth=None))
+
+
 @pytest.fixture(scope="module")
 def grounds() -> list[Map]:
     """Four grounds of other textures, of six images each."""
@@ -44,8 +50,8 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
     maps = bn.MapCollection(grounds, asked=2)
     assert maps.names == tuple(f"ground{seed}" for seed in SEEDS)
     for seed in SEEDS[1:]:
-        photo = view(POSES[1], "unseen", seed)
-        found = maps(photo.frame)
+        image = photo(seed)
+        found = maps(image.frame)
         assert found.map == f"ground{seed}"
         assert found.converged
         assert found.rival is None
@@ -53,14 +59,14 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
         assert len(found.asked) == 2
         assert found.runner_up is not None
         assert found.runner_up[0] == found.ranking[1].map
-        alone = bn.Localizer(grounds[SEEDS.index(seed)])(photo.frame)
+        alone = bn.Localizer(grounds[SEEDS.index(seed)])(image.frame)
         assert torch.equal(found.found.T_world_camera.matrix(), alone.T_world_camera.matrix())
 
 
 def test_two_maps_of_one_place_are_rivals(grounds: list[Map]) -> None:
     copy = grounds[0].scaled(2.0)
     maps = bn.MapCollection([*grounds[:2], replace(copy, info=replace(copy.info, data="copy"))])
-    found = maps(view(POSES[1]).frame)
+    found = maps(photo(0).frame)
     assert {found.map, found.rival} == {"ground0", "copy"}
 
 
@@ -111,19 +117,19 @@ def test_the_command(
     for name in known:
         (tmp_path / "maps" / name).mkdir(parents=True)
         (tmp_path / "maps" / name / "map.json").write_text("{}")
-    photo = tmp_path / "photo.png"
-    iio.imwrite(photo, (255 * view(POSES[1], "", SEEDS[1]).frame.rgb).round().to(torch.uint8).numpy())
-    status, out, err = bidnerf("localize", tmp_path / "maps", photo, "--focal", 130, "--json")
+    file = tmp_path / "photo.png"
+    iio.imwrite(file, (255 * view(POSES[1], "", SEEDS[1]).frame.rgb).round().to(torch.uint8).numpy())
+    status, out, err = bidnerf("localize", tmp_path / "maps", file, "--focal", 130, "--json")
     assert status == 0, err
     answer = json.loads(out)
     assert (answer["map"], answer["converged"]) == ("m4", True)
     assert answer["runner_up"]["converged"] is False
     assert len(loaded) == 2
     two = (tmp_path / "maps" / "m0", tmp_path / "maps" / "m4")
-    status, out, err = bidnerf("localize", *two, photo, "--focal", 130, "--out", tmp_path / "poses.json")
+    status, out, err = bidnerf("localize", *two, file, "--focal", 130, "--out", tmp_path / "poses.json")
     assert status == 0, err
     assert out.startswith("photo: in m4: converged")
     assert "runner-up m0: too few matches" in out
     assert json.loads((tmp_path / "poses.json").read_text())[0]["map"] == "m4"
     for words in (("--out", tmp_path / "poses.txt"), ("--perturb", 1, 1)):
-        assert bidnerf("localize", *two, photo, *words)[0] == 2
+        assert bidnerf("localize", *two, file, *words)[0] == 2

@@ -232,5 +232,5 @@ def test_answers_in_a_format_of_poses_hold_the_accepted_ones(
         answers.append(Answer.of(frame, len(answers), found))
     with caplog.at_level(logging.INFO, "bidnerf"):
         answers.save(tmp_path / "poses.tum")
-    assert len((tmp_path / "poses.tum").read_text().splitlines()) == 2  # a heading and a pose
+    assert len((tmp_path / "poses.tum").read_text().splitlines()) == 3  # a heading, a name and a pose
     assert "1 without an accepted pose are left out" in caplog.text
