@@ -20,7 +20,6 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 from jaxtyping import Float
-from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
 from bidnerf_core.camera.colmap_models import MODELS
@@ -113,11 +112,9 @@ def _local(found: Localization) -> dict[str, Any]:
 
 def _quaternion(R_frame_camera: Float[Tensor, "3 3"]) -> dict[str, float]:
     """Return the unit quaternion that rotates from the body's axes (x forward, y left, z up) to the frame, with w >= 0."""
-    q = torch.nn.functional.normalize(
-        rotation_matrix_to_quaternion(R_frame_camera.double() @ R_CAMERA_BODY), dim=-1
-    )
-    w, x, y, z = (q if float(q[0]) >= 0 else -q).tolist()
-    return {"x": x, "y": y, "z": z, "w": w}
+    R_frame_body = R_frame_camera.double() @ R_CAMERA_BODY
+    numbers = SE3(R_frame_body, R_frame_body.new_zeros(3)).quaternion("xyzw").tolist()
+    return dict(zip("xyzw", numbers, strict=True))
 
 
 def _reading(request: Record) -> _Reading:
@@ -208,11 +205,11 @@ def _prior(anchor: Anchor | None, request: Record) -> dict[str, bytes]:
     pose = _object(Record("priorPoses", priors[-1]), "geopose")
     position, quaternion = _object(pose, "position"), _object(pose, "quaternion")
     lat, lon, h = (_required(position, key) for key in ("lat", "lon", "h"))
-    q = torch.tensor([_required(quaternion, key) for key in "wxyz"], dtype=torch.float64)
+    q = torch.tensor([_required(quaternion, key) for key in "xyzw"], dtype=torch.float64)
     length = float(torch.linalg.vector_norm(q))
     if not 0.9 < length < 1.1:
         raise quaternion.error(f"has the length {length:.3g}, expected 1")
-    rotation = quaternion_to_rotation_matrix(q / length) @ R_CAMERA_BODY.mT
+    rotation = SE3.from_quaternion(q, q.new_zeros(3), "xyzw").rotation @ R_CAMERA_BODY.mT
     T_world_camera = anchor.T_world_camera(GeographicPose(Geodetic(lat, lon, h), rotation))
     return {"start": _matrix(T_world_camera)}
 

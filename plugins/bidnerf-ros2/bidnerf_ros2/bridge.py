@@ -10,8 +10,9 @@ from typing import Any
 import torch
 
 from bidnerf_core import SE3, Corrector, Frame, Localization, Localizer, Tracker
+from bidnerf_core.geometry.pose_covariance import covariance_in
 from bidnerf_core.results.errors import standard_deviations
-from bidnerf_ros2.conversions import covariance_elsewhere, fill, fixed_axes_covariance, seconds
+from bidnerf_ros2.conversions import covariance_elsewhere, fill, seconds
 from bidnerf_ros2.messages import frame_of, intrinsics
 
 OK, WARN, ERROR, STALE = range(4)
@@ -100,7 +101,7 @@ def fill_pose(message: Any, found: Localization, T_camera_base: SE3 | None = Non
     if T_camera_base is not None:
         pose, covariance = pose @ T_camera_base, covariance_elsewhere(covariance, T_camera_base)
     fill(message.pose, pose)
-    message.covariance = fixed_axes_covariance(pose, covariance).flatten().tolist()
+    message.covariance = covariance_in(covariance, pose, "ros").flatten().tolist()
 
 
 def diagnosis(found: Localization) -> tuple[int, str, dict[str, str]]:

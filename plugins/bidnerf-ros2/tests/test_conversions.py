@@ -10,14 +10,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core import SE3
+from bidnerf_core.geometry.pose_covariance import covariance_in
 from bidnerf_ros2.conversions import (
     R_BODY_OPTICAL,
     body_pose,
     covariance_elsewhere,
     fill,
-    fixed_axes_covariance,
-    quaternion,
-    rotation,
     seconds,
     transform_of,
 )
@@ -40,13 +38,13 @@ def poses(seed: int = 0) -> SE3:
 
 def test_quaternions_are_those_of_scipy_in_the_order_of_ros() -> None:
     for matrix in rotations():
-        found = np.array(quaternion(torch.from_numpy(matrix)))
-        assert found[3] >= 0
-        assert np.linalg.norm(found) == pytest.approx(1, abs=1e-12)
-        assert Rotation.from_quat(found).as_matrix() == pytest.approx(matrix, abs=1e-9)
-        assert rotation(*(3 * found)).numpy() == pytest.approx(matrix, abs=1e-9)
-    with pytest.raises(ValueError, match="expected a finite one"):
-        rotation(0, 0, 0, 0)
+        message = SimpleNamespace(translation=SimpleNamespace(), rotation=SimpleNamespace())
+        fill(message, SE3(torch.from_numpy(matrix), torch.zeros(3, dtype=torch.float64)))
+        found = message.rotation
+        assert Rotation.from_quat([found.x, found.y, found.z, found.w]).as_matrix() == pytest.approx(
+            matrix, abs=1e-9
+        )
+        assert transform_of(message).rotation.numpy() == pytest.approx(matrix, abs=1e-9)
 
 
 def test_optical_axes_are_those_of_rep_103() -> None:
@@ -77,7 +75,7 @@ def test_covariance_about_fixed_axes_is_that_of_sampled_poses() -> None:
     moved = pose.retract(drawn)
     places = moved.translation - pose.translation
     turned = SE3(moved.rotation @ pose.rotation.mT, torch.zeros_like(places)).log()[:, 3:]  # about fixed axes
-    assert close(torch.cov(torch.cat([places, turned], dim=1).mT), fixed_axes_covariance(pose, covariance))
+    assert close(torch.cov(torch.cat([places, turned], dim=1).mT), covariance_in(covariance, pose, "ros"))
 
 
 def test_covariance_at_a_base_is_that_of_sampled_poses() -> None:
