@@ -167,10 +167,6 @@ BAD_DATA: dict[str, tuple[Edit, tuple[str, ...]]] = {
         lambda folder: (folder.rename(f"{folder}.away"), folder.touch())[1],
         ("is a file", "expected"),
     ),
-    "no transforms.json": (
-        lambda folder: (folder / "transforms.json").unlink(),
-        ("no dataset found", "expected transforms.json"),
-    ),
     "broken JSON": (
         lambda folder: (folder / "transforms.json").write_text('{"frames": [') and None,
         (
