@@ -45,7 +45,9 @@ Largest: TypeAlias = Annotated[
     int | None,
     option("PX", "longer side to which larger images are reduced", "1600, or less where memory is short"),
 ]
-DataFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, option("DATA", "folder of a dataset")]
+DataFolder: TypeAlias = Annotated[
+    Path, tyro.conf.Positional, option("DATA", "folder of a dataset, or a .r3d file")
+]
 Flag: TypeAlias = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
 """``--frame a b --frame c`` names three frames."""
