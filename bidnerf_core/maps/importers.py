@@ -37,6 +37,7 @@ class ImportedField:
     )
     cameras: tuple[StoredCamera, ...] = ()  # those of its training images, where files beside it tell
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # direction that is upwards by the format's convention
+    is_solid: bool = False  # whether matter encloses no free space, so that the scene is seen from around it
 
 
 @runtime_checkable

@@ -129,9 +129,10 @@ def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], 
     if found.cameras:
         log.info(f"{where}: {amount(len(found.cameras), 'camera')} of its training images beside it")
         return found.cameras
-    chosen = viewpoints(field, found.bounds, found.up)
+    chosen = viewpoints(field, found.bounds, found.up, found.is_solid)
     log.info(
-        f"{where}: no photos; looked at from {amount(len(chosen), 'viewpoint')} that were found in free space"
+        f"{where}: no photos; looked at from {amount(len(chosen), 'viewpoint')}"
+        + (" around it" if found.is_solid else " that were found in free space")
     )
     return chosen
 

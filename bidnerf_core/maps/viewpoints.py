@@ -46,17 +46,20 @@ class _Tried:
 
 
 def viewpoints(
-    field: RadianceField, bounds: SceneBounds, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-) -> tuple[StoredCamera, ...]:
+    field: RadianceField, bounds: SceneBounds, up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    is_solid: bool = False,
+) -> tuple[StoredCamera, ...]:  # fmt: skip
     """Return cameras that see the matter of a field: from all around an object, or from free places within a room.
 
-    ``up`` is the direction that is upwards in the images. Deterministic.
+    ``up`` is the direction that is upwards in the images. What lies within an ``is_solid`` object is not free, although nothing
+    is met there. Deterministic.
     """
     generator = torch.Generator().manual_seed(0)
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
     tried = _try(field, bounds, lower + size * torch.rand((PLACES, 3), generator=generator))
     free = (tried.nearest > CLEARANCE * bounds.side) & (tried.share > ENCLOSED)
-    poses = _within(tried, free, up) if float(free.float().mean()) > ROOMY else _around(bounds, up)
+    is_room = not is_solid and float(free.float().mean()) > ROOMY
+    poses = _within(tried, free, up) if is_room else _around(bounds, up)
     focal = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     camera = Intrinsics(focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
     return tuple(

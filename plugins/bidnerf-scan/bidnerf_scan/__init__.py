@@ -1,0 +1,19 @@
+"""Meshes and point clouds as maps."""
+
+from bidnerf_core.backend import RecipeBackend
+from bidnerf_scan.field import ScanField
+from bidnerf_scan.formats import read_scan
+from bidnerf_scan.importer import ScanImporter, importer
+from bidnerf_scan.recipe import ScanConfig, train
+from bidnerf_scan.scan import Scan
+
+__all__ = ["Scan", "ScanConfig", "ScanField", "ScanImporter", "backend", "importer", "read_scan"]
+
+backend = RecipeBackend(
+    "meshes and point clouds that were scanned, or discs on measured depth",
+    ScanConfig,
+    ScanField,
+    train,
+    ScanConfig(pieces=6000, steps=300),
+)
+"""Meshes and point clouds that were scanned, or discs on measured depth."""

@@ -1,0 +1,98 @@
+"""Meshes that trimesh reads, in any of its formats."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bidnerf_core.errors import InputError
+from bidnerf_scan.scan import Scan, joined
+
+MOST_TEXELS = 2 * 10**9
+
+
+def read(path: Path, expected: str) -> Scan:
+    """Return all meshes of a file as one or, where it has none, its points.
+
+    The file's counts must have been checked. Raises ``InputError`` for what trimesh cannot read.
+    """
+    import trimesh
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            scene = trimesh.load_scene(str(path), process=False)
+            parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
+    except (Exception, RecursionError) as error:  # trimesh raises whatever its parsing steps do
+        said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise InputError(
+            f"{path}: not readable ({said[:200]}), expected {expected}; is it truncated?"
+        ) from error
+    meshes = [part for part in parts if part.faces is not None and len(part.faces)]
+    chosen = meshes or [part for part in parts if len(part.points)]
+    if not chosen:
+        raise InputError(f"{path}: holds neither faces nor points, expected {expected}")
+    if sum(image.shape[0] * image.shape[1] for part in chosen for image in part.images) > MOST_TEXELS:
+        raise InputError(f"{path}: textures of more than {MOST_TEXELS:,} pixels, expected fewer")
+    return joined(chosen)
+
+
+def _placed(scene: Any, node: str) -> Scan:
+    """Return the geometry of a node, in the coordinates of the file."""
+    transform, name = scene.graph[node]
+    geometry = scene.geometry[name]
+    vertices = getattr(geometry, "vertices", np.zeros((0, 3)))
+    points = np.asarray(vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
+    faces = getattr(geometry, "faces", None)
+    if faces is None or not len(faces):
+        return Scan(points, _vertex_colours(geometry, len(points)))
+    faces = np.asarray(faces, np.int64)
+    if geometry.visual.kind == "texture":
+        return _textured(geometry.visual, points, faces)
+    if geometry.visual.kind == "face":
+        rgb = np.asarray(geometry.visual.face_colors, np.float32)[:, :3] / 255
+        corners = np.arange(faces.size).reshape(faces.shape)
+        return Scan(points[faces].reshape(-1, 3), rgb.repeat(3, axis=0), corners)
+    return Scan(points, _vertex_colours(geometry, len(points)), faces)
+
+
+def _vertex_colours(geometry: Any, count: int) -> NDArray[np.float32] | None:
+    visual = getattr(geometry, "visual", None)
+    if visual is None or visual.kind != "vertex":
+        return None
+    colours = np.asarray(visual.vertex_colors)
+    return colours[:, :3].astype(np.float32) / 255 if len(colours) == count else None
+
+
+def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> Scan:
+    """Return a mesh with a material: a texture, a colour, or both."""
+    image, colour = _material(visual.material)
+    rgb = None if colour is None else np.broadcast_to(colour, (len(points), 3)).astype(np.float32)
+    attributes = getattr(visual, "vertex_attributes", None)
+    found = attributes.get("color") if attributes is not None else None
+    if found is not None and len(found) == len(points):
+        own = np.asarray(found)[:, :3].astype(np.float32)
+        own = own / 255 if np.asarray(found).dtype.kind in "ui" else own
+        rgb = own if rgb is None else rgb * own
+    if image is None or visual.uv is None or len(visual.uv) != len(points):
+        return Scan(points, rgb, faces)
+    uv = np.asarray(visual.uv, np.float32)[faces][..., :2]
+    return Scan(points, rgb, faces, uv, np.zeros(len(faces), np.int64), (image,))
+
+
+def _material(material: Any) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32] | None]:
+    """Return the texture (h, w, 3) of a material and its colour (3,), where it has them."""
+    texture = getattr(material, "baseColorTexture", None)
+    texture = getattr(material, "image", None) if texture is None else texture
+    image = None if texture is None else np.asarray(texture.convert("RGB"), np.uint8)
+    factor = getattr(material, "baseColorFactor", None)
+    if factor is None and image is None:
+        factor = getattr(material, "diffuse", None)
+    if factor is None:
+        return image, None
+    colour = np.asarray(factor, np.float64)[:3]
+    return image, (colour / 255 if np.asarray(factor).dtype.kind in "ui" else colour).astype(np.float32)

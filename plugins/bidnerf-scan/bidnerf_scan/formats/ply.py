@@ -1,0 +1,76 @@
+"""PLY: point clouds by the core's reader, meshes by trimesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.ply import PlyHeader, read_ply, read_ply_header
+from bidnerf_scan.formats import by_trimesh
+from bidnerf_scan.scan import Scan
+
+EXPECTED = "a PLY file of a mesh or of points"
+SPLATS = ({"opacity", "scale_0"}, {"packed_position"})
+"""Properties of the points of Gaussian splats, which are no scan."""
+COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+
+
+def recognises(path: Path) -> bool:
+    """Return whether the file is a PLY of something else than Gaussian splats."""
+    if path.suffix.lower() != ".ply":
+        return False
+    try:
+        header = read_ply_header(path)
+    except InputError:  # said when it is read
+        with path.open("rb") as file:
+            return file.read(3) == b"ply"
+    vertex = header.element("vertex")
+    return vertex is None or not any(splat <= set(vertex.names) for splat in SPLATS)
+
+
+def read(path: Path) -> Scan:
+    """Return the mesh or the points of a PLY file."""
+    header = read_ply_header(path, EXPECTED)
+    vertex, face = header.element("vertex"), header.element("face")
+    if vertex is None or not {"x", "y", "z"} <= set(vertex.names):
+        raise InputError(f"{path}: no vertices with x, y and z, expected {EXPECTED}")
+    if vertex.count == 0:
+        raise InputError(f"{path}: holds no vertices, expected {EXPECTED}")
+    if face is not None and face.count:
+        _check_size(path, header)
+        return by_trimesh.read(path, EXPECTED)
+    rows = read_ply(path, EXPECTED).get("vertex")
+    if rows is None:
+        raise InputError(f"{path}: its vertices hold lists of numbers, expected {EXPECTED}")
+    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    return Scan(points, _colours(rows))
+
+
+def _colours(rows: NDArray) -> NDArray[np.float32] | None:
+    names = rows.dtype.names or ()
+    found = next((three for three in COLOURS if set(three) <= set(names)), None)
+    if found is None:
+        return None
+    rgb = np.stack([rows[name].astype(np.float32) for name in found], axis=-1)
+    kind = rows.dtype[found[0]]
+    if kind.kind in "ui":
+        return rgb / np.float32(np.iinfo(kind).max)
+    return rgb / 255 if len(rgb) and np.nanmax(rgb) > 1.5 else rgb
+
+
+def _check_size(path: Path, header: PlyHeader) -> None:
+    """Raise ``InputError`` where the elements that are declared need more bytes than the file has."""
+    left = path.stat().st_size - header.length
+    for element in header.elements:
+        width = sum(np.dtype(kind).itemsize for _, kind in element.properties)
+        least = 2 * len(element.properties) if header.order == "=" else width
+        least += 1 if element.has_lists else 0
+        if element.count * least > left + 1:
+            raise InputError(
+                f"{path}: declares {element.count:,} elements {element.name!r}, for which its {left:,} bytes of data are too"
+                " few; is the file truncated?"
+            )
+        left -= element.count * least

@@ -1,0 +1,91 @@
+"""Surveyors' formats: LAS and LAZ by laspy, E57 by pye57, which are extras."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bidnerf_core.errors import InputError
+from bidnerf_scan.scan import Scan, joined
+
+
+def recognises_las(path: Path) -> bool:
+    """Return whether the file's name is that of LAS, compressed or not."""
+    return path.suffix.lower() in (".las", ".laz")
+
+
+def recognises_e57(path: Path) -> bool:
+    """Return whether the file's name is that of E57."""
+    return path.suffix.lower() == ".e57"
+
+
+def _library(name: str, path: Path, extra: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"{path}: reading it takes {name}, which is not installed (pip install 'bidnerf-scan[{extra}]')"
+        ) from error
+
+
+def read_las(path: Path) -> Scan:
+    """Return the points of a LAS or LAZ file."""
+    laspy = _library("laspy", path, "las")
+    try:
+        with laspy.open(str(path)) as file:
+            header = file.header
+            count, size = int(header.point_count), path.stat().st_size
+            least = 1 if path.suffix.lower() == ".laz" else 8 * header.point_format.size
+            if count * least > 8 * size:
+                raise InputError(
+                    f"{path}: declares {count:,} points, for which its {size:,} bytes are too few; is the file truncated?"
+                )
+            rows = file.read()
+        points = np.stack([np.asarray(axis, np.float64) for axis in (rows.x, rows.y, rows.z)], axis=-1)
+        if not {"red", "green", "blue"} <= set(rows.point_format.dimension_names):
+            return Scan(points)
+        rgb = np.stack([np.asarray(c) for c in (rows.red, rows.green, rows.blue)], -1).astype(np.float32)
+    except InputError:
+        raise
+    except Exception as error:  # laspy and its decompressors raise errors of many types
+        raise InputError(
+            f"{path}: not readable ({type(error).__name__}: {error}), expected LAS; is it truncated?"
+        ) from error
+    if not rgb.size or rgb.max() == 0:
+        return Scan(points)  # fields for colours that nobody filled in
+    # The standard scales to 16 bits; many programs write 8.
+    return Scan(points, rgb / (65535 if rgb.max() > 255 else 255))
+
+
+def read_e57(path: Path) -> Scan:
+    """Return the points of all scans of an E57 file, each moved by its pose."""
+    pye57 = _library("pye57", path, "e57")
+    parts = []
+    try:
+        file = pye57.E57(str(path))
+        for number in range(file.scan_count):
+            count = int(file.get_header(number).point_count)
+            if count > path.stat().st_size:
+                raise InputError(
+                    f"{path}: declares {count:,} points, for which its {path.stat().st_size:,} bytes are too few; is the file"
+                    " truncated?"
+                )
+            rows = file.read_scan(number, colors=True, intensity=False, ignore_missing_fields=True)
+            points = np.stack([rows[f"cartesian{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
+            rgb = None
+            if "colorRed" in rows:
+                rgb = np.stack([rows[f"color{c}"] for c in ("Red", "Green", "Blue")], -1).astype(np.float32)
+                rgb /= 255 if rgb.size and rgb.max() > 1 else 1
+            parts.append(Scan(points, rgb))
+    except InputError:
+        raise
+    except Exception as error:  # pye57 passes on errors of a library in C++
+        raise InputError(
+            f"{path}: not readable ({type(error).__name__}: {error}), expected E57; is it truncated?"
+        ) from error
+    if not parts:
+        raise InputError(f"{path}: holds no scan, expected E57 with points")
+    return joined(parts)

@@ -1,0 +1,212 @@
+"""The importer of meshes and point clouds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import Rays, SceneBounds
+from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.maps.importers import UNMOVED, ImportedField, bounds_about
+from bidnerf_core.settings import Range, Settings
+from bidnerf_scan.field import ScanField, config_of
+from bidnerf_scan.formats import Format, format_of
+from bidnerf_scan.pieces import Pieces, cloud_pieces, mesh_pieces, spacing, thinned
+from bidnerf_scan.recipe import ScanConfig
+from bidnerf_scan.scan import Scan, cleaned
+
+UPS = {
+    "+x": (1, 0, 0),
+    "-x": (-1, 0, 0),
+    "+y": (0, 1, 0),
+    "-y": (0, -1, 0),
+    "+z": (0, 0, 1),
+    "-z": (0, 0, -1),
+}
+Up = Literal["format", "+x", "-x", "+y", "-y", "+z", "-z"]
+FINEST = 2.0**-22
+"""Relative rounding of a coordinate in single precision, with some reserve."""
+COARSEST = 2e-4
+"""Rounding of coordinates, in units of the scene's longest side, beyond which a scan must be moved to the origin."""
+SURFACE_POINTS = 200_000
+"""Points on a mesh, evenly over its area, from which its extent is told."""
+TRIED = 4000
+"""Rays by which a solid object is told from a room."""
+FEWEST_BETWEEN = 0.02
+"""Share of the places in the box that must have matter on two opposite sides."""
+MOSTLY = 0.9
+HARDLY_CLIPPED = 1.5
+"""Ratio of the sides of the boxes about all and about nearly all points, up to which the box holds all."""
+
+
+@dataclass(frozen=True)
+class ScanSettings(Settings):
+    """What a file does not say."""
+
+    # axis of the file's coordinates that is upwards; by default that of the format's convention
+    up: Up = "format"
+    # place in the file's coordinates that becomes the origin, before scaling: surveys have coordinates of millions of metres
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # largest number of discs: clouds of more points are thinned by a grid
+    points: Annotated[int, Range(3, 10**8)] = 1_000_000
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour (rgb) where a ray meets nothing
+
+
+@dataclass(frozen=True)
+class ScanImporter:
+    """Reads meshes and point clouds of all formats."""
+
+    summary: str = "meshes and point clouds: .ply, .obj, .glb, .gltf, .pcd, .las, .laz, .e57"
+    config_type: type = ScanSettings
+
+    def recognises(self, path: Path) -> bool:
+        """Return whether the file is one of the formats."""
+        try:
+            return format_of(path) is not None
+        except OSError:
+            return False
+
+    def read(self, path: Path, config: ScanSettings, placement: Similarity) -> ImportedField:
+        """Return the field of the mesh or the cloud in a file, see ``Importer``."""
+        found = format_of(path)
+        if found is None:
+            raise InputError(f"{path}: no mesh or point cloud that can be read, expected {self.summary}")
+        return imported(found.read(path), str(path), config, placement, found)
+
+
+def imported(
+    scan: Scan, where: str, config: ScanSettings = ScanSettings(), placement: Similarity = UNMOVED,
+    of: Format | None = None,
+) -> ImportedField:  # fmt: skip
+    """Return a scan of any source as a field. Raises ``InputError`` where nothing of it can be rendered."""
+    kept, dropped = cleaned(scan, where)
+    points = placement.apply(torch.from_numpy(kept.points - np.array(config.origin)).double())
+    used = points if kept.faces is None else points[torch.from_numpy(kept.faces).unique()]
+    _check_precision(used, where, config)
+    facts = [_counts(scan) + (f" ({of.name})" if of else "")]
+    if str(dropped):
+        facts.append(f"left out {dropped}")
+    if not scan.has_colours:
+        facts.append(
+            "no colours: it gives no landmarks, and poses are found by its shape alone, which takes images with depth"
+            " (--photos gives landmarks)"
+        )
+    if kept.faces is None:
+        rgb = None if kept.rgb is None else torch.from_numpy(kept.rgb)
+        few, rgb = thinned(points, rgb, config.points)
+        if len(few) < len(points):
+            facts.append(f"thinned from {len(points):,} to {len(few):,} points (--points)")
+        pieces = cloud_pieces(few, rgb)
+        matter = few.float()
+        facts.append(f"points about {spacing(pieces):.3g} apart")
+    else:
+        pieces = mesh_pieces(kept, points)
+        matter = surface_points(pieces)
+    bounds = _bounds(matter, config.background, spacing(pieces))
+    settings = ScanConfig(steps=1, thickness=spacing(pieces), **config_of(pieces))
+    field = ScanField(settings, bounds)
+    field.assign(pieces)
+    solid = kept.faces is not None and is_solid(field)
+    if solid:
+        facts.append("its faces look outwards all around: a solid object, seen from outside")
+    axis = ("+z" if of is None else of.up) if config.up == "format" else config.up
+    facts.append(
+        f"axes: {axis[1]} {'up' if axis[0] == '+' else 'down'}"
+        + (", as said" if config.up != "format" else f", {of.convention}" if of else "")
+        + (f"; {config.origin} is the origin" if any(config.origin) else "")
+    )
+    up = placement.T_target_source.rotation.double() @ torch.tensor(UPS[axis], dtype=torch.float64)
+    return ImportedField(
+        "scan", settings, dict(field.state_dict()), bounds, tuple(facts), settings.steps, matter, (),
+        (float(up[0]), float(up[1]), float(up[2])), solid,
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def is_solid(field: ScanField) -> bool:
+    """Return whether rays from within a mesh meet the backs of its faces, as in a model of an object and not in one of a room.
+
+    Where faces look to either side at random, or where few rays from within the box meet any, it counts as not solid.
+    """
+    bounds, generator = field.bounds, torch.Generator().manual_seed(0)
+    lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
+    origins = lower + size * torch.rand((TRIED, 3), generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn((TRIED, 3), generator=generator), dim=-1)
+    near = torch.zeros(TRIED)
+    piece, valid = field.met(Rays(origins, directions, near, near + bounds.far))
+    opposite, other = field.met(Rays(origins, -directions, near, near + bounds.far))
+    if not piece.shape[1] or not opposite.shape[1]:
+        return False
+    backs = []
+    for index, way in ((piece[:, 0], directions), (opposite[:, 0], -directions)):
+        normal = torch.linalg.cross(field.first[index], field.second[index])
+        backs.append((normal * way).sum(-1) > 0)
+    between = valid[:, 0] & other[:, 0]  # something is met either way
+    if float(between.float().mean()) < FEWEST_BETWEEN:
+        return False
+    both = (backs[0] & backs[1])[between].float().mean()
+    neither = (~backs[0] & ~backs[1])[between].float().mean()
+    return float(both) > MOSTLY * float(both + neither) and float(both) > 0.5
+
+
+def _counts(scan: Scan) -> str:
+    if scan.faces is None:
+        found = f"a cloud of {len(scan.points):,} points"
+    else:
+        found = f"a mesh of {len(scan.faces):,} triangles"
+        if scan.images:
+            found += f" with {len(scan.images)} texture{'s' if len(scan.images) > 1 else ''}"
+    return found + (", with colours" if scan.rgb is not None else "")
+
+
+def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSettings) -> None:
+    """Raise ``InputError`` for coordinates so large that single precision does not resolve the scene."""
+    middle = points.median(0).values
+    side = (
+        float((points.quantile(0.9, dim=0) - points.quantile(0.1, dim=0)).max()) if len(points) < 2**24 else 0
+    )
+    side = side or float((points.amax(0) - points.amin(0)).max())
+    rounding = FINEST * float(middle.abs().max())
+    if rounding > COARSEST * side:
+        x, y, z = (round(o + float(m)) for o, m in zip(config.origin, middle, strict=True))
+        raise InputError(
+            f"{where}: its coordinates are about ({x}, {y}, {z}), which single precision resolves to {rounding:.2g} only;"
+            f" expected a scan near the origin (--origin {x} {y} {z} makes that place the origin)"
+        )
+
+
+def surface_points(pieces: Pieces) -> Float[Tensor, "n 3"]:
+    """Return points on triangles, evenly over their area, and always the same."""
+    area = torch.linalg.vector_norm(torch.linalg.cross(pieces.first, pieces.second), dim=-1).double()
+    ends = area.cumsum(0) / area.sum().clamp(min=1e-300)
+    generator = torch.Generator().manual_seed(0)
+    places = (torch.arange(SURFACE_POINTS, dtype=torch.float64) + 0.5) / SURFACE_POINTS
+    piece = torch.searchsorted(ends, places).clamp(max=len(area) - 1)
+    u, v = torch.rand((2, SURFACE_POINTS, 1), generator=generator)
+    u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
+    return pieces.corner[piece] + u * pieces.first[piece] + v * pieces.second[piece]
+
+
+def _bounds(
+    points: Float[Tensor, "n 3"], background: tuple[float, float, float], footprint: float
+) -> SceneBounds:
+    """Return bounds that hold all points, unless a few of them are far away."""
+    found = bounds_about(points, background, footprint)
+    lower, upper = points.amin(0).double(), points.amax(0).double()
+    if found.contracted or float((upper - lower).max()) > HARDLY_CLIPPED * found.side:
+        return found
+    pad = 0.01 * float((upper - lower).max())
+    low = tuple(min(a, float(b) - pad) for a, b in zip(found.lower, lower, strict=True))
+    high = tuple(max(a, float(b) + pad) for a, b in zip(found.upper, upper, strict=True))
+    return replace(found, lower=low, upper=high)
+
+
+importer = ScanImporter()
+"""Meshes and point clouds: .ply, .obj, .glb, .gltf, .pcd, .las, .laz, .e57"""

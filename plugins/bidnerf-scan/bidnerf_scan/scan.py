@@ -1,0 +1,120 @@
+"""What a scan consists of: points or vertices, and the faces between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bidnerf_core.errors import InputError
+
+FARTHEST = 1e12
+"""Coordinates beyond which a point counts as broken."""
+
+
+FEWEST = 3
+"""Points that have a plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A point cloud (without faces) or a mesh, in the coordinates of its file."""
+
+    points: NDArray[np.float64]  # (n, 3): points of a cloud, vertices of a mesh
+    rgb: NDArray[np.float32] | None = None  # (n, 3), in [0, 1]; None where the file holds no colours
+    faces: NDArray[np.int64] | None = None  # (m, 3): triangles; None for a cloud
+    uv: NDArray[np.float32] | None = None  # (m, 3, 2): place of each corner in its texture, v upwards
+    image: NDArray[np.int64] | None = None  # (m,): number of each triangle's texture; -1 where it has none
+    images: tuple[NDArray[np.uint8], ...] = ()  # textures, (h, w, 3)
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether it is known how anything looks."""
+        return self.rgb is not None or bool(self.images)
+
+
+@dataclass
+class Dropped:
+    """How much of a scan was left out, and why."""
+
+    not_finite: int = 0  # points whose coordinates are NaN or infinite
+    broken_faces: int = 0  # faces with corners that are left out or do not exist
+    flat_faces: int = 0  # faces without an area
+    repeated: int = 0  # points at the place of another
+
+    def __str__(self) -> str:
+        parts = [
+            f"{count:,} {what}"
+            for count, what in (
+                (self.not_finite, "points with coordinates that are not finite"),
+                (self.broken_faces, "faces with corners that do not exist"),
+                (self.flat_faces, "faces without an area"),
+                (self.repeated, "points at the place of another"),
+            )
+            if count
+        ]
+        return ", ".join(parts)
+
+
+def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
+    """Return the usable part of a scan, and what was left out. Raises ``InputError`` where nothing is left."""
+    dropped = Dropped()
+    if not len(scan.points):
+        raise InputError(f"{where}: holds no points, expected a mesh or a point cloud")
+    good = np.isfinite(scan.points).all(-1) & (np.abs(scan.points) < FARTHEST).all(-1)
+    dropped.not_finite = int((~good).sum())
+    rgb = None if scan.rgb is None else np.nan_to_num(scan.rgb, nan=0.5).clip(0, 1)
+    if scan.faces is None:
+        points, rgb = scan.points[good], None if rgb is None else rgb[good]
+        if not len(points):
+            raise InputError(f"{where}: none of its {len(good):,} points has finite coordinates")
+        _, first = np.unique(points, axis=0, return_index=True)
+        dropped.repeated = len(points) - len(first)
+        first.sort()
+        if len(first) < FEWEST:
+            raise InputError(f"{where}: {len(first)} points at different places, expected three at least")
+        return Scan(points[first], None if rgb is None else rgb[first]), dropped
+    exists = ((scan.faces >= 0) & (scan.faces < len(scan.points))).all(-1)
+    whole = exists.copy()
+    whole[exists] = good[scan.faces[exists]].all(-1)
+    corners = scan.points[np.where(whole[:, None], scan.faces, 0)]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    longest = np.maximum((a * a).sum(-1), (b * b).sum(-1))
+    with np.errstate(invalid="ignore"):
+        has_area = np.linalg.norm(np.cross(a, b), axis=-1) > 1e-7 * longest
+    kept = whole & has_area
+    dropped.broken_faces, dropped.flat_faces = int((~whole).sum()), int((whole & ~has_area).sum())
+    if not kept.any():
+        raise InputError(f"{where}: none of its {len(kept):,} faces has three finite corners and an area")
+    part = replace(
+        scan, points=np.where(good[:, None], scan.points, 0.0), rgb=rgb, faces=scan.faces[kept],
+        uv=None if scan.uv is None else np.nan_to_num(scan.uv[kept]),
+        image=None if scan.image is None else scan.image[kept],
+    )  # fmt: skip
+    return part, dropped
+
+
+def joined(scans: Sequence[Scan]) -> Scan:
+    """Return one mesh of several, or one cloud. Meshes without colours are grey among others."""
+    if len(scans) == 1:
+        return scans[0]
+    points = np.concatenate([scan.points for scan in scans])
+    rgb = None
+    if any(scan.rgb is not None for scan in scans):
+        grey = [np.full((len(s.points), 3), 1.0 if s.images else 0.5, np.float32) for s in scans]
+        rgb = np.concatenate([g if s.rgb is None else s.rgb for s, g in zip(scans, grey, strict=True)])
+    if scans[0].faces is None:
+        return Scan(points, rgb)
+    faces, uv, image, images, before = [], [], [], list[NDArray[np.uint8]](), 0
+    for scan in scans:
+        assert scan.faces is not None
+        count = len(scan.faces)
+        faces.append(scan.faces + before)
+        uv.append(np.zeros((count, 3, 2), np.float32) if scan.uv is None else scan.uv)
+        number = np.full(count, -1) if scan.image is None else scan.image
+        image.append(np.where(number >= 0, number + len(images), -1))
+        images += scan.images
+        before += len(scan.points)
+    return Scan(points, rgb, np.concatenate(faces), np.concatenate(uv), np.concatenate(image), tuple(images))

@@ -1,0 +1,9 @@
+"""The contract's tests of the backend."""
+
+from bidnerf_core.testing import BackendContract
+from bidnerf_scan import ScanConfig
+
+
+class TestScan(BackendContract):
+    name = "scan"
+    config = ScanConfig(pieces=600, steps=40, rays_per_step=512)
