@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -74,3 +75,17 @@ def test_walls_do_not_count_as_floors() -> None:
 def test_gravity_is_taken_as_it_is() -> None:
     assert given_up((0, 9.81, 0)).direction == (0, 1, 0)
     assert given_up((0, 9.81, 0)).source == "gravity"
+
+
+def test_datasets_that_wrap_others_keep_what_these_know() -> None:
+    """A scan's unit and gravity reach training whatever masks or splits are chosen."""
+    from bidnerf_core.datasets.dataset import Georeferenced
+    from bidnerf_core.datasets.polycam import PolycamDataset
+    from bidnerf_core.datasets.splits import Splits
+    from bidnerf_core.datasets.whole import WholeDataset
+
+    scan = PolycamDataset(Splits(Path("scan"), {"train": []}), None)
+    whole = WholeDataset(scan)
+    assert isinstance(scan, Georeferenced)
+    assert isinstance(whole, Georeferenced)
+    assert (whole.unit, whole.up) == ("metres", (0.0, 1.0, 0.0))

@@ -193,6 +193,6 @@ def _kept(points: ModelPoints, choice: SparseChoice) -> Tensor:
     return sound & (points.errors <= choice.points_error) & (points.tracks >= choice.points_views)
 
 
-def _off(there: Float[Tensor, "n 3"], here: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def _off(there: Float[Tensor, "n 3"], here: Float[Tensor, "n 3"]) -> Float[Tensor, n]:
     """Return the distances (metres) between corresponding cameras after a similarity alignment."""
     return torch.linalg.vector_norm(fit_similarity(there, here).apply(there) - here, dim=-1)

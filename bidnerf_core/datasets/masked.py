@@ -16,6 +16,7 @@ from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, ReadFram
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.masks import MaskFolder, WhollyHidden
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 
 
 class MaskedDataset:
@@ -36,6 +37,16 @@ class MaskedDataset:
     @property
     def splits(self) -> tuple[str, ...]:
         return self.unmasked.splits
+
+    @property
+    def unit(self) -> LengthUnit | None:
+        """The unit of the poses, where the format says it."""
+        return getattr(self.unmasked, "unit", None)
+
+    @property
+    def up(self) -> tuple[float, float, float] | None:
+        """The upward direction in the world, where the capture measured gravity."""
+        return getattr(self.unmasked, "up", None)
 
     @property
     def background(self) -> tuple[float, float, float]:

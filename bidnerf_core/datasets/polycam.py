@@ -31,6 +31,7 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.pose_rows import pose_of_rows
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import is_file
 from bidnerf_core.io.images import decode, read_compact_image
 from bidnerf_core.io.json import Record, read_record
@@ -87,6 +88,9 @@ class PolycamReader(Reader):
 
 class PolycamDataset(SplitDataset[PolycamFrame]):
     """Views of Polycam's raw data; see ``Dataset``."""
+
+    unit: LengthUnit | None = "metres"
+    up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
 
     def _pose(self, frame: PolycamFrame) -> SE3:
         return frame.T_world_camera

@@ -38,6 +38,7 @@ from bidnerf_core.depth.images import depth_image
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.archives import Archive
 from bidnerf_core.io.files import is_file, read_file
 from bidnerf_core.io.images import Background, ImageSource, read_compact_image
@@ -122,6 +123,9 @@ class Record3DReader(Reader):
 
 class Record3DDataset(SplitDataset[Record3DFrame]):
     """Views of a recording; see ``Dataset``."""
+
+    unit: LengthUnit | None = "metres"
+    up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
 
     def __init__(
         self, frames: Splits[Record3DFrame], files: _Files, metadata: Record, background: Background | None

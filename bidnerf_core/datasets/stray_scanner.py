@@ -32,6 +32,7 @@ from bidnerf_core.depth.images import MILLIMETRE, read_depth_image
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import is_file
 from bidnerf_core.io.images import Background, decode
 from bidnerf_core.io.rows import Row, read_lines, read_rows
@@ -83,6 +84,9 @@ class StrayScannerReader(Reader):
 
 class StrayDataset(SplitDataset[StrayFrame]):
     """Views of a recording; see ``Dataset``."""
+
+    unit: LengthUnit | None = "metres"
+    up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
 
     def __init__(self, frames: Splits[StrayFrame], video: VideoFrames, background: Background | None) -> None:
         super().__init__(frames, background)

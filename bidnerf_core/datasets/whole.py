@@ -11,6 +11,7 @@ from bidnerf_core.datasets.dataset import Dataset, ReadingProgress, positions, u
 from bidnerf_core.datasets.splits import SplitDataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.units import LengthUnit
 
 ALL = "all"
 """The name by which all splits together are asked for, unless a dataset has a split of that name."""
@@ -32,6 +33,16 @@ class WholeDataset:
     @property
     def splits(self) -> tuple[str, ...]:
         return (ALL,)
+
+    @property
+    def unit(self) -> LengthUnit | None:
+        """The unit of the poses, where the format says it."""
+        return getattr(self.parts, "unit", None)
+
+    @property
+    def up(self) -> tuple[float, float, float] | None:
+        """The upward direction in the world, where the capture measured gravity."""
+        return getattr(self.parts, "up", None)
 
     @property
     def background(self) -> tuple[float, float, float]:
