@@ -17,7 +17,13 @@ from bidnerf_core.mapping.landmarks.building import (
 from bidnerf_core.mapping.landmarks.features import Features, Keypoints, Sift, find_features
 from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap
 from bidnerf_core.mapping.landmarks.tracks import PosedKeypoints, TrackedKeypoints
-from bidnerf_core.mapping.surface.baking import BakeConfig, bake, colour_noise, rendered_views
+from bidnerf_core.mapping.surface.baking import (
+    BakeConfig,
+    bake,
+    colour_noise,
+    rendered_views,
+    surface_of_points,
+)
 from bidnerf_core.mapping.surface.casting import cast, trace
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, Surfels
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
@@ -60,6 +66,7 @@ __all__ = [
     "rendered_views",
     "resect",
     "surface_from_tensors",
+    "surface_of_points",
     "surface_tensors",
     "trace",
     "tracked_views",

@@ -37,6 +37,9 @@ class ImportedField:
     )
     cameras: tuple[StoredCamera, ...] = ()  # those of its training images, where files beside it tell
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # direction that is upwards by the format's convention
+    surface: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = (
+        None  # points (metres, world) on the matter of a scan, and their colours: its surface, which need not be rendered
+    )
     is_solid: bool = False  # whether matter encloses no free space, so that the scene is seen from around it
 
 

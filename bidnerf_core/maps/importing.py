@@ -23,9 +23,9 @@ from bidnerf_core.frames.pixels import draw, uniform
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.similarity import Similarity
 from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.mapping import BakeConfig, find_features
+from bidnerf_core.mapping import BakeConfig, find_features, surface_of_points
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
-from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.files import map_folder, save_map
 from bidnerf_core.maps.importers import ImportedField, importer_of, robust_box
 from bidnerf_core.maps.map import Map, frozen_field
@@ -109,7 +109,7 @@ def import_map(
             state = TrainingState(found.steps, found.tensors, {})
             scene = replace(scene, info=save_map(place, scene.info, state), folder=place)
         settings_of_bake = bake if isinstance(bake, BakeConfig) else USUAL_BAKE
-        return _baked(scene, views, settings_of_bake, progress, cancel) if bake else scene
+        return _baked(scene, found, views, settings_of_bake, progress, cancel) if bake else scene
 
 
 def _read(
@@ -195,6 +195,7 @@ def depth_ratio(field: RadianceField, bounds: SceneBounds, views: Sequence[View]
 
 def _baked(
     scene: Map,
+    found: ImportedField,
     views: Sequence[View],
     config: BakeConfig,
     progress: ProgressCallback | None,
@@ -206,7 +207,14 @@ def _baked(
             " --photos gives landmarks as a map that was trained here has"
         )
     try:
-        return scene.with_baked_parts(list(views), config, not views, None, progress, cancel)
+        surface = None
+        if found.surface is not None:
+            surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)
+            log.info(
+                f"{scene.info.data}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
+                f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
+            )
+        return scene.with_baked_parts(list(views), config, not views, None, progress, cancel, surface)
     except PluginError:  # nothing that other images would mend
         raise
     except InputError as error:  # the map itself is sound

@@ -218,13 +218,14 @@ class Map:
     def with_baked_parts(
         self, views: list[View], config: BakeConfig, rendered_landmarks: bool = False,
         tracked: TrackedViews | None = None, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+        surface: SurfaceMap | None = None,
     ) -> Map:  # fmt: skip
         """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the folder.
 
-        ``tracked`` holds the views' keypoints if they were tracked already.
+        ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if it is known.
         """
         check_cancelled(cancel, "baking")
-        surface = bake_surface(self.info, self.field, views, config, self._name, progress, cancel)
+        surface = surface or bake_surface(self.info, self.field, views, config, self._name, progress, cancel)
         scene = self._with_surface(surface)
         if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
             log.info(

@@ -7,8 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
@@ -38,6 +40,8 @@ KEYFRAME_SIDE = 400
 """Largest number of pixels along the longer side of a rendered keyframe."""
 MOST = 100
 """Largest number of keyframes that are rendered, from cameras at regular intervals."""
+SPACING_POINTS = 5000
+"""Points of a scan whose nearest neighbours tell how far its points are apart."""
 NOISE_RAYS = 4096
 """Rays on which the colour noise is measured."""
 
@@ -120,6 +124,29 @@ def surface_of(images: Sequence[PosedDepthImage], bounds: SceneBounds, config: B
     _, (positions, colours) = merged(grid.numbers(points), points, rgb)
     surfels = fused_surfels(positions, colours)
     keyframes = torch.stack([image.T_world_camera.matrix() for image in images])
+    return SurfaceMap(surfels, SurfelIndex.of(surfels.positions, grid), keyframes)
+
+
+def surface_of_points(
+    points: Float[Tensor, "p 3"], rgb: Float[Tensor, "p 3"], bounds: SceneBounds, cameras: Sequence[Camera],
+    config: BakeConfig = BakeConfig(),
+) -> SurfaceMap:  # fmt: skip
+    """Return the surface that points on matter (metres, world) show, such as those of a scan; ``cameras`` become its keyframes.
+
+    Its cells are as fine as the points are dense. Raises ``InputError`` where no point lies within the bounds.
+    """
+    inside = VoxelGrid.covering(bounds, VoxelGrid.filling(bounds, config.cells).cell).contains(points)
+    points, rgb = points[inside].float(), rgb[inside].float()
+    if len(points) < 2:
+        raise InputError(f"no surface to bake: {len(points)} points within the bounds of the scene")
+    places = points.numpy()
+    away, _ = cKDTree(places).query(places[:: max(1, len(points) // SPACING_POINTS)], k=2)
+    apart = float(np.median(np.asarray(away)[:, 1]))
+    finest = max(apart, VoxelGrid.filling(bounds, config.cells).cell)
+    grid = chosen_grid(points, bounds, finest, 4 * finest, config.megabytes)
+    _, (positions, colours) = merged(grid.numbers(points), points, rgb)
+    surfels = fused_surfels(positions, colours)
+    keyframes = torch.stack([T.matrix() for _, T in cameras]) if cameras else torch.zeros(0, 4, 4)
     return SurfaceMap(surfels, SurfelIndex.of(surfels.positions, grid), keyframes)
 
 

@@ -14,7 +14,7 @@ from bidnerf_core.fields.box_tree import TooMany, level_sizes, tree_of
 from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds
 from bidnerf_core.fields.met_pieces import Meeting, flattened, listed, met_pieces, pieces_about
 from bidnerf_core.settings import NotNegative, Range
-from bidnerf_scan.pieces import Pieces, Textures
+from bidnerf_scan.pieces import Pieces
 
 LARGEST_ALPHA = 0.999
 """Opacity of one piece, at most."""
@@ -226,6 +226,13 @@ class ScanField(nn.Module):
             torch.where(meets, alpha, 0),
         )  # fmt: skip
 
+    @torch.no_grad()
+    def colours_at(
+        self, piece: Int[Tensor, "p"], u: Float[Tensor, "p"], v: Float[Tensor, "p"]
+    ) -> Float[Tensor, "p 3"]:
+        """Return the colours at places on pieces, see ``Pieces``."""
+        return self._colours(piece, u, v)
+
     def _colours(
         self, index: Int[Tensor, "p"], u: Float[Tensor, "p"], v: Float[Tensor, "p"]
     ) -> Float[Tensor, "p 3"]:
@@ -281,10 +288,3 @@ class SurfaceSampler:
             ends[:, :-1] = torch.where(valid[:, 1:], torch.minimum(ends[:, :-1], between), ends[:, :-1])
         ends = torch.maximum(starts, ends)
         return RaySamples(*(part.reshape(*shape, width) for part in (starts, ends, valid)))
-
-
-def config_of(pieces: Pieces) -> dict[str, int]:
-    """Return the size of a field for these pieces."""
-    textures: Textures | None = pieces.textures
-    texels, images = (0, 0) if textures is None else (len(textures.texels), len(textures.shapes))
-    return {"pieces": len(pieces), "texels": texels, "images": images}

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
@@ -16,10 +16,10 @@ from bidnerf_core.fields.contract import Rays, SceneBounds
 from bidnerf_core.geometry.similarity import Similarity
 from bidnerf_core.maps.importers import UNMOVED, ImportedField, bounds_about
 from bidnerf_core.settings import Range, Settings
-from bidnerf_scan.field import ScanField, config_of
+from bidnerf_scan.field import ScanField
 from bidnerf_scan.formats import Format, format_of
-from bidnerf_scan.pieces import Pieces, cloud_pieces, mesh_pieces, spacing, thinned
-from bidnerf_scan.recipe import ScanConfig
+from bidnerf_scan.pieces import GREY, Pieces, cloud_pieces, mesh_pieces, spacing, thinned
+from bidnerf_scan.recipe import config_of
 from bidnerf_scan.scan import Scan, cleaned
 
 UPS = {
@@ -35,8 +35,8 @@ FINEST = 2.0**-22
 """Relative rounding of a coordinate in single precision, with some reserve."""
 COARSEST = 2e-4
 """Rounding of coordinates, in units of the scene's longest side, beyond which a scan must be moved to the origin."""
-SURFACE_POINTS = 200_000
-"""Points on a mesh, evenly over its area, from which its extent is told."""
+SURFACE_POINTS = 300_000
+"""Points on a mesh, evenly over its area, which make its surface and tell its extent."""
 TRIED = 4000
 """Rays by which a solid object is told from a room."""
 FEWEST_BETWEEN = 0.02
@@ -98,6 +98,7 @@ def imported(
             "no colours: it gives no landmarks, and poses are found by its shape alone, which takes images with depth"
             " (--photos gives landmarks)"
         )
+    colours: Tensor | None = None
     if kept.faces is None:
         rgb = None if kept.rgb is None else torch.from_numpy(kept.rgb)
         few, rgb = thinned(points, rgb, config.points)
@@ -105,12 +106,13 @@ def imported(
             facts.append(f"thinned from {len(points):,} to {len(few):,} points (--points)")
         pieces = cloud_pieces(few, rgb)
         matter = few.float()
+        colours = None if rgb is None else rgb.float()
         facts.append(f"points about {spacing(pieces):.3g} apart")
     else:
         pieces = mesh_pieces(kept, points)
         matter = surface_points(pieces)
     bounds = _bounds(matter, config.background, spacing(pieces))
-    settings = ScanConfig(steps=1, thickness=spacing(pieces), **config_of(pieces))
+    settings = replace(config_of(pieces), steps=1, thickness=spacing(pieces))
     field = ScanField(settings, bounds)
     field.assign(pieces)
     solid = kept.faces is not None and is_solid(field)
@@ -125,7 +127,8 @@ def imported(
     up = placement.T_target_source.rotation.double() @ torch.tensor(UPS[axis], dtype=torch.float64)
     return ImportedField(
         "scan", settings, dict(field.state_dict()), bounds, tuple(facts), settings.steps, matter, (),
-        (float(up[0]), float(up[1]), float(up[2])), solid,
+        (float(up[0]), float(up[1]), float(up[2])), (matter, torch.full_like(matter, GREY) if colours is None else colours),
+        solid,
     )  # fmt: skip
 
 
@@ -183,15 +186,22 @@ def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSetti
 
 
 def surface_points(pieces: Pieces) -> Float[Tensor, "n 3"]:
-    """Return points on triangles, evenly over their area, and always the same."""
+    """Return points (metres, world) on triangles, evenly over their area."""
+    piece, u, v = surface_places(pieces)
+    return pieces.corner[piece] + u[:, None] * pieces.first[piece] + v[:, None] * pieces.second[piece]
+
+
+def surface_places(
+    pieces: Pieces,
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Return places on triangles, evenly over their area and always the same: numbers of triangles, and u and v in them."""
     area = torch.linalg.vector_norm(torch.linalg.cross(pieces.first, pieces.second), dim=-1).double()
     ends = area.cumsum(0) / area.sum().clamp(min=1e-300)
     generator = torch.Generator().manual_seed(0)
     places = (torch.arange(SURFACE_POINTS, dtype=torch.float64) + 0.5) / SURFACE_POINTS
     piece = torch.searchsorted(ends, places).clamp(max=len(area) - 1)
-    u, v = torch.rand((2, SURFACE_POINTS, 1), generator=generator)
-    u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
-    return pieces.corner[piece] + u * pieces.first[piece] + v * pieces.second[piece]
+    u, v = torch.rand((2, SURFACE_POINTS), generator=generator)
+    return piece, torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
 
 
 def _bounds(
@@ -203,9 +213,9 @@ def _bounds(
     if found.contracted or float((upper - lower).max()) > HARDLY_CLIPPED * found.side:
         return found
     pad = 0.01 * float((upper - lower).max())
-    low = tuple(min(a, float(b) - pad) for a, b in zip(found.lower, lower, strict=True))
-    high = tuple(max(a, float(b) + pad) for a, b in zip(found.upper, upper, strict=True))
-    return replace(found, lower=low, upper=high)
+    low = torch.minimum(lower - pad, torch.tensor(found.lower, dtype=torch.float64)).tolist()
+    high = torch.maximum(upper + pad, torch.tensor(found.upper, dtype=torch.float64)).tolist()
+    return replace(found, lower=(low[0], low[1], low[2]), upper=(high[0], high[1], high[2]))
 
 
 importer = ScanImporter()

@@ -39,6 +39,15 @@ class ScanConfig(FieldConfig, SupervisionConfig):
     seed: Annotated[int, Range(0)] = 0  # seed of all random draws
 
 
+def config_of(pieces: Pieces) -> ScanConfig:
+    """Return the size of a field for these pieces."""
+    if pieces.textures is None:
+        return ScanConfig(pieces=len(pieces))
+    return ScanConfig(
+        pieces=len(pieces), images=len(pieces.textures.shapes), texels=len(pieces.textures.texels)
+    )  # fmt: skip
+
+
 def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping.
 

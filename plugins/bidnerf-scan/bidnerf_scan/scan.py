@@ -63,7 +63,7 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
     dropped = Dropped()
     if not len(scan.points):
         raise InputError(f"{where}: holds no points, expected a mesh or a point cloud")
-    good = np.isfinite(scan.points).all(-1) & (np.abs(scan.points) < FARTHEST).all(-1)
+    good = np.asarray(np.all(np.isfinite(scan.points) & (np.abs(scan.points) < FARTHEST), axis=-1))
     dropped.not_finite = int((~good).sum())
     rgb = None if scan.rgb is None else np.nan_to_num(scan.rgb, nan=0.5).clip(0, 1)
     if scan.faces is None:
@@ -76,7 +76,7 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
         if len(first) < FEWEST:
             raise InputError(f"{where}: {len(first)} points at different places, expected three at least")
         return Scan(points[first], None if rgb is None else rgb[first]), dropped
-    exists = ((scan.faces >= 0) & (scan.faces < len(scan.points))).all(-1)
+    exists = np.asarray(np.all((scan.faces >= 0) & (scan.faces < len(scan.points)), axis=-1))
     whole = exists.copy()
     whole[exists] = good[scan.faces[exists]].all(-1)
     corners = scan.points[np.where(whole[:, None], scan.faces, 0)]

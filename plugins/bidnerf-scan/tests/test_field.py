@@ -15,16 +15,16 @@ from bidnerf_core.devices import without_waiting
 from bidnerf_core.fields.contract import Rays, SceneBounds
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.maps.importers import UNMOVED
-from bidnerf_scan import Scan, ScanConfig, ScanField, importer
-from bidnerf_scan.field import config_of
+from bidnerf_scan import Scan, ScanField, importer
 from bidnerf_scan.importer import ScanSettings, imported
 from bidnerf_scan.pieces import Pieces, cloud_pieces, mesh_pieces, spacing, thinned
+from bidnerf_scan.recipe import config_of
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.01, 10.0)
 
 
 def field_of(pieces: Pieces) -> ScanField:
-    field = ScanField(ScanConfig(**config_of(pieces)), BOUNDS)
+    field = ScanField(config_of(pieces), BOUNDS)
     field.assign(pieces)
     return field.requires_grad_(False)
 

@@ -17,6 +17,7 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.mapping import surface_of_points
 from bidnerf_scan import Scan
 from bidnerf_scan.importer import ScanSettings, imported
 
@@ -120,3 +121,16 @@ def test_a_solid_object_is_seen_from_outside_and_a_room_from_inside(tmp_path: Pa
         half = torch.tensor([0.5, 0.6, 0.4])
         inside = [bool((c.pose.translation.abs() < half).all()) for c in scene.info.cameras]
         assert all(inside) if turned else not any(inside), name
+
+
+def test_the_surface_of_a_map_is_that_of_the_scan() -> None:
+    """All of it, to within a cell, whether or not a viewpoint sees it."""
+    mesh = box()
+    found = imported(Scan(np.asarray(mesh.vertices), None, np.asarray(mesh.faces)), "x")
+    assert found.surface is not None
+    surface = surface_of_points(*found.surface, found.bounds, [])
+    away = (surface.surfels.positions.abs() - torch.tensor([0.5, 0.6, 0.4])).amax(-1)
+    assert float(away.abs().max()) < 2 * surface.cell
+    again = imported(Scan(np.asarray(mesh.subdivide().vertices)), "x").surface  # other points on all faces
+    assert again is not None
+    assert float(surface.distance(again[0]).max()) < 5 * surface.cell

@@ -54,7 +54,7 @@ def _placed(scene: Any, node: str) -> Scan:
     if geometry.visual.kind == "texture":
         return _textured(geometry.visual, points, faces)
     if geometry.visual.kind == "face":
-        rgb = np.asarray(geometry.visual.face_colors, np.float32)[:, :3] / 255
+        rgb = np.asarray(geometry.visual.face_colors, np.float32)[:, :3] / np.float32(255)
         corners = np.arange(faces.size).reshape(faces.shape)
         return Scan(points[faces].reshape(-1, 3), rgb.repeat(3, axis=0), corners)
     return Scan(points, _vertex_colours(geometry, len(points)), faces)
@@ -65,7 +65,7 @@ def _vertex_colours(geometry: Any, count: int) -> NDArray[np.float32] | None:
     if visual is None or visual.kind != "vertex":
         return None
     colours = np.asarray(visual.vertex_colors)
-    return colours[:, :3].astype(np.float32) / 255 if len(colours) == count else None
+    return colours[:, :3].astype(np.float32) / np.float32(255) if len(colours) == count else None
 
 
 def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> Scan:
@@ -76,7 +76,7 @@ def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64]
     found = attributes.get("color") if attributes is not None else None
     if found is not None and len(found) == len(points):
         own = np.asarray(found)[:, :3].astype(np.float32)
-        own = own / 255 if np.asarray(found).dtype.kind in "ui" else own
+        own = own / np.float32(255) if np.asarray(found).dtype.kind in "ui" else own
         rgb = own if rgb is None else rgb * own
     if image is None or visual.uv is None or len(visual.uv) != len(points):
         return Scan(points, rgb, faces)
@@ -95,4 +95,6 @@ def _material(material: Any) -> tuple[NDArray[np.uint8] | None, NDArray[np.float
     if factor is None:
         return image, None
     colour = np.asarray(factor, np.float64)[:3]
-    return image, (colour / 255 if np.asarray(factor).dtype.kind in "ui" else colour).astype(np.float32)
+    return image, (colour / np.float32(255) if np.asarray(factor).dtype.kind in "ui" else colour).astype(
+        np.float32
+    )

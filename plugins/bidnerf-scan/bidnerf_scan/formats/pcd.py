@@ -52,12 +52,18 @@ def _colours(rows: NDArray) -> NDArray[np.float32] | None:
     if packed is not None and rows.dtype[packed].itemsize == 4:
         # Three bytes in the bits of a number, which may be declared as a float.
         bits = np.ascontiguousarray(rows[packed]).view(np.uint32)
-        return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(np.float32) / 255
+        return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(
+            np.float32
+        ) / np.float32(255)
     three = next((n for n in (("r", "g", "b"), ("red", "green", "blue")) if set(n) <= set(names)), None)
     if three is None:
         return None
     rgb = np.stack([rows[name].astype(np.float32) for name in three], axis=-1)
-    return rgb / 255 if rows.dtype[three[0]].kind in "ui" or (len(rgb) and np.nanmax(rgb) > 1.5) else rgb
+    return (
+        rgb / np.float32(255)
+        if rows.dtype[three[0]].kind in "ui" or (len(rgb) and np.nanmax(rgb) > 1.5)
+        else rgb
+    )
 
 
 def _header(path: Path, data: bytes) -> _Header:
@@ -76,11 +82,13 @@ def _header(path: Path, data: bytes) -> _Header:
         repeats = found.get("COUNT", ["1"] * len(names))
         fields = []
         for number, (name, size, of, repeat) in enumerate(zip(names, sizes, types, repeats, strict=True)):
-            kind = f"<{ {'F': 'f', 'I': 'i', 'U': 'u'}[of.upper()] }{int(size)}"
+            number_kind = f"<{ {'F': 'f', 'I': 'i', 'U': 'u'}[of.upper()] }{int(size)}"
             unique = f"_{number}" if name == "_" or name in names[:number] else name
             if not 0 < int(repeat) < 65536:
                 raise ValueError(f"COUNT {repeat}")
-            fields.append((unique, kind) if int(repeat) == 1 else (unique, kind, (int(repeat),)))
+            fields.append(
+                (unique, number_kind) if int(repeat) == 1 else (unique, number_kind, (int(repeat),))
+            )
         count = (
             int(found["POINTS"][0]) if "POINTS" in found else int(found["WIDTH"][0]) * int(found["HEIGHT"][0])
         )

@@ -58,7 +58,7 @@ def _colours(rows: NDArray) -> NDArray[np.float32] | None:
     kind = rows.dtype[found[0]]
     if kind.kind in "ui":
         return rgb / np.float32(np.iinfo(kind).max)
-    return rgb / 255 if len(rgb) and np.nanmax(rgb) > 1.5 else rgb
+    return rgb / np.float32(255) if len(rgb) and np.nanmax(rgb) > 1.5 else rgb
 
 
 def _check_size(path: Path, header: PlyHeader) -> None:

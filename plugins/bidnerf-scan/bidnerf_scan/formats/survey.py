@@ -57,7 +57,7 @@ def read_las(path: Path) -> Scan:
     if not rgb.size or rgb.max() == 0:
         return Scan(points)  # fields for colours that nobody filled in
     # The standard scales to 16 bits; many programs write 8.
-    return Scan(points, rgb / (65535 if rgb.max() > 255 else 255))
+    return Scan(points, rgb / np.float32(65535 if rgb.max() > 255 else 255))
 
 
 def read_e57(path: Path) -> Scan:
