@@ -255,7 +255,7 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
             raise InputError(f"{path}: no matrix of numbers in it, expected {EXPECTED_POSE}") from error
         found[name] = pose_from_matrix(matrix, f"{path}: T_world_camera")
     if not found:
-        raise InputError(f"{path}: holds no pose that is not null, expected {EXPECTED_POSE}")
+        raise InputError(f"{path}: holds no pose, expected {EXPECTED_POSE}")
     return found
 
 
@@ -280,6 +280,6 @@ def _entries(path: Path, content: bytes) -> list[Any]:
         if len(lines) < 2 or not all(line.startswith(b"{") for line in lines):
             raise
         return [parse_json(line, f"{path}: line {n}", EXPECTED_POSE) for n, line in enumerate(lines, 1)]
-    if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
+    if isinstance(found, list) and all(isinstance(entry, dict) for entry in found):
         return found
     return [found]
