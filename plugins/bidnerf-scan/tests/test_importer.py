@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ EYE = look_at([0.5, -3.0, 1.0], [0.0, 0.0, 0.0], (0.0, 0.0, 1.0))
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 40)
+    monkeypatch.setattr(import_module("bidnerf_scan.importer"), "SURFACE_POINTS", 6000)
 
 
 def box(scale: float = 1.0) -> trimesh.Trimesh:
