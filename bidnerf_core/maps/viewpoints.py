@@ -29,10 +29,11 @@ SOLID = 0.8
 """Opacity at which a ray meets something."""
 CLEARANCE = 0.04
 """Least distance from matter, in units of the box's longest side; near of it, little is seen."""
-ENCLOSED = 0.75
+ENCLOSED = 0.6
 """Share of the rays from a place that meet matter, above which it is inside of a room or the like."""
-ROOMY = 0.02
-"""Share of the places in the box that must be free and enclosed, for the scene to be looked at from inside."""
+ROOMY = 0.2
+"""Share of the places in the box that must be free and enclosed, for the scene to be looked at from inside. An object with hollows
+(Lego: 0.09) has some such places, and a room (0.5) has many."""
 
 
 @dataclass(frozen=True, eq=False)
