@@ -1,9 +1,9 @@
 """Method ``auto``: find the pose with or without a start, from whatever was measured, and decide whether to trust it.
 
-All its decisions are made here. If the map has landmarks, they are matched first, and their pose is fused with measured
-depth and rendered rays. If that pose is not accepted, the surface is searched: measured points are aligned with it where
-there is enough depth, and otherwise the images are compared with its renderings. A map without a surface needs a start,
-from which ``auto`` descends as ``bid`` does.
+The order of its proposals is decided here; each part judges its own. If the map has landmarks, they are matched first, and
+their pose is fused with measured depth and rendered rays. If that pose is not accepted, the surface is searched: measured
+points are aligned with it where there is enough depth, and otherwise the images are compared with its renderings. A map
+without a surface needs a start, from which ``auto`` descends as ``bid`` does.
 """
 
 from __future__ import annotations

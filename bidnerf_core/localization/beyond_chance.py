@@ -53,7 +53,7 @@ class Support:
 
     @property
     def confidence(self) -> float:
-        """The probability of the pose, if it was as probable as each rival before."""
+        """The posterior probability of the pose, with equal prior odds against each rival."""
         return 1 / (1 + sum(_factor(odds) for odds in (self.plain, self.displaced, self.other)))
 
     def rejection(self, least_explained: float = LEAST_EXPLAINED) -> Verdict | None:

@@ -165,7 +165,8 @@ def nearby_start(
 ) -> FusedPose:
     """Return the pose that explains prior and rays best among the prior's mean and ``count`` draws from it.
 
-    Rays lead to the right pose only from where edges overlap, which a vague prior may miss.
+    Refinement on rays converges only if rendered and observed edges overlap already, which the mean of a vague prior does not
+    guarantee.
     """
     prior = measurements.prior
     root = UNSURE * torch.linalg.cholesky(prior.covariance)

@@ -109,7 +109,7 @@ class Localizer:
 
     @property
     def depth_sensor(self) -> DepthSensorModel:
-        """The model of the sensor that measures depth; methods without such a setting have that of an unknown one."""
+        """The noise model of the depth sensor; the generic one if the method has no such setting."""
         return find_depth_sensor(self.depth_sensor_name)
 
     @property

@@ -92,7 +92,7 @@ class Hypothesis:
     name: str
     whose: Whose
     log_prior: float
-    prior: CalibrationPrior  # with which the image is localized: ``FIXED`` but where the intrinsics are estimated
+    refitted: CalibrationPrior  # what a fit under it estimates anew, about the stated intrinsics; ``FIXED``: nothing
     mean: Float[Tensor, "5"]  # in the order of ``Calibration``
     deviations: Float[Tensor, "5"]  # of the correction about its mean
     camera: Intrinsics | None = None  # the map's
@@ -106,7 +106,7 @@ class Hypothesis:
 
 
 def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FIXED) -> list[Hypothesis]:
-    """Return all hypotheses about the intrinsics of an image; the only place with their priors.
+    """Return all hypotheses about the intrinsics of an image, with their priors.
 
     ``cameras``: those of the map, relative to the stated intrinsics. ``prior``: how uncertain the stated intrinsics are, if they
     are approximate and therefore estimated in any case.
@@ -221,6 +221,7 @@ class Posterior:
     deviations: Float[Tensor, "5"]  # its standard deviations due to the noise of keypoints
     distance: float  # metres: median depth of the landmarks
     explanations: tuple[Explanation, ...]
+    chosen: Explanation | None = None  # one to localize with however probable it is
 
     @property
     def stated(self) -> Explanation:
@@ -234,13 +235,10 @@ class Posterior:
         """
         best = next(each for each in self.explanations if each.is_as(explanation))
         if T_world_rig is None:
-            found = replace(self)
-        else:
-            fitted = replace(best, update=(self.T_world_rig.inverse() @ T_world_rig).log())
-            found = replace(self, explanations=tuple(fitted if e is best else e for e in self.explanations))
-            best = fitted
-        vars(found)["best"] = best
-        return found
+            return replace(self, chosen=best)
+        fitted = replace(best, update=(self.T_world_rig.inverse() @ T_world_rig).log())
+        explanations = tuple(fitted if each is best else each for each in self.explanations)
+        return replace(self, explanations=explanations, chosen=fitted)
 
     @cached_property
     def probabilities(self) -> list[float]:
@@ -251,7 +249,9 @@ class Posterior:
 
     @cached_property
     def best(self) -> Explanation:
-        """The explanation with which to localize the image: that of the most probable intrinsics, see ``best_of``."""
+        """The explanation with which to localize the image: ``chosen``, or that of the most probable intrinsics (``best_of``)."""
+        if self.chosen is not None:
+            return self.chosen
         totals: dict[str, float] = {}
         for each, p in self._weighted:
             totals[each.hypothesis.name] = totals.get(each.hypothesis.name, 0.0) + p
@@ -314,7 +314,7 @@ class Posterior:
             replace(each, log_evidence=each.log_evidence + log_odds.get(each.hypothesis.group, 0.0))
             for each in self.explanations
         )
-        return replace(self, explanations=explanations)
+        return replace(self, explanations=explanations, chosen=None)
 
     @property
     def doubt_of_motion(self) -> Float[Tensor, "6 6"]:

@@ -132,7 +132,7 @@ class LandmarkPose:
 
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
-        """The covariance, including that due to errors of the intrinsics, whether these were taken or estimated."""
+        """The covariance of the pose, including the uncertainty of its intrinsics: given, the map's, or estimated."""
         return self.covariance + self.doubt.covariance
 
     @property

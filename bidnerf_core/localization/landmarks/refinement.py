@@ -122,7 +122,7 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
         best = pose.posterior.best
         if best.is_as(pose.best):
             break
-        prior, seen = best.hypothesis.prior, _seen(pose.query, best)
+        prior, seen = best.hypothesis.refitted, _seen(pose.query, best)
         motion = MotionPrior.usual(pose.posterior.distance) if best.motion is Motion.MOVING else STILL
         start = best.calibration if best.hypothesis.whose is Whose.ESTIMATED else GIVEN
         T, most = pose.posterior.pose(best), pose.max_distance
@@ -160,7 +160,7 @@ def _judged(
 
 def _seen(query: LandmarkQuery, explanation: Explanation) -> LandmarkQuery:
     """Return the query with the intrinsics with which an explanation is fitted; those that the fit estimates are the stated ones."""
-    if explanation.hypothesis.prior != FIXED:
+    if explanation.hypothesis.refitted != FIXED:
         return query
     cameras = [explanation.intrinsics(image.intrinsics) for image in query.images]
     return replace(query.seen_by(cameras), prior=FIXED)

@@ -43,10 +43,10 @@ class _Replay:
 
 
 def captured(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
-    """Return a function that does what ``step`` does: on a GPU, by replaying a graph of it, if it can be captured.
+    """Return a callable equivalent to ``step``; on a GPU it replays a CUDA graph.
 
-    ``generator`` is the one from which the step draws. Capturing takes no step. A step that cannot be captured is returned as
-    it is, with a warning.
+    ``generator`` is the one from which the step draws. Capturing does not execute the step. If the capture fails, this warns and
+    returns ``step`` itself.
     """
     if device.type != "cuda":
         return step

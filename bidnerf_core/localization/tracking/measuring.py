@@ -304,7 +304,7 @@ def unconfirmed(verdict: Verdict) -> Verdict:
 
 
 def precise_enough(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
-    """Return the verdict, or a rejection if the position is too uncertain for the ``distance`` (metres) of what is in view."""
+    """Return the verdict, or a rejection if the position's uncertainty is too large for the scene's ``distance`` (metres)."""
     deviation = position_deviation(covariance)
     if not verdict.accepted or deviation <= LandmarkThresholds().precision * distance:
         return verdict

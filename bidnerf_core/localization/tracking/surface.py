@@ -82,7 +82,7 @@ def fused_with_surface(
 
 
 def fused_with_points(T: SE3, pose: PoseEstimate, information: Float[Tensor, "6 6"]) -> PoseEstimate:
-    """Return the pose ``T`` with the covariances that ``pose`` has once it is fused with points of this ``information``."""
+    """Return the estimate at ``T``, its noise and bias covariances updated with the points' ``information`` matrix."""
     fused = torch.linalg.inv(torch.linalg.inv(pose.covariance) + information)
     kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
     return PoseEstimate(

@@ -62,7 +62,7 @@ def adjusted(
     correlation: float = 1.0,
     tolerance: float = SMALL_DECREASE,
 ) -> Adjustment:
-    """Minimize the robust reprojection errors and the prior, from ``start``; the poses in ``sightings`` have no part in it.
+    """Minimize the robust reprojection error plus the prior, starting from ``start``; poses in ``sightings`` are ignored.
 
     ``noise`` is the standard deviation of a sighting along each axis (pixels), and ``correlation`` the number of sightings that
     count as one, because their errors are correlated. Images without sightings keep their given poses. ``tolerance`` is the

@@ -31,7 +31,7 @@ class Calibration:
 
     @property
     def focal_factor(self) -> float:
-        """Ratio of the true to the given focal length; of a stretched image, the geometric mean across and down."""
+        """The true over the given focal length; for a stretched image, the geometric mean of both directions."""
         return math.exp(self.log_focal)
 
     @property

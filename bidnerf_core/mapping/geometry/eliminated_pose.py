@@ -26,7 +26,10 @@ class Conditional:
 
 @dataclass(frozen=True)
 class EliminatedPose:
-    """The quadratic cost of a camera's parameters, with the pose that suits them best (Schur complement)."""
+    """The quadratic cost in a camera's parameters after eliminating the pose (Schur complement).
+
+    The optimal pose is a linear function of the parameters.
+    """
 
     here: Array  # (p,) values of the parameters
     cost: float

@@ -69,9 +69,9 @@ def pose_scatter(
 ) -> Float[Tensor, "6 6"]:
     """Return the covariance of the right updates from given to resected poses; zero if there are too few images.
 
-    ``noise`` is that of the keypoints, pixels. Each image takes part in triangulating the points that it sees, which biases
-    them towards its own error. This is corrected for: if a point has k views, resection shows the factor 1 - 1/k of the pose
-    variance, whereas the pose of a new image would show 1 + 1/k.
+    ``noise`` is that of the keypoints, pixels. An image also helped to triangulate the points that it is resected from, so that
+    the variance of its pose is underestimated: with k views of a point it is 1 - 1/k of the true variance, against 1 + 1/k for a
+    new image. The updates are rescaled accordingly.
     """
     return update_scatter(list(pose_updates(tracked, positions, noise).values()))
 
