@@ -40,6 +40,7 @@ class ImportedField:
     surface: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = (
         None  # points (metres, world) on the matter of a scan, and their colours: its surface, which need not be rendered
     )
+    is_coloured: bool = True  # whether its colours mean something; otherwise renderings give no landmarks
     is_solid: bool = False  # whether matter encloses no free space, so that the scene is seen from around it
 
 

@@ -201,7 +201,8 @@ def _baked(
     progress: ProgressCallback | None,
     cancel: Cancel | None,
 ) -> Map:
-    if not views:
+    has_landmarks = bool(views) or found.is_coloured
+    if not views and found.is_coloured:
         log.info(
             f"{scene.info.data}: landmarks from rendered images: a photo matches them less well than other photos;"
             " --photos gives landmarks as a map that was trained here has"
@@ -214,6 +215,8 @@ def _baked(
                 f"{scene.info.data}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
                 f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
             )
+        if not has_landmarks:
+            return scene.with_baked_surface(config, surface, progress, cancel)
         return scene.with_baked_parts(list(views), config, not views, None, progress, cancel, surface)
     except PluginError:  # nothing that other images would mend
         raise

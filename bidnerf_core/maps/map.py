@@ -248,6 +248,15 @@ class Map:
             log.info(str(error))
             return None
 
+    def with_baked_surface(
+        self, config: BakeConfig, surface: SurfaceMap | None = None, progress: ProgressCallback | None = None,
+        cancel: Cancel | None = None,
+    ) -> Map:  # fmt: skip
+        """Bake the surface alone, if it is not known, while the caller holds the lock of the folder."""
+        if surface is None:
+            surface = bake_surface(self.info, self.field, [], config, self._name, progress, cancel)
+        return self._with_surface(surface)
+
     def _with_surface(self, surface: SurfaceMap) -> Map:
         info = self.info if self.folder is None else save_surface(self.folder, self.info, surface)
         return replace(self, info=info, surface=surface)

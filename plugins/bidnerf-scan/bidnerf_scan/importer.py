@@ -95,8 +95,8 @@ def imported(
         facts.append(f"left out {dropped}")
     if not scan.has_colours:
         facts.append(
-            "no colours: it gives no landmarks, and poses are found by its shape alone, which takes images with depth"
-            " (--photos gives landmarks)"
+            "no colours: it gives no landmarks, and poses are found by its shape alone, which takes images with depth and is"
+            " seldom accepted (--photos gives landmarks)"
         )
     colours: Tensor | None = None
     if kept.faces is None:
@@ -127,8 +127,7 @@ def imported(
     up = placement.T_target_source.rotation.double() @ torch.tensor(UPS[axis], dtype=torch.float64)
     return ImportedField(
         "scan", settings, dict(field.state_dict()), bounds, tuple(facts), settings.steps, matter, (),
-        (float(up[0]), float(up[1]), float(up[2])), (matter, torch.full_like(matter, GREY) if colours is None else colours),
-        solid,
+        (float(up[0]), float(up[1]), float(up[2])), (matter, torch.full_like(matter, GREY) if colours is None else colours), scan.has_colours, solid,
     )  # fmt: skip
 
 

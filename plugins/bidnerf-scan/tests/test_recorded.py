@@ -1,0 +1,53 @@
+"""Recorded images with depth, localized without a start in the fused depth of other images of the place."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bidnerf_core import Localizer, import_map, open_dataset
+from bidnerf_core.frames.pixels import draw, uniform
+from bidnerf_core.results.errors import pose_error
+from bidnerf_scan.pieces import thinned
+
+
+def test_frames_with_depth_are_found_by_the_shape_of_a_cloud(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their poses are right, and no wrong one is accepted; without colours, most are not accepted at all."""
+    folder = os.environ.get("BIDNERF_DATA")
+    if not folder:
+        pytest.skip("needs BIDNERF_DATA")
+    monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 100)
+    dataset = open_dataset(Path(folder) / "room_living")
+    names = dataset.frame_names("train")[::2]
+    pixels = draw(
+        dataset.views("train", names), 400_000, uniform, torch.Generator().manual_seed(0)
+    ).flattened()
+    points = (pixels.origins + pixels.distance[:, None] * pixels.directions)[pixels.distance > 0]
+    few, _ = thinned(points, None, 60_000)
+    rows = few.numpy().astype("<f4")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n" + "".join(
+        f"property float {axis}\n" for axis in "xyz"
+    )
+    (tmp_path / "cloud.ply").write_bytes(
+        head.encode() + b"end_header\n" + np.ascontiguousarray(rows).tobytes()
+    )
+    scene = import_map(tmp_path / "cloud.ply")
+    assert scene.landmarks is None
+    localizer = Localizer(scene)
+    right = said = 0
+    for view in dataset.views(
+        "test", dataset.frame_names("test")[:: max(1, len(dataset.frame_names("test")) // 5)][:5]
+    ):
+        found = localizer(replace(view.frame))
+        error = pose_error(found.T_world_camera, view.T_ref_camera)
+        good = float(error.translation) < 0.05 and float(error.rotation_deg) < 5
+        right, said = right + good, said + (found.converged and not good)
+    assert right >= 4
+    assert not said
