@@ -25,6 +25,7 @@ from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
 from bidnerf_core.structure.mapping import vertical
 from bidnerf_core.structure.pairs import ALL_OF_FRAMES, ALL_OF_PHOTOS, NEIGHBOURS, chosen_pairs, few
+from bidnerf_core.structure.record import begin, clear
 from bidnerf_core.structure.sources import SourceImage, lacks_poses, photos_of
 from bidnerf_core.structure.video_frames import MOST, STEP, FrameMeasure, chosen, measured, write_frames
 from commands import Run
@@ -167,6 +168,23 @@ def test_train_takes_photos_without_poses(
         assert "2 photos of 9 are held out" in caplog.text
     finally:
         beside.rename(search.out)
+
+
+def test_photos_inside_the_folder_of_the_poses_are_never_removed(tmp_path: Path) -> None:
+    """Nor are those that are called as the frames of a video are."""
+    photos = tmp_path / "capture" / "images"
+    photos.mkdir(parents=True)
+    for number in range(2):
+        Image.new("RGB", (64, 48)).save(photos / f"{number:06d}.jpg")
+    with pytest.raises(bn.InputError, match="2 photos, expected at least 3"):
+        bn.find_poses(photos, tmp_path / "capture", overwrite=True)
+    with pytest.raises(bn.InputError, match="exists already, and the frames"):
+        begin(tmp_path / "capture", "a video", video=True)
+    assert len(list(photos.iterdir())) == 2
+    begin(tmp_path / "other", "a video", video=True)
+    photos.rename(tmp_path / "other" / "images")
+    clear(tmp_path / "other")
+    assert list((tmp_path / "other").iterdir()) == []
 
 
 def test_a_folder_inside_and_names_that_occur_twice(tmp_path: Path) -> None:

@@ -90,7 +90,7 @@ def find_poses(
     with _folder(folder, inputs, overwrite):
         if overwrite:
             clear(folder)
-        work = begin(folder, inputs)
+        work = begin(folder, inputs, video=is_video(source))
         try:
             return _Search(source, folder, work, inputs, camera, progress, cancel, pycolmap).run(images)
         except Cancelled as stopped:
@@ -260,6 +260,7 @@ class _Search:
         result = FoundPoses(
             self._source.name, len(images), model.num_reg_images(), tuple(models.sizes), tuple(left), model.num_points3D(),
             error, round(time.monotonic() - self._began, 1), self._inputs, self._pycolmap.__version__,
+            is_video(self._source),
         )  # fmt: skip
         write_found(self._folder, result)
         for line in str(result).splitlines():

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -60,6 +61,7 @@ class FoundPoses:
     seconds: float  # of the run that finished
     inputs: str  # digest of the names, sizes and times of the files, and of the camera
     pycolmap: str  # its version
+    video: bool = False  # whether the photos are frames of a video, which were written beside this record
 
     def __str__(self) -> str:
         lines = [
@@ -96,20 +98,31 @@ def read_found(folder: Path) -> FoundPoses | None:
 
 def begun_with(folder: Path) -> str | None:
     """Return the digest of the photos with which interrupted work in a folder was begun, or None where there is none."""
+    return _begun(folder).get("inputs")
+
+
+def _begun(folder: Path) -> dict[str, Any]:
     try:
         found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
     except InputError:
-        return None
-    return found.get("inputs") if isinstance(found, dict) else None
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
-def begin(folder: Path, inputs: str) -> Path:
-    """Return the folder of the work, emptied unless it was begun with the same inputs."""
+def begin(folder: Path, inputs: str, video: bool) -> Path:
+    """Return the folder of the work, emptied unless it was begun with the same inputs.
+
+    Raises ``InputError`` where the frames of a video would be written among images that are not such frames.
+    """
     work = folder / WORK
     if begun_with(folder) != inputs:
         clear(folder)
+        if video and (folder / FRAMES).exists():
+            raise InputError(
+                f"{folder / FRAMES}: exists already, and the frames of the video would be written into it; name another folder"
+            )
         work.mkdir(parents=True, exist_ok=True)
-        write_file(work / "begun.json", json.dumps({"inputs": inputs}).encode())
+        write_file(work / "begun.json", json.dumps({"inputs": inputs, "video": video}).encode())
     return work
 
 
@@ -121,14 +134,22 @@ def is_ours(file: Path) -> bool:
 
 
 def clear(folder: Path) -> None:
-    """Remove all that this module wrote; other files stay."""
-    for name in (RECORD, TRANSFORMS):
-        (folder / name).unlink(missing_ok=True)
+    """Remove all that this module wrote; other files stay, such as photos in a folder that is called as that of frames is."""
+    (folder / TRANSFORMS).unlink(missing_ok=True)  # first: without it, the record counts as incomplete
+    if _has_frames(folder) and (folder / FRAMES).is_dir() and is_ours(folder / FRAMES):
+        shutil.rmtree(folder / FRAMES)
+    (folder / RECORD).unlink(missing_ok=True)
     shutil.rmtree(folder / WORK, ignore_errors=True)
     for name in MODEL_FILES:
         (folder / MODEL / name).unlink(missing_ok=True)
-    if (folder / FRAMES).is_dir() and is_ours(folder / FRAMES):
-        shutil.rmtree(folder / FRAMES)
+
+
+def _has_frames(folder: Path) -> bool:
+    """Return whether frames of a video were written into a folder of poses."""
+    record: Any = {}
+    with contextlib.suppress(InputError):
+        record = read_json(folder / RECORD, "the record of found poses")
+    return any(isinstance(part, dict) and part.get("video") is True for part in (record, _begun(folder)))
 
 
 def write_dataset(folder: Path, photos: Mapping[int, Photo], model: Any, names: Mapping[int, str]) -> None:
