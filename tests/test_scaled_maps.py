@@ -13,6 +13,7 @@ import tiny
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import levels
+from bidnerf_core.maps.anchor import Anchor, load_anchor, save_anchor
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, textured_map, unseen
@@ -107,11 +108,20 @@ def test_an_interrupted_training_is_not_scaled(ground: Map) -> None:
 def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     trained = tmp_path / "map"
     before = bn.train(tiny.views(3), out=trained, config=tiny.config(5), bake=False)
+    save_anchor(trained, Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5))
     status, out, err = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half")
     assert status == 0, err
     assert "all lengths multiplied by 0.5" in out
     half = bn.load_map(tmp_path / "half")
     assert half.unit == "metres"
+    anchors = [load_anchor(folder) for folder in (trained, tmp_path / "half")]
+    places = [
+        anchor.geographic(scene.info.cameras[0].pose).place
+        for anchor, scene in zip(anchors, (before, half), strict=True)
+        if anchor is not None
+    ]
+    assert len(places) == 2
+    assert places[0].height == pytest.approx(places[1].height, abs=1e-6)
     assert half.bounds.side == 0.5 * before.bounds.side
     names = [camera.name for camera in before.info.cameras]
     length = float((before.info.cameras[0].pose.translation - before.info.cameras[1].pose.translation).norm())

@@ -11,6 +11,7 @@ from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import MapFolder, option, parse
 from bidnerf_core.cli.output import say, show
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.maps.anchor import load_anchor, save_anchor, scaled_anchor
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.maps.scaling import factor_of_distance, factor_of_poses
 from bidnerf_core.results.pose_files import read_poses
@@ -47,7 +48,7 @@ def scale(
     ] = None,
     out: Annotated[Path | None, option("MAP2", "leave the map as it is and write another one", "")] = None,
 ) -> None:
-    """Change the unit of a map to metres: of its field, bounds, surface, landmarks and record.
+    """Change the unit of a map to metres: of its field, bounds, surface, landmarks, record and anchor.
 
     Poses, covariances and errors are in metres from then on, and depth of sensors fits.
     """
@@ -67,7 +68,10 @@ def scale(
         raise UsageError("expected one of --distance, --poses and --factor")
     if not found > 0:
         raise InputError(f"the factor is {found:g}, expected a positive number")
+    anchor = load_anchor(map)
     stored = scene.scaled(found).save(out or map, overwrite=out is None)
+    if anchor is not None:
+        save_anchor(out or map, scaled_anchor(anchor, found))
     sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
     show(
         f"{stored.folder}: all lengths multiplied by {found:.6g}; in metres now, the scene is a box of {sides}"

@@ -8,8 +8,9 @@ axis) say how well the anchor itself is known.
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.geometry.wgs84 import Geodetic, geodetic
+from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, read_json, to_plain
 
 ANCHOR = "anchor.json"
@@ -94,3 +96,13 @@ def load_anchor(folder: Path) -> Anchor | None:
         return from_plain(Anchor, read_json(path, "the anchor of a map"), str(path))
     except InputError as error:
         raise InputError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
+
+
+def save_anchor(folder: Path, anchor: Anchor) -> None:
+    """Write an anchor into the folder of a map, replacing an earlier one."""
+    write_file(folder / ANCHOR, (json.dumps(anchor.plain(), indent=1, allow_nan=False) + "\n").encode())
+
+
+def scaled_anchor(anchor: Anchor, factor: float) -> Anchor:
+    """Return the anchor of a map whose lengths were multiplied by ``factor``."""
+    return replace(anchor, metres_per_unit=anchor.metres_per_unit / factor)
