@@ -9,7 +9,9 @@ import pytest
 
 import bidnerf_core as bn
 import tiny
+from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import Cancelled, InputError
+from bidnerf_core.maps.extending import locate
 from bidnerf_core.testing.textured_field import training_views, view
 from commands import Run
 
@@ -62,6 +64,17 @@ def test_the_same_photos_change_nothing(map_folder: Path) -> None:
     same = bn.extend(map_folder, training_views()[:3], steps=STEPS, config=BAKE)
     assert len(same.info.cameras) == 7
     assert files(map_folder) == before
+
+
+def test_a_photo_that_was_added_under_another_name_is_known(stored: Path) -> None:
+    """Another folder's first photo has the name of the map's first one."""
+    scene, new = bn.load_map(stored), training_views()[7]
+    name = scene.info.cameras[0].name
+    frame = replace(new.frame, name=name)
+    located = locate(scene, [frame], "map")
+    assert [each.frame.name for each in located.views] == [f"{name}_2"]
+    info = replace(scene.info, cameras=(*scene.info.cameras, *stored_cameras(located.views)))
+    assert locate(replace(scene, info=info), [frame], "map").known == (name,)
 
 
 def test_another_scene_is_refused(map_folder: Path) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import itertools
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -132,6 +133,7 @@ def locate(
             f"{where}: has no landmarks to locate photos by; 'bidnerf bake MAP --data DATA' builds them"
         )
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
+    near = SAME_PLACE * scene.bounds.side
     count = counter("locating", "photos", progress, cancel)
     views, left_out, known = list[View](), list[tuple[str, str]](), list[str]()
     for number, frame in enumerate(frames, start=1):
@@ -140,11 +142,12 @@ def locate(
             found = localizer(frame)
         except InputError as error:
             left_out.append((frame.name, str(error)))
+            count(number, len(frames))
             continue
-        stored = cameras.get(frame.name)
+        stored = [cameras[name] for name in _names_like(frame.name, cameras)]
         if not found.converged:
             left_out.append((frame.name, f"{found.outcome}: {found.reason}"))
-        elif stored is not None and _apart(found.T_world_camera, stored) < SAME_PLACE * scene.bounds.side:
+        elif any(_apart(found.T_world_camera, pose) < near for pose in stored):
             known.append(frame.name)
         else:
             named = replace(
@@ -389,9 +392,15 @@ def _apart(first: SE3, second: SE3) -> float:
     return float((first.translation - second.translation).norm())
 
 
-def _free(name: str, taken: set[str]) -> str:
+def _names_like(name: str, taken: Container[str]) -> list[str]:
+    """Return the names that are taken by photos called ``name``: the name itself, and those that ``_free`` made of it."""
+    found = itertools.takewhile(
+        lambda each: each in taken, itertools.chain([name], (f"{name}_{n}" for n in itertools.count(2)))
+    )
+    return list(found)
+
+
+def _free(name: str, taken: Container[str]) -> str:
     """Return a name that is not taken: the name itself, or with the first number that makes it one."""
-    number, found = 2, name
-    while found in taken:
-        found, number = f"{name}_{number}", number + 1
-    return found
+    like = _names_like(name, taken)
+    return f"{name}_{len(like) + 1}" if like else name
