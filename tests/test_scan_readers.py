@@ -56,6 +56,7 @@ def test_what_is_read_is_what_was_written(layout: tuple[str, Path], written: lis
         frames = list(open_sequence(folder))
         dataset = open_dataset(folder)
     assert len(frames) == COUNT
+    assert getattr(dataset, "unit", None) == (None if kind == "reality-capture" else "metres")
     assert sorted(dataset.splits) == ["test", "train"]
     assert sum(len(dataset.frame_names(split)) for split in dataset.splits) == COUNT
     for timed, view in zip(frames, written, strict=True):

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from bidnerf_core.captures.up_direction import given_up, up_direction
+from bidnerf_core.datasets.record3d import Record3DDataset
 from bidnerf_core.geometry.se3 import SE3
 
 WORLD = SE3.exp(torch.tensor([0.0, 0, 0, 0.7, -1.1, 0.4], dtype=torch.float64)).rotation
@@ -89,3 +90,9 @@ def test_datasets_that_wrap_others_keep_what_these_know() -> None:
     assert isinstance(scan, Georeferenced)
     assert isinstance(whole, Georeferenced)
     assert (whole.unit, whole.up) == ("metres", (0.0, 1.0, 0.0))
+
+
+def test_the_world_of_record3d_has_no_vertical_axis() -> None:
+    """It is the camera of the first frame, however the phone was held."""
+    assert Record3DDataset.up is None
+    assert Record3DDataset.unit == "metres"

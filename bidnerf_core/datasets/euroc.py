@@ -18,7 +18,7 @@ import torch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.posed_images import ImageDataset, ImageFrame, images_posed, images_there
+from bidnerf_core.datasets.posed_images import ImageFrame, MetricImageDataset, images_posed, images_there
 from bidnerf_core.datasets.reader import OpenQuestion, Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import Splits, hold_out
@@ -48,15 +48,15 @@ class EurocReader(Reader):
         if truth is None:
             raise InputError(f"{path}: has no poses, expected mav0/{TRUTHS[0]}/data.csv")
         frames = images_posed(truth, _frames(path, options))
-        return ImageDataset(Splits(path, hold_out(frames)), options.background)
+        return MetricImageDataset(Splits(path, hold_out(frames)), options.background)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         frames = _frames(path, options)
         posed = [frame for frame in frames if frame.T_world_camera is not None]
         others = [frame for frame in frames if frame.T_world_camera is None]
-        return ImageDataset(Splits(path, hold_out(posed) if posed else {}), options.background).sequence(
-            others
-        )
+        return MetricImageDataset(
+            Splits(path, hold_out(posed) if posed else {}), options.background
+        ).sequence(others)
 
 
 def _root(path: Path) -> Path | None:

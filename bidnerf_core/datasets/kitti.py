@@ -18,7 +18,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import remark
-from bidnerf_core.datasets.posed_images import ImageDataset, ImageFrame, images_posed
+from bidnerf_core.datasets.posed_images import ImageFrame, MetricImageDataset, images_posed
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import Splits, hold_out
@@ -51,15 +51,15 @@ class KittiReader(Reader):
                 f"{path}: has no poses, expected poses.txt in it, or ../../poses/{path.resolve().name}.txt"
             )
         frames = images_posed(file, _frames(path))
-        return ImageDataset(Splits(path, hold_out(frames)), options.background)
+        return MetricImageDataset(Splits(path, hold_out(frames)), options.background)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         frames = _frames(path)
         posed = [frame for frame in frames if frame.T_world_camera is not None]
         others = [frame for frame in frames if frame.T_world_camera is None]
-        return ImageDataset(Splits(path, hold_out(posed) if posed else {}), options.background).sequence(
-            others
-        )
+        return MetricImageDataset(
+            Splits(path, hold_out(posed) if posed else {}), options.background
+        ).sequence(others)
 
 
 def _number(path: Path) -> int | None:

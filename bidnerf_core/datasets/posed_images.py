@@ -13,6 +13,7 @@ from bidnerf_core.datasets.splits import SplitDataset
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import is_file
 
 
@@ -43,6 +44,12 @@ class ImageDataset(SplitDataset[ImageFrame]):
 
     def _pose(self, frame: ImageFrame) -> SE3 | None:
         return frame.T_world_camera
+
+
+class MetricImageDataset(ImageDataset):
+    """Views of image files of a format whose poses are in metres."""
+
+    unit: LengthUnit | None = "metres"
 
 
 def images_there(where: Path, frames: Sequence[ImageFrame]) -> list[ImageFrame]:

@@ -5,7 +5,7 @@ column), ``perFrameIntrinsicCoeffs`` (``fx fy cx cy`` of each frame, in newer re
 camera to world, OpenGL axes), ``frameTimestamps`` (seconds) or ``fps``. Frame N has ``rgbd/N.jpg``, ``rgbd/N.depth`` (32-bit
 floats in metres, row by row, compressed with LZFSE) and, from a lidar, ``rgbd/N.conf`` (a byte of confidence per pixel,
 compressed likewise). Depth takes the package ``lzfse``, which the extra ``record3d`` installs. The world is that of the
-recording: the camera of its first frame as a rule. See ``phone_scans`` for how depth and photos are read.
+recording: the camera of its first frame as a rule, so no axis of it is vertical. See ``phone_scans`` for how depth and photos are read.
 
 Members of the archive are read one at a time and within limits. Every eighth frame of the dataset (the first, the ninth ...) is
 held out as "test" and the others are "train".
@@ -125,7 +125,6 @@ class Record3DDataset(SplitDataset[Record3DFrame]):
     """Views of a recording; see ``Dataset``."""
 
     unit: LengthUnit | None = "metres"
-    up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
 
     def __init__(
         self, frames: Splits[Record3DFrame], files: _Files, metadata: Record, background: Background | None

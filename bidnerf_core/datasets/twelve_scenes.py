@@ -18,7 +18,7 @@ import torch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.posed_images import ImageDataset, ImageFrame, images_posed
+from bidnerf_core.datasets.posed_images import ImageFrame, MetricImageDataset, images_posed
 from bidnerf_core.datasets.reader import OpenQuestion, Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -51,13 +51,13 @@ class TwelveScenesReader(Reader):
     def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Read the poses. Raises ``InputError`` where a description is not usable, and where no frame has a pose."""
         frames = images_posed(path, _frames(path, options))
-        return ImageDataset(Splits(path, _splits(path, frames)), options.background)
+        return MetricImageDataset(Splits(path, _splits(path, frames)), options.background)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         frames = _frames(path, options)
         posed = [frame for frame in frames if frame.T_world_camera is not None]
         others = [frame for frame in frames if frame.T_world_camera is None]
-        return ImageDataset(Splits(path, _splits(path, posed)), options.background).sequence(others)
+        return MetricImageDataset(Splits(path, _splits(path, posed)), options.background).sequence(others)
 
 
 def _info(path: Path) -> Path | None:
