@@ -19,7 +19,7 @@ import tiny
 from bidnerf_core.camera.orientation import CODES
 from bidnerf_core.datasets.whole import all_views
 from bidnerf_core.geometry.similarity import fit_similarity
-from bidnerf_core.maps.photos import posed_images
+from bidnerf_core.maps.photos import posed_images, poses_folder
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
@@ -185,6 +185,12 @@ def test_photos_inside_the_folder_of_the_poses_are_never_removed(tmp_path: Path)
     photos.rename(tmp_path / "other" / "images")
     clear(tmp_path / "other")
     assert list((tmp_path / "other").iterdir()) == []
+
+
+def test_the_poses_are_beside_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert poses_folder(Path("maps/room")) == Path("maps/room-poses")
+    monkeypatch.chdir(tmp_path)
+    assert poses_folder(Path(".")) == tmp_path.with_name(f"{tmp_path.name}-poses")
 
 
 def test_a_folder_inside_and_names_that_occur_twice(tmp_path: Path) -> None:

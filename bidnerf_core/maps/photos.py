@@ -20,7 +20,8 @@ log = logging.getLogger("bidnerf")
 
 def poses_folder(out: Path) -> Path:
     """Return the folder beside a map in which the poses of its photos are kept: MAP-poses."""
-    return out.with_name(f"{out.name}-poses")
+    place = out if out.name else out.absolute()  # "." has no name
+    return place.with_name(f"{place.name}-poses")
 
 
 @contextlib.contextmanager
