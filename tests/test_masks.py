@@ -31,7 +31,7 @@ from bidnerf_core.mapping.landmarks.features import SIFT
 from bidnerf_core.maps.rendering import rendering_scores
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training.ray_bank import RayBank
-from conftest import Run
+from commands import Run
 from photo_files import write_photo
 from tiny import config, options, views, write_dataset
 
