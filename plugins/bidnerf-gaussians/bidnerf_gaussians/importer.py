@@ -153,7 +153,7 @@ def _cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ..
             pose = SE3(placement.T_target_source.rotation.double() @ rotation, position)
             rows = tuple((r[0], r[1], r[2], r[3]) for r in pose.matrix().tolist())
             cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise InputError(
                 f"{file}: camera {len(cameras)} is not readable ({error}), expected Inria's layout"
             ) from error

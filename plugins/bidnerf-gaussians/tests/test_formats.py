@@ -261,6 +261,9 @@ def test_gltf(tmp_path: Path, some: Some) -> None:
     path.write_bytes(glb(some(3))[:-20])
     with pytest.raises(InputError, match="is cut off"):
         read_gaussians(path)
+    path.write_bytes(glb(some(4)).replace(b'"count": 4', b'"count": 3', 1))
+    with pytest.raises(InputError, match="one for each Gaussian"):
+        read_gaussians(path)
 
 
 def test_checkpoints_of_gsplat_and_splatfacto(tmp_path: Path, some: Some) -> None:
@@ -275,6 +278,15 @@ def test_checkpoints_of_gsplat_and_splatfacto(tmp_path: Path, some: Some) -> Non
     torch.save({"pipeline": pipeline | {"_model.lpips.weight": torch.zeros(2)}}, tmp_path / "b.ckpt")
     for name in ("a.pt", "b.ckpt"):
         assert max(differences(read_gaussians(tmp_path / name), g).values()) == 0
+    repeated = {name: value[:1].expand(10**9, *value.shape[1:]) for name, value in gsplat.items()}
+    for broken, message in (
+        ({"sh0": torch.zeros(7)}, "different counts"),
+        ({"means": torch.tensor(1.0)}, "different counts"),
+        (repeated, "are too few"),
+    ):
+        torch.save({"splats": gsplat | broken}, tmp_path / "a.pt")
+        with pytest.raises(InputError, match=message):
+            read_gaussians(tmp_path / "a.pt")
 
 
 def test_checkpoints_of_other_fields_are_not_recognised(tmp_path: Path) -> None:
@@ -340,11 +352,16 @@ def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -
         "short.spz": (gzip.compress(unpacked[:-10]), "data end after"),
         "degree.spz": (gzip.compress(unpacked[:12] + b"\x07" + unpacked[13:]), "degree 7"),
         "version.spz": (gzip.compress(unpacked[:4] + b"\x09" + unpacked[5:]), "version 9"),
-        "huge4.spz": (struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10**9, 0, 12, 0, 5, 32) + bytes(80), "is it truncated"),
+        "huge4.spz": (struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10**3, 0, 12, 0, 5, 32) + bytes(80), "is it truncated"),
+        "dense4.spz": (struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10**9, 0, 12, 0, 5, 32) + bytes(80), "can hold"),
         "none.sog": (b"no archive", "no zip archive"),
         "text.pt": (b"no checkpoint", "no file of Gaussians"),
         "mesh.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "no file of Gaussians"),
     }  # fmt: skip
+    archive = bytearray(write_sog(tmp_path / "a.sog", parts).read_bytes())
+    archive[6] |= 1  # "encrypted", in both headers of the first member
+    archive[archive.index(b"PK\x01\x02") + 8] |= 1
+    cases["encrypted.sog"] = bytes(archive), "has no readable"
     for name, content in (
         ("noimage.sog", no_image),
         ("huge.sog", parts | {"meta.json": json.dumps(huge).encode()}),
@@ -368,6 +385,13 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     path = write_sog(tmp_path / "bomb.sog", sog_parts() | {"quats.webp": bytes(3000)})
     with pytest.raises(InputError, match="unpacks to"):
         read_gaussians(path)
+    sections = spz_content(4)[:5]
+    packed = [zstandard.ZstdCompressor().compress(part) for part in (bytes(10**7), *sections[1:])]
+    sizes = b"".join(struct.pack("<QQ", len(a), len(b)) for a, b in zip(packed, sections, strict=True))
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 2, 0, 12, 0, 5, 32)
+    (tmp_path / "bomb.spz").write_bytes(header + sizes + b"".join(packed))
+    with pytest.raises(InputError, match="a stream unpacks to 10,000,000 bytes"):
+        read_gaussians(tmp_path / "bomb.spz")
     stream = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2, 0, 12, 0, 0) + bytes(10**7))
     (tmp_path / "bomb.spz").write_bytes(stream)
     assert (

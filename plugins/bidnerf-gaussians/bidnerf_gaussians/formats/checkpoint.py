@@ -41,16 +41,21 @@ def read(path: Path) -> Gaussians:
     missing = [name for name in ("means", "log_scales", "quaternions", "logits", "sh0") if name not in found]
     if missing:
         raise InputError(f"{path}: has no {', '.join(missing)}, expected {EXPECTED}")
-    parts = {name: value.float() for name, value in found.items()}
-    count = len(parts["means"])
-    sh0 = parts["sh0"].reshape(count, 1, 3)
-    harmonics = torch.cat([sh0, parts["shN"].reshape(count, -1, 3)], dim=1) if "shN" in parts else sh0
+    needed, size = sum(value.numel() * value.element_size() for value in found.values()), path.stat().st_size
+    if needed > size:  # a stored number may stand for any count of them
+        raise InputError(
+            f"{path}: its tensors have {needed:,} bytes, for which its {size:,} bytes are too few"
+        )
     try:
+        parts = {name: value.float() for name, value in found.items()}
+        count = len(parts["means"])
+        sh0 = parts["sh0"].reshape(count, 1, 3)
+        harmonics = torch.cat([sh0, parts["shN"].reshape(count, -1, 3)], dim=1) if "shN" in parts else sh0
         return Gaussians(
             parts["means"].reshape(count, 3), parts["log_scales"].reshape(count, 3),
             parts["quaternions"].reshape(count, 4), parts["logits"].reshape(count), harmonics,
         )  # fmt: skip
-    except RuntimeError as error:
+    except (RuntimeError, TypeError) as error:
         raise InputError(f"{path}: tensors of different counts ({error}), expected {EXPECTED}") from error
 
 

@@ -166,13 +166,23 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
         if degree and of_degree[0] not in names:
             break
         harmonics += [scene.accessor(names[name]) for name in of_degree]
-    opacity = scene.accessor(names[f"{EXTENSION}:OPACITY"])[:, 0]
+    position, scale, rotation, opacity = (
+        scene.accessor(names[name])
+        for name in (
+            "POSITION",
+            f"{EXTENSION}:SCALE",
+            f"{EXTENSION}:ROTATION",
+            f"{EXTENSION}:OPACITY",
+        )
+    )
+    shapes = [part.shape for part in (position, scale, rotation, opacity, *harmonics)]
+    count = len(position)
+    if shapes != [(count, 3), (count, 3), (count, 4), (count, 1), *[(count, 3)] * len(harmonics)]:
+        raise InputError(
+            f"{scene.path}: its attributes have the shapes {shapes}, expected one for each Gaussian"
+        )
     return gaussians_of(
-        scene.accessor(names["POSITION"]),
-        scene.accessor(names[f"{EXTENSION}:SCALE"]),
-        np.roll(scene.accessor(names[f"{EXTENSION}:ROTATION"]), 1, axis=-1),
-        logit(opacity),
-        np.stack(harmonics, axis=1),
+        position, scale, np.roll(rotation, 1, axis=-1), logit(opacity[:, 0]), np.stack(harmonics, axis=1)
     )
 
 

@@ -45,7 +45,7 @@ def read(path: Path) -> Gaussians:
         meta = parse_json(member(META), f"{path}: {META}", EXPECTED)
         try:
             return _decoded(meta, member, path)
-        except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, OSError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(
@@ -68,7 +68,7 @@ def _opened(path: Path) -> Iterator[Member]:
         return
     try:
         archive = zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError) as error:
+    except Exception as error:  # damaged archives raise errors of many types
         raise InputError(f"{path}: is no zip archive ({error}), expected {EXPECTED}") from error
     with archive:
 
@@ -81,7 +81,11 @@ def _opened(path: Path) -> Iterator[Member]:
                     )
                 with archive.open(name) as file:
                     return file.read(LARGEST_MEMBER)
-            except (KeyError, zipfile.BadZipFile, OSError) as error:
+            except InputError:
+                raise
+            except (
+                Exception
+            ) as error:  # of zipfile and of its decompressors; an encrypted member has another one
                 raise InputError(
                     f"{path}: has no readable {name} in it ({error}), expected {EXPECTED}"
                 ) from error

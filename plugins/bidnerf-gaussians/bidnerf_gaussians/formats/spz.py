@@ -32,7 +32,7 @@ FLIP = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 """From x right, y up, z back to x right, y down, z forward."""
 ORIGIN = torch.zeros(3)
 MOST_INFLATED = 1032
-"""Largest factor by which deflate can compress."""
+"""Largest factor by which deflate can compress. Zstandard can do more, but not with what Gaussians differ in."""
 
 
 def recognises(path: Path) -> bool:
@@ -113,6 +113,10 @@ def _streams(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, in
         raise InputError(
             f"{path}: has {number} streams, expected {len(wanted)} for {count:,} Gaussians of degree {degree}"
         )
+    if sum(sizes) > MOST_INFLATED * len(content):
+        raise InputError(
+            f"{path}: declares {count:,} Gaussians, more than its {len(content):,} bytes can hold"
+        )
     found = []
     for index, size in enumerate(wanted):
         packed, unpacked = struct.unpack_from("<QQ", content, place + 16 * index)
@@ -131,9 +135,14 @@ def _zstandard(content: bytes, size: int, path: Path) -> bytes:
         import zstandard
     except ImportError as error:
         raise InputError(
-            f"{path}: is of version 4, which needs the package zstandard: pip install 'bidnerf-gaussians[spz4]'"
+            f"{path}: is of version 4, which needs the package zstandard: pip install zstandard"
         ) from error
     try:
+        told = zstandard.get_frame_parameters(
+            content
+        ).content_size  # which the library trusts, whatever our limit
+        if told not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise InputError(f"{path}: a stream unpacks to {told:,} bytes, expected {size:,}")
         found = bytes(zstandard.ZstdDecompressor().decompress(content, max_output_size=size))
     except (zstandard.ZstdError, MemoryError) as error:
         raise InputError(f"{path}: is damaged ({error}), expected {EXPECTED}") from error
