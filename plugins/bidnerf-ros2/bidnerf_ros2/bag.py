@@ -132,6 +132,13 @@ def _messages(path: Path, names: tuple[str | None, ...]) -> Iterator[tuple[str, 
         raise InputError(f"{path}: the bag cannot be read ({type(error).__name__}: {error})") from error
 
 
+def _first(path: Path, topic: str) -> Any:
+    """Return the first message of a topic. Raises ``InputError`` where the bag only counts some."""
+    for _, _, message in _messages(path, (topic,)):
+        return message
+    raise InputError(f"{path}: has no message of {topic}, though it counts some; is it truncated?")
+
+
 def _topics(path: Path) -> Topics:
     """Choose the topics of a bag."""
     counts, infos, span = dict[str, int](), set[str](), 0.0
@@ -147,7 +154,7 @@ def _topics(path: Path) -> Topics:
         raise InputError(
             f"{path}: not a bag that can be read ({error}), expected {BagReader().expected}"
         ) from error
-    first = {topic: next(_messages(path, (topic,)))[2] for topic in (*counts, *infos)}
+    first = {topic: _first(path, topic) for topic in (*counts, *infos)}
     colour = [t for t in counts if not is_depth(first[t]) and _info_beside(t, infos) in infos]
     if not colour:
         listed = ", ".join(sorted({*counts, *infos})) or "none"

@@ -115,8 +115,7 @@ def _raster(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
         raise InputError(
             f"an image of {width}x{height} in rows of {step} bytes has {len(data)} bytes, expected {step * height}"
         )
-    data = np.concatenate([data, np.zeros(max(0, step * height - len(data)), np.uint8)])
-    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :row])
+    rows = np.ascontiguousarray(np.ndarray((height, row), np.uint8, data, 0, (step, 1)))
     stored = kind.newbyteorder(">" if message.is_bigendian else "<")
     return rows.view(stored).astype(kind).reshape(height, width, channels)
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
+
 from bidnerf_core import InputError, Localizer, load_map
 from bidnerf_ros2.bridge import ERROR, Bridge, Estimate, diagnosis, fill_pose
 from bidnerf_ros2.conversions import fill, transform_of
@@ -130,11 +132,9 @@ def make_node() -> Any:
             fill_pose(message.pose, found, T_camera_base)
             self.poses.publish(message)
             if not self.bridge.has_odometry:
-                pose = (
-                    found.T_world_camera.to("cpu")
-                    if T_camera_base is None
-                    else found.T_world_camera @ T_camera_base
-                )
+                pose = found.T_world_camera.to("cpu", torch.float64)
+                if T_camera_base is not None:
+                    pose = pose @ T_camera_base
                 self.broadcast(base or self.optical_frame, pose, answer.stamp)
 
         def broadcast(self, child: str, pose: Any, stamp: Any) -> None:
