@@ -299,6 +299,9 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
         assert reply.status < 500, (path, query, bytes(body), reply.body)
         assert reply.json["detail"] if reply.status != 200 else reply.json["outcome"]
         found.add(reply.status)
+    for length in ("one", "\xb2", "9" * 5000, ""):  # other servers may let them through
+        headers = {"content-length": length}
+        assert service.run(service.ask("POST", "/localize", [b"x"], headers)).status == 400
     assert found >= {400, 404, 422}
     assert service.pool.metrics.restarts["died"] == 0
 
@@ -571,6 +574,40 @@ def test_a_body_without_end_and_a_client_without_haste_are_cut_off(
     client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
     assert client.localize(place.photo, focal=32, start=json.loads(place.start))["method"] == "bid"
     quickly(lambda: client.ask("/health")["waiting"] == 0)
+
+
+def test_a_connection_that_only_dribbles_after_an_answer_is_closed(
+    address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_core.service.server.IDLE_SECONDS", 0.1)
+    monkeypatch.setattr("bidnerf_core.service.server.HEAD_SECONDS", 0.2)
+    with socket.create_connection(address, timeout=20) as connection:
+        connection.sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+        began = time.monotonic()
+        with contextlib.suppress(ConnectionError):
+            while time.monotonic() - began < 10:
+                connection.sendall(b"G")
+                connection.settimeout(0.1)
+                with contextlib.suppress(TimeoutError):
+                    if not connection.recv(1):
+                        break
+        assert time.monotonic() - began < 5
+
+
+def test_a_token_that_is_given_is_not_shown(
+    tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def announced(maps: Any, *, token: str | None, ready: Any, **more: Any) -> None:
+        ready("http://localhost:1", token or "made-up-0123456789")
+
+    monkeypatch.setattr("bidnerf_core.service.server.serve", announced)
+    (tmp_path / "token").write_text("secret-0123456789")
+    given = bidnerf("serve", tmp_path, "--token-file", tmp_path / "token")
+    assert "Bearer" in given.out + given.err
+    assert "secret" not in given.out + given.err
+    made_up = bidnerf("serve", tmp_path)
+    assert "Bearer made-up-0123456789" in made_up.out + made_up.err
 
 
 def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidnerf: Run) -> None:

@@ -61,9 +61,11 @@ def serve(
     require("--port", port, 0, 65535)
     if not maps:
         raise UsageError("no MAP, expected folders of maps")
+    given = _token(token_file)
     server.serve(
-        _named(maps), host=host, port=port, token=_token(token_file), config=config, method=method, device=device,
-        settings=None if settings is None else read_record(settings).values, ready=_announce,
+        _named(maps), host=host, port=port, token=given, config=config, method=method, device=device,
+        settings=None if settings is None else read_record(settings).values,
+        ready=lambda address, token: _announce(address, "TOKEN, the one that was given" if given else token),
     )  # fmt: skip
 
 
@@ -93,6 +95,7 @@ def _token(file: Path | None) -> str | None:
 
 
 def _announce(address: str, token: str | None) -> None:
+    """Say where the service is; ``token``: one that was made up, since one that was given belongs in no log."""
     say(f"serving at {address}; Ctrl-C ends")
     if token is not None:
         say(f"clients need the header  Authorization: Bearer {token}")

@@ -210,7 +210,6 @@ class Pool:
                 worker = self._workers[number] = await self._forked()
             job = await self._next(worker)
             if job is not None and not await self._answered(job, worker):
-                worker.stop()
                 worker = None
 
     async def _next(self, worker: WorkerProcess) -> Job | None:
@@ -228,7 +227,7 @@ class Pool:
         return None
 
     async def _answered(self, job: Job, worker: WorkerProcess) -> bool:
-        """Let a worker answer; return whether it may go on. A request whose worker died waits for another one."""
+        """Let a worker answer; return whether it goes on or was stopped. A request whose worker died waits for another one."""
         job.attempts += 1
         if job.waited is None:
             job.waited = time.perf_counter() - job.began
@@ -245,6 +244,7 @@ class Pool:
                 asking.cancel()
             with contextlib.suppress(BaseException):
                 await asking
+        worker.stop()  # before its files are removed, or it would write others
         self._forget_files(job)
         if job.answer.done():  # timed out, or its client has left
             late = not job.answer.cancelled()

@@ -87,8 +87,10 @@ async def body_of(request: Request, config: ServiceConfig) -> bytes:
     close = {"Connection": "close"}  # the rest of the body is not read
     announced = request.headers.get("content-length", "0")
     most = f"expected at most {config.max_megabytes:g} MiB"
-    if not announced.isdigit() or int(announced) > config.max_bytes:
-        raise Refused(413, f"the request has {int(announced or 0) / MEBIBYTE:,.0f} MiB, {most}", close)
+    if not (announced.isascii() and announced.isdigit() and len(announced) <= 20):
+        raise Refused(400, f"Content-Length is {_short(announced)}, expected a number", close)
+    if int(announced) > config.max_bytes:
+        raise Refused(413, f"the request has {int(announced) / MEBIBYTE:,.0f} MiB, {most}", close)
     content = bytearray()
     try:
         async with asyncio.timeout(config.upload_timeout):

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 PORT = 8000
 LOOPBACK = "127.0.0.1"
 HEAD_SECONDS = 10.0
-"""Time in which the head of a connection's first request must have arrived."""
+"""Time in which the head of a request must have arrived, since the connection was made or may be idle no longer."""
+IDLE_SECONDS = 15
+"""Time for which a connection may be idle between two requests."""
 CONNECTIONS = 256
 """Open connections; a further one is closed at once."""
 GRACE = 10
@@ -97,7 +99,7 @@ def serve(
     with _bound(host or LOOPBACK, port) as bound:
         options = uvicorn.Config(
             app, http=_patient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
-            server_header=False, proxy_headers=False, timeout_keep_alive=15, timeout_graceful_shutdown=GRACE, backlog=CONNECTIONS,
+            server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=GRACE, backlog=CONNECTIONS,
         )  # fmt: skip
         asyncio.run(
             _run(app, uvicorn.Server(options), bound, lambda address: ready and ready(address, token), stop)
@@ -193,11 +195,17 @@ def _patient() -> type[Any]:
             if len(self.connections) > CONNECTIONS:
                 transport.close()
                 return
-            self.loop.call_later(HEAD_SECONDS, self._close_if_silent)
+            self.loop.call_later(HEAD_SECONDS, self._close_if_silent, None)
 
-        def _close_if_silent(self) -> None:
+        def on_response_complete(self) -> None:
+            answered = self.cycle  # before the next request, which may have come already
+            super().on_response_complete()
+            self.loop.call_later(IDLE_SECONDS + HEAD_SECONDS, self._close_if_silent, answered)
+
+        def _close_if_silent(self, last: Any) -> None:
+            """Close the connection if no request has come since ``last``, whatever bytes did."""
             asked: Any = self.cycle  # None until the first request
-            if asked is None:
+            if asked is last:
                 self.transport.close()
 
     return Limited
