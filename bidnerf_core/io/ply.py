@@ -116,6 +116,9 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
             raise InputError(f"{path}: a line {line[:60]!r} in its header, expected {expected}") from error
     if not order:
         raise InputError(f"{path}: its header names no format, expected {expected}")
+    for element in elements:  # any number of them would fit into no bytes
+        if element.count and not element.properties and not element.has_lists:
+            raise InputError(f"{path}: its elements {element.name!r} have no properties, expected {expected}")
     file.seek(stop + 1)
     return PlyHeader(order, tuple(elements), stop + 1)
 

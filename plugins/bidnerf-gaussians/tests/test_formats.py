@@ -342,6 +342,8 @@ def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -
     huge = json.loads(parts["meta.json"]) | {"count": 10**12}
     cases: dict[str, tuple[bytes, str]] = {
         "huge.ply": (inria(10**12), "are too few"),
+        "lists.ply": (inria(1).replace(b"property float x", b"property list uchar int l\nproperty float x"), "lists of numbers"),
+        "bare.ply": (inria(1).replace(b"element vertex", b"element bare 1000000000000\nelement vertex"), "no file of Gaussians"),
         "cut.ply": (inria(3, body=bytes(100)), "are too few"),
         "degree.ply": (inria(1, 10, bytes(24 * 4)), "properties f_rest_N"),
         "chunks.ply": (compressed_ply((0, 2)), "too few chunks"),

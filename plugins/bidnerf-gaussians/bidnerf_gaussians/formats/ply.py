@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def _header(path: Path) -> PlyHeader | None:
 
 def read(path: Path) -> Gaussians:
     """Return the Gaussians of a PLY: logarithms of the scales, logits of the opacities, quaternions w, x, y, z."""
-    vertices = read_ply(path, EXPECTED)["vertex"]
+    vertices = _vertices(read_ply(path, EXPECTED), path)
     names = vertices.dtype.names or ()
     missing = [name for name in NEEDED if name not in names]
     if missing:
@@ -63,6 +64,12 @@ def read(path: Path) -> Gaussians:
         _columns(vertices, MEANS), _columns(vertices, SCALES), _columns(vertices, TURNS),
         vertices["opacity"], harmonics,
     )  # fmt: skip
+
+
+def _vertices(elements: Mapping[str, np.ndarray], path: Path) -> np.ndarray:
+    if "vertex" not in elements:
+        raise InputError(f"{path}: lists of numbers in or before its vertices, expected {EXPECTED}")
+    return elements["vertex"]
 
 
 def _rest(rows: np.ndarray, count: int, path: Path) -> np.ndarray:
@@ -100,7 +107,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
 def read_compressed(path: Path) -> Gaussians:
     """Return the Gaussians of a compressed PLY: numbers of a few bits, within the range of their chunk."""
     elements = read_ply(path, EXPECTED)
-    vertices, chunks = elements["vertex"], elements.get("chunk")
+    vertices, chunks = _vertices(elements, path), elements.get("chunk")
     names = vertices.dtype.names or ()
     missing = [name for name in PACKED if name not in names]
     if missing or chunks is None or len(chunks) * CHUNK < len(vertices):
