@@ -71,7 +71,8 @@ def test_a_file_becomes_a_map(file: Path, tmp_path: Path, caplog: pytest.LogCapt
     with caplog.at_level(logging.INFO, "bidnerf"):
         scene = import_map(file, tmp_path / "MAP", bake=False)
     assert "3 things" in caplog.text
-    assert "taken for metres" in caplog.text
+    assert "its unit is not stored" in caplog.text
+    assert scene.unit == "units"
     assert f"{VIEWS} viewpoints" in caplog.text
     again = load_map(tmp_path / "MAP")
     assert again.info.complete

@@ -22,6 +22,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import draw, uniform
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.mapping import BakeConfig, find_features, surface_of_points
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
@@ -93,12 +94,16 @@ def import_map(
         found = chosen.read(path, settings, placement)
         for line in found.found:
             log.info(f"{path}: {line}")
-        _tell_extent(found, str(path), scale != 1)
-        views, background = _read(photos, split, progress, cancel)
-        bounds = found.bounds if background is None else replace(found.bounds, background=background)
+        read = None if photos is None else read_views(photos, split, progress=progress, cancel=cancel)
+        views: list[View] = [] if read is None else read.views
+        unit: LengthUnit = "metres" if scale != 1 else "units" if read is None else read.unit
+        _tell_extent(found, str(path), unit)
+        bounds = found.bounds
+        if read is not None and read.source and any(view.frame.alpha is not None for view in views):
+            bounds = replace(bounds, background=read.background)  # over which its images were composited
         info = MapInfo(
             found.backend, to_plain(found.config, "config"), bounds, found.steps, True, path.name,
-            landmark_features=features,
+            landmark_features=features, unit=unit, gravity_up=None if read is None else read.gravity_up,
         )  # fmt: skip
         field = frozen_field(info, found.tensors, None)
         scene = Map(info, field).to(there)
@@ -110,17 +115,6 @@ def import_map(
             scene = replace(scene, info=save_map(place, scene.info, state), folder=place)
         settings_of_bake = bake if isinstance(bake, BakeConfig) else USUAL_BAKE
         return _baked(scene, found, views, settings_of_bake, progress, cancel) if bake else scene
-
-
-def _read(
-    photos: Images | None, split: str, progress: ProgressCallback | None, cancel: Cancel | None
-) -> tuple[list[View], tuple[float, float, float] | None]:
-    """Return the photos, and the background over which those of a dataset with an alpha channel were composited."""
-    if photos is None:
-        return [], None
-    read = read_views(photos, split, progress=progress, cancel=cancel)
-    has_alpha = any(view.frame.alpha is not None for view in read.views)
-    return read.views, read.background if has_alpha and read.source else None
 
 
 def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], where: str) -> Any:
@@ -137,7 +131,7 @@ def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], 
     return chosen
 
 
-def _tell_extent(found: ImportedField, where: str, is_scaled: bool) -> None:
+def _tell_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     """Say how large the scene is, and warn where its lengths are hardly metres."""
     if found.points is None or not len(found.points):
         size = found.bounds.size
@@ -148,16 +142,12 @@ def _tell_extent(found: ImportedField, where: str, is_scaled: bool) -> None:
     extent = " x ".join(f"{side:.3g}" for side in size)
     log.info(
         f"{where}: extent {extent}"
-        + (
-            " after scaling"
-            if is_scaled
-            else "; its unit is not stored, so it is taken for metres (--scale changes it)"
-        )
+        + (" metres" if unit == "metres" else "; its unit is not stored (--scale says how many metres it is)")
     )
     if not SMALLEST <= max(size) <= LARGEST:
-        unit = "millimetres" if max(size) > LARGEST else "kilometres or a unit of its own"
+        other = "millimetres" if max(size) > LARGEST else "kilometres or a unit of its own"
         warnings.warn(
-            f"{where}: {extent} would be {'very large' if max(size) > LARGEST else 'tiny'} in metres; are its lengths {unit}?"
+            f"{where}: {extent} would be {'very large' if max(size) > LARGEST else 'tiny'} in metres; are its lengths {other}?"
             " --scale changes them",
             InputWarning,
             stacklevel=3,
