@@ -45,7 +45,7 @@ from commands import Run
 
 QUICK = {"max_steps": 3, "rays": 64}
 CONFIG = ServiceConfig(
-    workers=1, queue=3, timeout=30.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0
+    workers=1, queue=3, timeout=120.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0
 )
 FORM = "multipart/form-data; boundary=xyz"
 
@@ -374,7 +374,7 @@ def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Servi
         quickly(lambda: service.pool._taken == 1)
         nursery.kill()
         os.kill(process, signal.SIGKILL)
-        assert waiting.result(60).status == 200
+        assert waiting.result(150).status == 200
 
 
 def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -> None:

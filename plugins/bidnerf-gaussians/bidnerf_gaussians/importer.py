@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import StoredCamera
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.similarity import Similarity
 from bidnerf_core.io.files import read_file
@@ -140,6 +141,14 @@ def _cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ..
     file = next((folder / "cameras.json" for folder in folders if (folder / "cameras.json").is_file()), None)
     if file is None:
         return ()
+    try:
+        return _inria_cameras(file, placement)
+    except InputError as error:  # it may be another program's, with no word of these Gaussians
+        warnings.warn(f"{error}; left aside", InputWarning, stacklevel=2)
+        return ()
+
+
+def _inria_cameras(file: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
     record = parse_record(str(file), b'{"cameras":' + read_file(file, "cameras.json") + b"}")
     cameras = []
     for entry in record.items("cameras") or []:

@@ -15,6 +15,7 @@ import torch
 from bidnerf_core import import_map, load_map
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import StoredCamera
+from bidnerf_core.errors import InputWarning
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.geometry.se3 import SE3
@@ -72,6 +73,10 @@ def test_the_cameras_beside_a_file_are_its_viewpoints(file: Path) -> None:
     (camera,) = import_map(file, scale=2.0, bake=False).info.cameras
     assert camera.intrinsics == Intrinsics(50.0, 51.0, 32.0, 24.0, 64, 48)
     assert camera.pose.translation.tolist() == [2, 4, 6]
+
+    (file.parent / "cameras.json").write_text('{"another": "program\'s"}')
+    with pytest.warns(InputWarning, match="left aside"):
+        assert import_map(file, bake=False).info.cameras
 
 
 def test_gaussians_are_as_wide_as_images_show_them(some: Some) -> None:

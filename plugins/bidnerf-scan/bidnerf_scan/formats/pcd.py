@@ -14,6 +14,8 @@ from bidnerf_core.io.files import read_file
 from bidnerf_scan.scan import Scan
 
 EXPECTED = "a PCD file"
+LARGEST = 4 * 2**30
+"""Bytes of a file that is read."""
 LARGEST_HEADER = 64 * 1024
 SMALLEST_NUMBER = 2
 """Bytes of a number in a text file, with the blank behind it."""
@@ -36,7 +38,7 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path) -> Scan:
     """Return the points of a PCD file. The pose of its sensor (VIEWPOINT) is left out, since points are in the world."""
-    data = read_file(path, EXPECTED)
+    data = read_file(path, EXPECTED, LARGEST)
     header = _header(path, data)
     rows = _rows(path, header, memoryview(data)[header.length :])
     names = header.kind.names or ()
