@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -76,11 +76,11 @@ class Lens(ABC):
         return self.orientation.upright_size(self.stored_width, self.stored_height)[1]
 
     @abstractmethod
-    def resized(self, width: int, height: int) -> Self:
+    def resized(self, width: int, height: int) -> Lens:
         """Return the lens of the same upright image resampled to another size."""
 
     @abstractmethod
-    def upright(self, orientation: Orientation) -> Self:
+    def upright(self, orientation: Orientation) -> Lens:
         """Return the lens of the upright image; this one is of the image as it is stored."""
 
     @property

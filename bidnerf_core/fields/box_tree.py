@@ -28,7 +28,7 @@ MOST_PAIRS = 2**22
 KEPT_NODES = 128
 """Nodes on each level that a ray may meet where their number must be known beforehand; the nearest ones are kept."""
 
-Boxes = Sequence[Float[Tensor, "6 m 8"]]
+Boxes = Sequence[Float[Tensor, "6 _ 8"]]
 """The boxes of the children of each node, the lowest level (whose children are pieces) first."""
 
 
@@ -42,7 +42,7 @@ def level_sizes(count: int) -> list[int]:
 
 def tree_of(
     centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
-) -> tuple[Int[Tensor, "n"], list[Float[Tensor, "6 m 8"]]]:
+) -> tuple[Int[Tensor, "n"], list[Float[Tensor, "6 _ 8"]]]:
     """Return the order of the pieces, and the boxes of all levels. What is not ``seen`` is in an empty box."""
     order = torch.argsort(_morton(centres, seen), stable=True)
     centres, halves, seen = centres[order], halves[order], seen[order]

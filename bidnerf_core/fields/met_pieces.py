@@ -110,7 +110,7 @@ def _is_hit(found: Meeting, near: Float[Tensor, "p"], far: Float[Tensor, "p"]) -
 
 def _in_order(
     key: Float[Tensor, "r s"], alpha: Float[Tensor, "r s"], index: Int[Tensor, "r s"]
-) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+) -> tuple[Int[Tensor, "r k"], Bool[Tensor, "r k"]]:
     """Return the indices in order of ``key``, and which of them count: those that are reached by any light."""
     key, order = key.sort(dim=1, stable=True)
     alpha, index = alpha.gather(1, order), index.gather(1, order)

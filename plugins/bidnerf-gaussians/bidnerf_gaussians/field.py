@@ -72,7 +72,7 @@ class GaussiansField(nn.Module):
         self.refit()
 
     @property
-    def boxes(self) -> list[Float[Tensor, "6 m 8"]]:
+    def boxes(self) -> list[Float[Tensor, "6 _ 8"]]:
         """The boxes of the tree, the lowest level first, see ``index``."""
         return [getattr(self, f"boxes_{number}") for number in range(len(level_sizes(len(self.means))))]
 
