@@ -264,7 +264,7 @@ def remarks_of(folder: Path) -> list[str]:
 
 
 def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
-    """Of ten images six are there, and the last row of the ground truth is cut off."""
+    """Six of ten images are there, and the last row of the ground truth is cut off."""
     expected = [timed.truth for timed in open_sequence(folder)]
     for kind, kept in (("rgb", 6), ("depth", 5)):
         for file in sorted((folder / kind).iterdir())[kept:]:

@@ -22,7 +22,7 @@ TOP = 8
 MORTON_BITS = 16
 """Bits of each coordinate on the Morton curve."""
 LEAST_COMPONENT = 1e-9
-"""Of a direction, along each axis; smaller ones are replaced by it."""
+"""Least size of a direction's component along an axis; smaller ones are replaced by it, so that slopes stay finite."""
 MOST_PAIRS = 2**22
 """Largest number of pairs of a ray and a box that are tested at once: some 300 MB."""
 KEPT_NODES = 128

@@ -33,7 +33,7 @@ from bidnerf_core.results.answers import Answer
 from bidnerf_core.service.upload import Upload
 
 R_CAMERA_BODY = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
-"""From x forward, y left, z up to OpenCV's axes."""
+"""Rotation from body axes (x forward, y left, z up) to OpenCV's camera axes."""
 RAW_CHANNELS = {"RGBA32": 4, "RGB24": 3, "GRAY8": 1}
 """Formats without a header, and their bytes in a pixel."""
 NOT_LOCALIZED = 422

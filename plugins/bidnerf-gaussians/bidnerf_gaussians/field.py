@@ -19,7 +19,7 @@ from bidnerf_gaussians.quaternions import matrices, turned_back
 from bidnerf_gaussians.spherical_harmonics import colours
 
 LARGEST_ALPHA = 0.999
-"""Of one Gaussian along a ray, as in gsplat."""
+"""Largest opacity of one Gaussian along a ray, as in gsplat."""
 LEAST_EXTENT = 2.0
 """Standard deviations to which at least a Gaussian's box extends, so that ``query`` finds nearly all of its density."""
 POINTS_AT_ONCE = 2**15

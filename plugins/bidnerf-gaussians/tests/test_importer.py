@@ -80,7 +80,7 @@ def test_the_cameras_beside_a_file_are_its_viewpoints(file: Path) -> None:
 
 
 def test_gaussians_are_as_wide_as_images_show_them(some: Some) -> None:
-    """As the first paper's code does: 0.3 square pixels are added to what a camera sees."""
+    """The first paper's code adds 0.3 square pixels to what a camera sees."""
     g = some(5)
     wide = with_dilation(g, 0.01, ())
     assert with_dilation(g, 0.0) is g

@@ -199,7 +199,7 @@ def with_count(glb: bytes, count: int, zeros: bool = False) -> bytes:
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
-    """With one sentence, which names the file, and before memory is asked for."""
+    """The refusal is one sentence that names the file, and comes before memory is asked for."""
     for name, content in broken().items():
         path = tmp_path / name
         path.write_bytes(content)

@@ -21,7 +21,7 @@ NAMES = {
 }  # fmt: skip
 """What the parameters of both are called here."""
 PREFIX = "_model.gauss_params."
-"""Of the parameters of splatfacto."""
+"""Prefix of the names of splatfacto's parameters."""
 ZIP = b"PK\x03\x04"
 
 

@@ -29,7 +29,7 @@ COLOUR_SCALE = 0.15
 WRITTEN = 3
 """Version that is written: the newest one that the standard library can compress."""
 FLIP = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
-"""From x right, y up, z back to x right, y down, z forward."""
+"""Rotation from the axes of the file (x right, y up, z back) to x right, y down, z forward."""
 ORIGIN = torch.zeros(3)
 MOST_INFLATED = 1032
 """Largest factor by which deflate can compress. Zstandard can do more, but not with what Gaussians differ in."""
