@@ -14,12 +14,14 @@ from torch.nn.functional import pad
 
 from bidnerf_core.devices import may_wait
 from bidnerf_core.fields.box_tree import Boxes, Lines, TooMany, met, nearest_met
-from bidnerf_core.fields.contract import Rays
+from bidnerf_core.fields.contract import FieldValues, Rays
 
 STOPPED = 1e-4
 """Share of a ray's light that still shines through where nothing behind is looked at, as in the code of 3D Gaussian splatting."""
 RAYS_AT_ONCE = 384
 """Rays that are looked up together: so few that what they meet stays in the processor's cache."""
+POINTS_AT_ONCE = 2**15
+"""Points that are looked up together."""
 KEPT_HITS = 64
 """Pieces along a ray where their number must be known beforehand; the nearest ones are kept."""
 
@@ -141,6 +143,44 @@ def pieces_about(
     index, valid = nearest_met(lines, boxes, order)
     point = torch.arange(len(index), device=index.device)[:, None].expand(index.shape)
     return point.reshape(-1), index.reshape(-1), valid.reshape(-1)
+
+
+AboutPoints: TypeAlias = Callable[
+    [Float[Tensor, "p 3"], Float[Tensor, "p 3"]],
+    tuple[Int[Tensor, "q"], Float[Tensor, "q"], Float[Tensor, "q 3"]],
+]
+"""A function from positions and directions to pairs of a point and a piece: the point's number, the density (1/metre), the colour.
+
+It may raise ``TooMany``, as ``pieces_about`` does.
+"""
+
+
+def values_of_pieces(
+    positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], about: AboutPoints
+) -> FieldValues:
+    """Return the sum of the pieces' densities at points, and their mean colour by density."""
+    shape = positions.shape[:-1]
+    places, ways = (part.reshape(-1, 3).split(POINTS_AT_ONCE) for part in (positions, directions))
+    found = _joined([_values(place, way, about) for place, way in zip(places, ways, strict=True)])
+    return FieldValues(found.density.reshape(shape), found.rgb.reshape(*shape, 3))
+
+
+def _values(
+    positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], about: AboutPoints
+) -> FieldValues:
+    try:
+        point, density, rgb = about(positions, directions)
+    except TooMany:
+        halves = zip(positions.chunk(2), directions.chunk(2), strict=True)
+        return _joined([_values(place, way, about) for place, way in halves])
+    count = len(positions)
+    total = density.new_zeros(count).index_add(0, point, density)
+    colour = rgb.new_zeros((count, 3)).index_add(0, point, density[:, None] * rgb)
+    return FieldValues(total, (colour / total.clamp(min=1e-20)[:, None]).clamp(0, 1))
+
+
+def _joined(parts: list[FieldValues]) -> FieldValues:
+    return FieldValues(torch.cat([part.density for part in parts]), torch.cat([part.rgb for part in parts]))
 
 
 def listed(

@@ -10,9 +10,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.fields.box_tree import TooMany, level_sizes, tree_of
+from bidnerf_core.fields.box_tree import level_sizes, tree_of
 from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds
-from bidnerf_core.fields.met_pieces import Meeting, flattened, listed, met_pieces, pieces_about
+from bidnerf_core.fields.met_pieces import (
+    Meeting,
+    flattened,
+    listed,
+    met_pieces,
+    pieces_about,
+    values_of_pieces,
+)
 from bidnerf_core.settings import Range
 from bidnerf_gaussians.gaussians import COEFFICIENTS, LEAST_OPACITY, Gaussians
 from bidnerf_gaussians.quaternions import matrices, turned_back
@@ -22,7 +29,6 @@ LARGEST_ALPHA = 0.999
 """Largest opacity of one Gaussian along a ray, as in gsplat."""
 LEAST_EXTENT = 2.0
 """Standard deviations to which at least a Gaussian's box extends, so that ``query`` finds nearly all of its density."""
-POINTS_AT_ONCE = 2**15
 
 
 @dataclass(frozen=True)
@@ -141,25 +147,13 @@ class GaussiansField(nn.Module):
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return the density whose integral along ``directions`` gives the opacity of ``hits``, and the mean colour."""
-        shape = positions.shape[:-1]
-        parts = zip(
-            positions.reshape(-1, 3).split(POINTS_AT_ONCE),
-            directions.reshape(-1, 3).split(POINTS_AT_ONCE),
-            strict=True,
-        )
-        values = [self._values(*part) for part in parts]
-        density = torch.cat([value.density for value in values])
-        return FieldValues(
-            density.reshape(shape), torch.cat([value.rgb for value in values]).reshape(*shape, 3)
-        )
+        return values_of_pieces(positions, directions, self._about)
 
-    def _values(self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]) -> FieldValues:
-        try:
-            point, index, counts = pieces_about(positions, self.boxes, self.order)
-        except TooMany:
-            halves = zip(*(part.chunk(2) for part in (positions, directions)), strict=True)
-            found = [self._values(*half) for half in halves]
-            return FieldValues(torch.cat([f.density for f in found]), torch.cat([f.rgb for f in found]))
+    def _about(
+        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
+    ) -> tuple[Int[Tensor, "q"], Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+        """Return the pairs of a point and a piece about it, with density and colour."""
+        point, index, counts = pieces_about(positions, self.boxes, self.order)
         towards = directions.index_select(0, point)
         peaks = self._peaks(index, positions.index_select(0, point), towards)
         thickness = torch.where(counts & (peaks.alpha >= LEAST_OPACITY), -torch.log1p(-peaks.alpha), 0)
@@ -168,10 +162,7 @@ class GaussiansField(nn.Module):
         )
         density = thickness * profile
         rgb = colours(self.harmonics.index_select(0, index), towards)
-        count = len(positions)
-        total = density.new_zeros(count).index_add(0, point, density)
-        colour = rgb.new_zeros((count, 3)).index_add(0, point, density[:, None] * rgb)
-        return FieldValues(total, (colour / total.clamp(min=1e-20)[:, None]).clamp(0, 1))
+        return point, density, rgb
 
     def _peaks(
         self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]

@@ -10,9 +10,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.fields.box_tree import TooMany, level_sizes, tree_of
+from bidnerf_core.fields.box_tree import level_sizes, tree_of
 from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds
-from bidnerf_core.fields.met_pieces import Meeting, flattened, listed, met_pieces, pieces_about
+from bidnerf_core.fields.met_pieces import (
+    Meeting,
+    flattened,
+    listed,
+    met_pieces,
+    pieces_about,
+    values_of_pieces,
+)
 from bidnerf_core.settings import NotNegative, Range
 from bidnerf_scan.pieces import Pieces
 
@@ -23,7 +30,6 @@ ROUNDING = 2e-6
 """Error of a place on a ray in single precision, in units of its distance: triangles reach over their edges by it."""
 FLATTEST = 1e-6
 """Sine of the angle between a ray and a plane, below which they do not meet."""
-POINTS_AT_ONCE = 2**15
 THICKNESS = 0.005
 """Thickness of a surface for whoever samples rays, in units of the scene's side."""
 
@@ -164,26 +170,14 @@ class ScanField(nn.Module):
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return the density whose integral along ``directions`` gives the opacity of ``hits``, and the mean colour."""
-        shape = positions.shape[:-1]
-        parts = zip(
-            positions.reshape(-1, 3).split(POINTS_AT_ONCE),
-            directions.reshape(-1, 3).split(POINTS_AT_ONCE),
-            strict=True,
-        )
-        values = [self._values(*part) for part in parts]
-        density, rgb = (torch.cat([getattr(v, name) for v in values]) for name in ("density", "rgb"))
-        return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+        return values_of_pieces(positions, directions, self._about)
 
-    def _values(self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]) -> FieldValues:
-        try:
-            with torch.no_grad():
-                point, index, counts = pieces_about(
-                    positions, self.boxes, self.order, directions, self.thickness
-                )
-        except TooMany:
-            halves = zip(*(part.chunk(2) for part in (positions, directions)), strict=True)
-            found = [self._values(*half) for half in halves]
-            return FieldValues(torch.cat([f.density for f in found]), torch.cat([f.rgb for f in found]))
+    def _about(
+        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
+    ) -> tuple[Int[Tensor, "q"], Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+        """Return the pairs of a point and a piece about it, with density and colour."""
+        with torch.no_grad():
+            point, index, counts = pieces_about(positions, self.boxes, self.order, directions, self.thickness)
         crossed = self._crossings(index, positions.index_select(0, point), directions.index_select(0, point))
         near = (crossed.distance / self.thickness).square()
         counts = counts & (near < 1) & (crossed.alpha >= LEAST_ALPHA)
@@ -191,10 +185,7 @@ class ScanField(nn.Module):
         profile = (1 - torch.where(counts, near, 1)).square() * (15 / 16 / self.thickness)
         density = torch.where(counts, -torch.log1p(-crossed.alpha) * profile, 0)
         rgb = self._colours(index, crossed.u, crossed.v)
-        count = len(positions)
-        total = density.new_zeros(count).index_add(0, point, density)
-        colour = rgb.new_zeros((count, 3)).index_add(0, point, density[:, None] * rgb)
-        return FieldValues(total, (colour / total.clamp(min=1e-20)[:, None]).clamp(0, 1))
+        return point, density, rgb
 
     def _crossings(
         self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
