@@ -13,6 +13,7 @@ import tiny
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import levels
+from bidnerf_core.io.files import FileInUse, locked
 from bidnerf_core.maps.anchor import Anchor, load_anchor, save_anchor
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
@@ -103,6 +104,38 @@ def test_a_factor_is_a_positive_number(ground: Map, factor: float) -> None:
 def test_an_interrupted_training_is_not_scaled(ground: Map) -> None:
     with pytest.raises(InputError, match="cannot be scaled: its training stopped"):
         replace(ground, info=replace(ground.info, complete=False)).scaled(2)
+
+
+def test_saving_takes_the_anchor_along(tmp_path: Path) -> None:
+    anchor = Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5)
+    bn.train(tiny.views(3), out=tmp_path / "a", config=tiny.config(2), bake=False)
+    save_anchor(tmp_path / "a", anchor)
+    bn.load_map(tmp_path / "a").save(tmp_path / "b")
+    assert load_anchor(tmp_path / "b") == anchor
+    bn.load_map(tmp_path / "b").scaled(0.5).save(tmp_path / "b", overwrite=True)
+    assert load_anchor(tmp_path / "b") == replace(anchor, metres_per_unit=1.0)
+
+
+def test_a_map_that_is_being_changed_is_not_read(
+    bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What another process writes between reading and writing would be lost."""
+    bn.train(tiny.views(3), out=tmp_path / "map", config=tiny.config(2), bake=False)
+    refused = list[str]()
+
+    def load(folder: Path) -> Map:
+        with pytest.raises(FileInUse) as found, locked(folder):
+            pass
+        refused.append(str(found.value))
+        return bn.load_map(folder)
+
+    monkeypatch.setattr("bidnerf_core.cli.scale.load_map", load)
+    assert bidnerf("scale", tmp_path / "map", "--factor", "2")[0] == 0
+    monkeypatch.setattr("bidnerf_core.maps.extending.load_map", load)
+    bidnerf("extend", tmp_path / "map", tmp_path)
+    assert len(refused) == 2
+    nothing = bidnerf("scale", tmp_path / "none", "--factor", "2")
+    assert (nothing.status, "none" in nothing.err, (tmp_path / "none").exists()) == (1, True, False)
 
 
 def test_the_command(bidnerf: Run, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from bidnerf_core.errors import amount
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.extending import extend as extend_map
-from bidnerf_core.maps.map import load_map
 
 
 def run(arguments: list[str]) -> None:
@@ -55,7 +54,7 @@ def extend(
     before = len(load_info(map).cameras)
     with stopped_by_ctrl_c() as cancel, Display() as progress:
         scene = extend_map(
-            load_map(map),
+            map,
             new,
             data,
             split=split,

@@ -10,9 +10,10 @@ import tyro
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import MapFolder, option, parse
 from bidnerf_core.cli.output import say, show
-from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.maps.anchor import load_anchor, save_anchor, scaled_anchor
-from bidnerf_core.maps.map import load_map
+from bidnerf_core.errors import UsageError
+from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps.files import map_folder
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scaling import factor_of_distance, factor_of_poses
 from bidnerf_core.results.pose_files import read_poses
 
@@ -54,28 +55,31 @@ def scale(
     """
     if out is not None:
         check_folder(out, (map,))
-    scene = load_map(map)
-    if factor is not None:
-        found = factor
-    elif poses is not None:
+    load_info(map)  # raises where there is no map
+    place = out or map
+    with map_folder(
+        place, overwrite=out is None
+    ):  # locked before it is read, so that nobody changes it meanwhile
+        scene = load_map(map)
+        found = _factor(scene, distance, poses, factor)
+        stored = scene.scaled(found).stored_in(place)
+    sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
+    show(f"{place}: all lengths multiplied by {found:.6g}; in metres now, the scene is a box of {sides}")
+
+
+def _factor(
+    scene: Map, distance: tuple[str, str, str] | None, poses: Path | None, factor: float | None
+) -> float:
+    if poses is not None:
         fit = factor_of_poses(scene, read_poses(poses))
         say(f"{poses}: {fit}")
-        found = fit.factor
-    elif distance is not None:
+        return fit.factor
+    if distance is not None:
         first, second, length = distance
-        found = factor_of_distance(scene, first, second, _metres(length))
-    else:
+        return factor_of_distance(scene, first, second, _metres(length))
+    if factor is None:
         raise UsageError("expected one of --distance, --poses and --factor")
-    if not found > 0:
-        raise InputError(f"the factor is {found:g}, expected a positive number")
-    anchor = load_anchor(map)
-    stored = scene.scaled(found).save(out or map, overwrite=out is None)
-    if anchor is not None:
-        save_anchor(out or map, scaled_anchor(anchor, found))
-    sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
-    show(
-        f"{stored.folder}: all lengths multiplied by {found:.6g}; in metres now, the scene is a box of {sides}"
-    )
+    return factor
 
 
 def _metres(word: str) -> float:

@@ -103,13 +103,16 @@ def extend(
     no landmarks to find them by, and where its folder is changed meanwhile; raises ``Cancelled`` once ``cancel`` returns True. The map
     in the folder then stays what it was, as it does if the process is killed.
     """
-    scene = scene if isinstance(scene, Map) else load_map(scene)
-    where = str(scene.folder or scene.info.data or "map in memory")
-    if scene.info.interruption is not None:
-        raise InputError(f"{where}: cannot be extended: {scene.info.interruption}")
     if steps is not None and (isinstance(steps, bool) or steps < 1):
         raise InputError(f"steps is {steps!r}, expected a positive whole number")
-    with contextlib.nullcontext() if scene.folder is None else locked(scene.folder):
+    folder = scene.folder if isinstance(scene, Map) else Path(scene)
+    if folder is not None:
+        load_info(folder)  # raises where there is no map
+    with contextlib.nullcontext() if folder is None else locked(folder):
+        scene = scene if isinstance(scene, Map) else load_map(scene)
+        where = str(scene.folder or scene.info.data or "map in memory")
+        if scene.info.interruption is not None:
+            raise InputError(f"{where}: cannot be extended: {scene.info.interruption}")
         frames = _frames(photos, scene, split)
         located = locate(scene, frames, where, progress, cancel)
         if not located.views:

@@ -27,6 +27,7 @@ from bidnerf_core.io.json import from_plain
 from bidnerf_core.io.tensors import read_tensors
 from bidnerf_core.localization.problem import on_device
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedViews, find_features
+from bidnerf_core.maps.anchor import Anchor, load_anchor, save_anchor
 from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
 from bidnerf_core.maps.files import (
@@ -65,6 +66,7 @@ class Map:
     landmarks: LandmarkMap | None = None  # None where none were built
     folder: Path | None = None  # None for a map in memory
     record: CaptureReport | None = None  # of the photos, for a map in memory; see ``capture``
+    anchor: Anchor | None = None  # where on the earth the map lies, if that is known
 
     def __repr__(self) -> str:
         """A line, in place of all tensors and cameras; ``describe`` has the facts."""
@@ -278,9 +280,15 @@ class Map:
     def save(self, folder: str | Path, overwrite: bool = False) -> Map:
         """Write the whole map into a folder, and return it with that folder.
 
-        Baked parts that were left unread (``load_map`` with ``baked=False``) are written as well, and returned. Raises ``InputError`` where the folder cannot be written, where it is not empty and ``overwrite`` is not set, and where
-        the field is not that of a backend.
+        Baked parts that were left unread (``load_map`` with ``baked=False``) are written as well, and returned. Raises ``InputError``
+        where the folder cannot be written, where it is not empty and ``overwrite`` is not set, and where the field is not that of a
+        backend.
         """
+        with map_folder(Path(folder), overwrite):
+            return self.stored_in(Path(folder))
+
+    def stored_in(self, folder: Path) -> Map:
+        """Write the whole map into a folder as ``save`` does, while the caller holds the lock of the folder."""
         field = trained_field(self.field)
         if not isinstance(field, nn.Module):
             found = type(field).__name__
@@ -288,10 +296,11 @@ class Map:
         state = TrainingState(self.info.step, field.state_dict(), {})
         if not self.info.complete and self.folder is not None:
             state = load_state(self.folder, self.info, self.field)
-        folder, whole = Path(folder), self.whole()
+        whole = self.whole()
         here = whole.to("cpu")
-        with map_folder(folder, overwrite):
-            info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture)
+        info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture)
+        if self.anchor is not None:
+            save_anchor(folder, self.anchor)
         return replace(whole, info=info, folder=folder, record=self.capture)
 
     def whole(self) -> Map:
@@ -319,7 +328,7 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     field = frozen_field(info, tensors, folder)
     if landmarks is not None:
         landmarks = _with_cameras(landmarks, info)
-    return Map(info, field, surface, landmarks, folder).to(device)
+    return Map(info, field, surface, landmarks, folder, anchor=load_anchor(folder)).to(device)
 
 
 def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:

@@ -22,6 +22,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.similarity import fit_similarity, spread
 from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
+from bidnerf_core.maps.anchor import scaled_anchor
 from bidnerf_core.maps.description import FieldFrame, MapInfo
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
         landmarks=None if whole.landmarks is None else scaled_landmarks(whole.landmarks, factor),
         folder=None,
         record=None if capture is None else scaled_capture(capture, factor),
+        anchor=None if whole.anchor is None else scaled_anchor(whole.anchor, factor),
     )
 
 

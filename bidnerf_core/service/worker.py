@@ -12,7 +12,6 @@ from typing import Any
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import Localizer, settings_of
-from bidnerf_core.maps.anchor import Anchor, load_anchor
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.answers import Answer, localize_each
 from bidnerf_core.service import geopose, wire
@@ -30,14 +29,13 @@ class Served:
 
     scene: Map
     localizer: Localizer
-    anchor: Anchor | None
 
     @property
     def described(self) -> dict[str, Any]:
         """What clients may know of the map."""
         facts = self.scene.describe().plain()
         return {key: facts[key] for key in TOLD} | {
-            "anchor": None if self.anchor is None else self.anchor.plain()
+            "anchor": None if self.scene.anchor is None else self.scene.anchor.plain()
         }
 
 
@@ -61,7 +59,7 @@ class Worker:
         for name, place in maps.items():
             scene = load_map(place)
             localizer = Localizer(scene, method.name, config, warm_up=method.device == "cpu")
-            served[name] = Served(scene, localizer, load_anchor(place))
+            served[name] = Served(scene, localizer)
         return Worker(served, max_pixels, folder, method.device)
 
     @property
@@ -84,9 +82,7 @@ class Worker:
         if self.device == "cpu":
             return self
         moved = {
-            name: Served(
-                s.scene, Localizer(s.scene, s.localizer.method, s.localizer.config, self.device), s.anchor
-            )
+            name: Served(s.scene, Localizer(s.scene, s.localizer.method, s.localizer.config, self.device))
             for name, s in self.maps.items()
         }
         return Worker(moved, self.max_pixels, self.folder, self.device)
@@ -99,7 +95,7 @@ class Worker:
             served = self.maps[request["map"]]
             if request["kind"] == "geopose":
                 return geopose.answer(
-                    served.anchor, request["body"], lambda query: self._localize(served, query, folder)
+                    served.scene.anchor, request["body"], lambda query: self._localize(served, query, folder)
                 )
             answer, plain = self._localize(served, Upload(request["parameters"], blocks), folder)
             return {"status": OK, "body": plain, "outcome": str(answer.found.outcome)}
