@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -79,6 +80,19 @@ def test_a_mask_of_the_stored_image_is_turned_with_it(tmp_path: Path) -> None:
     assert torch.equal(
         read_mask(upright, Raster(*SIZE, turned), SIZE[::-1]), torch.from_numpy(left(*SIZE[::-1]) == 0)
     )
+
+
+def test_a_mask_that_fits_both_orientations_is_turned_by_its_own_exif(tmp_path: Path) -> None:
+    mask, turned = left(8, 8), Orientation(*CODES[6])
+    raster, upright = Raster(8, 8, turned), turned.upright(torch.from_numpy(mask == 0))
+    plain, tagged = saved(tmp_path / "plain.png", mask), write_photo(tmp_path / "tagged.png", mask, 6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(read_mask(tagged, raster, (8, 8)), upright)
+        assert torch.equal(read_mask(tagged, Raster(8, 8), (8, 8)), upright)  # of a photo that is upright
+        read_mask(plain, Raster(8, 8), (8, 8))
+    with pytest.warns(InputWarning, match="as stored and as EXIF turns it"):
+        assert torch.equal(read_mask(plain, raster, (8, 8)), upright)
 
 
 def test_unusable_masks_are_refused(tmp_path: Path) -> None:

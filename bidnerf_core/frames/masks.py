@@ -6,6 +6,7 @@ everything brighter is used; masks of segmentation often mark what is to be left
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
@@ -16,9 +17,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from bidnerf_core.camera.exif import read_exif
 from bidnerf_core.camera.intrinsics import same_aspect
+from bidnerf_core.camera.orientation import UPRIGHT
 from bidnerf_core.camera.source import Raster
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.io.images import IMAGE_SUFFIXES, decode, resampled
 
 HiddenColour = Literal["black", "white"]
@@ -41,26 +44,40 @@ def read_mask(
 ) -> Bool[Tensor, "h w"]:
     """Return which pixels of an image of ``size`` (width, height) the mask in file ``path`` hides.
 
-    ``raster`` is that of the image file: a mask of the stored image is turned upright with it. A mask of another resolution is
-    resampled to the nearest of its pixels. Masks whose values are all small, such as 0 and 1, hide what is 0; otherwise the
+    ``raster`` is that of the image file. A mask with an EXIF orientation of its own is turned upright by that; one whose size
+    fits the stored image is turned upright with it. Where its size fits the upright image as well, as in square photos and
+    those that were taken upside down, an ``InputWarning`` says so. A mask of another resolution is resampled to the nearest of
+    its pixels. Masks whose values are all small, such as 0 and 1, hide what is 0; otherwise the
     bright half of the values is white. The alpha channel is the mask of files whose colours are uniform. Raises ``InputError``
     where the file is not an image, or one of another aspect ratio, and ``WhollyHidden`` where it hides everything.
     """
-    white = torch.from_numpy(_white(decode(path)))
-    given = (white.shape[1], white.shape[0])
-    if same_aspect(given, raster.size):
-        white = raster.orientation.upright(white)
-    elif not same_aspect(given, raster.upright_size):
-        expected = "x".join(map(str, raster.upright_size))
-        raise InputError(
-            f"{path}: mask is {given[0]}x{given[1]}, its image {expected}; expected the same aspect ratio"
-        )
+    white = _upright(torch.from_numpy(_white(decode(path))), path, raster)
     if tuple(white.shape) != size[::-1]:
         white = resampled(white, *size)
     hidden = white if hides == "white" else ~white
     if bool(hidden.all()):
         raise WhollyHidden(f"{path}: mask is all {hides}, which hides the whole image; {INVERTED}")
     return hidden
+
+
+def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[Tensor, "h w"]:
+    """Return the mask of the upright image of ``raster``. Raises ``InputError`` for another aspect ratio."""
+    own = read_exif(path).orientation
+    if own != UPRIGHT and same_aspect((turned := own.upright(stored)).shape[::-1], raster.upright_size):
+        return turned
+    given = (stored.shape[1], stored.shape[0])
+    is_upright = same_aspect(given, raster.upright_size)
+    if same_aspect(given, raster.size):
+        if is_upright and raster.orientation != UPRIGHT:
+            text = "mask fits the image as stored and as EXIF turns it; it is turned as the image is"
+            warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
+        return raster.orientation.upright(stored)
+    if is_upright:
+        return stored
+    expected = "x".join(map(str, raster.upright_size))
+    raise InputError(
+        f"{path}: mask is {given[0]}x{given[1]}, its image {expected}; expected the same aspect ratio"
+    )
 
 
 def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
