@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,8 +14,11 @@ import pytest
 import torch
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets import FrameSequence, TimedFrame, open_sequence
-from bidnerf_core.errors import InputError
+from bidnerf_core.datasets import FrameSequence, MaskFolder, TimedFrame, open_sequence
+from bidnerf_core.datasets.masked import masked_sequence
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.frames.frame import Frame
+from photo_files import write_photo
 
 WIDTH, HEIGHT, COUNT, RATE = 64, 48, 20, 25
 TURNS = {
@@ -204,3 +207,36 @@ def test_ten_bits_and_the_colour_spaces_of_hdr(codec: str, pixels: str, space: i
     left, right = frames[1].rgb[:, :20] * 255, frames[1].rgb[:, -20:] * 255
     assert 30 < float(left.mean()) < 50
     assert 190 < float(right.mean()) < 210
+
+
+def test_masks_of_a_video_are_named_after_its_frames(tmp_path: Path) -> None:
+    video, camera = tmp_path / "v.mp4", Intrinsics.from_focal(60, WIDTH, HEIGHT)
+    encode(video, range(3))
+    names = [timed.frame.name for timed in open_sequence(video, camera=camera)]
+    masks = {name: tmp_path / name for name in (names[1], "other")}
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[5:] = 255
+    for name, folder in masks.items():
+        write_photo(folder / f"{name}.png", mask)
+    hidden = [f.frame.hidden is not None for f in open_sequence(video, camera=camera, masks=masks[names[1]])]
+    assert hidden == [False, True, False]
+    with pytest.raises(InputError, match="no mask in it belongs to any of 3 images"):
+        open_sequence(video, camera=camera, masks=masks["other"])
+
+
+class Stream:
+    """A sequence that does not know the names of its frames beforehand."""
+
+    path = Path("stream")
+
+    def __len__(self) -> int:
+        return 1
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        yield TimedFrame(0.0, Frame("a", torch.zeros(8, 8, 3), Intrinsics.from_focal(9, 8, 8)))
+
+
+def test_a_stream_without_masks_says_so_at_its_end(tmp_path: Path) -> None:
+    write_photo(tmp_path / "b.png", np.eye(8, dtype=np.uint8) * 255)
+    with pytest.warns(InputWarning, match="no mask in it belongs to any of 1 image "):
+        assert len(list(masked_sequence(Stream(), MaskFolder(tmp_path)))) == 1

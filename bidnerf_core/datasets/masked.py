@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,6 +14,7 @@ from bidnerf_core.camera.lenses import CentralLens
 from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, ReadFrame, SequenceEntry, TimedFrame
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.masks import MaskFolder, WhollyHidden
 from bidnerf_core.geometry.se3 import SE3
@@ -86,10 +88,16 @@ def masked(frame: Frame, masks: MaskFolder) -> Frame:
 
 
 def masked_sequence(frames: FrameSequence, masks: MaskFolder) -> FrameSequence:
-    """Return a sequence whose frames hide what the masks of a folder hide. Raises ``InputError`` where no frame has a mask."""
+    """Return a sequence whose frames hide what the masks of a folder hide.
+
+    Raises ``InputError`` where no frame has a mask. Sequences that do not list their ``names``, such as streams, show that only
+    at their end, with an ``InputWarning``.
+    """
+    names: Sequence[str] | None = getattr(frames, "names", None)
+    if names is not None:
+        masks.require_any(names)
     if not isinstance(frames, FileSequence):
-        return _MaskedVideo(frames, masks)
-    masks.require_any(frames.names)
+        return _MaskedStream(frames, masks)
     return FileSequence(
         frames.path, [replace(entry, read=partial(_read, entry, masks)) for entry in frames.entries]
     )
@@ -101,8 +109,8 @@ def _read(entry: SequenceEntry, masks: MaskFolder) -> tuple[Frame, SE3 | None]:
     return masked(frame, masks), truth
 
 
-class _MaskedVideo:
-    """The frames of a video, whose masks are named after their numbers as the video's frames are."""
+class _MaskedStream:
+    """Frames that are decoded one after another, such as a video's, whose masks are named after them."""
 
     def __init__(self, frames: FrameSequence, masks: MaskFolder) -> None:
         self._frames, self._masks = frames, masks
@@ -115,5 +123,11 @@ class _MaskedVideo:
         return len(self._frames)
 
     def __iter__(self) -> Iterator[TimedFrame]:
+        names = list[str]()
         for timed in self._frames:
+            names.append(timed.frame.name)
             yield replace(timed, frame=masked(timed.frame, self._masks))
+        try:
+            self._masks.require_any(names)
+        except InputError as error:
+            warnings.warn(str(error), InputWarning, stacklevel=2)

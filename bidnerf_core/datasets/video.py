@@ -51,6 +51,11 @@ class Video:
     def __len__(self) -> int:
         return self.count
 
+    @property
+    def names(self) -> list[str]:
+        """The names of the frames, which are their numbers."""
+        return [_name(number) for number in range(self.count)]
+
     def __iter__(self) -> Iterator[TimedFrame]:
         for number, (time, pixels) in enumerate(pictures(self.path)):
             yield TimedFrame(time, self._frame(pixels, number))
@@ -59,9 +64,13 @@ class Video:
         rgb = as_floats(torch.from_numpy(pixels))  # at once, as a tracker reads them often
         found = self.camera.find(self.path, Raster(pixels.shape[1], pixels.shape[0]))
         return Frame.taken(
-            f"{number:06d}", found.camera, Images(rgb), camera_source=found.description,
+            _name(number), found.camera, Images(rgb), camera_source=found.description,
             focal_is_approximate=found.approximate,
         )  # fmt: skip
+
+
+def _name(number: int) -> str:
+    return f"{number:06d}"
 
 
 def pictures(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
