@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core.datasets import open_dataset, open_sequence
+from bidnerf_core.datasets import open_dataset, open_sequence, phone_scans
 from bidnerf_core.datasets.reader import READERS, find_reader
 from bidnerf_core.datasets.trajectories import read_trajectory
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames.frame import View
+from bidnerf_core.maps.views import read_views
 from bidnerf_core.results.pose_files import PosedImage, write_poses
 from bidnerf_core.testing import ReaderContract
 from bidnerf_core.testing.textured_field import training_views
@@ -78,6 +79,21 @@ def test_what_is_read_is_what_was_written(layout: tuple[str, Path], written: lis
     if has_times:
         gaps = [b - a for a, b in pairwise(times)]  # type: ignore[operator]
         assert gaps == pytest.approx([PERIOD] * (COUNT - 1), abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["record3d", "polycam", "stray-scanner"])
+def test_photos_of_phone_apps_have_the_size_that_is_asked_for(
+    kind: str, written: list[View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their usual size is small, and a larger one is had for the asking."""
+    folder = LAYOUTS[kind][1](tmp_path, written)
+    monkeypatch.setattr(phone_scans, "LARGEST_SIDE", 40)
+    whole = written[0].frame.intrinsics
+    for asked, side in ((None, 40), (30, 30), (50, 50), (2000, max(whole.width, whole.height))):
+        frames = [view.frame for view in read_views(folder, largest=asked).views]
+        assert {max(frame.rgb.shape[:2]) for frame in frames} == {side}
+        found, expected = frames[0].intrinsics, whole.scaled(side / max(whole.width, whole.height))
+        torch.testing.assert_close(found.matrix(), expected.matrix(), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["path.kitti.txt", "path.euroc.csv", "path.tum"])

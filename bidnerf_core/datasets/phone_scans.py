@@ -3,7 +3,8 @@
 ARKit's poses are camera to world with OpenGL axes and +y up, its intrinsics count pixels from the centre of the upper left one,
 and its confidence is 0 (low), 1 or 2 (high). Depth is kept where the confidence is high, and up to the range of the lidar;
 beyond it, depth was inferred from the photo. Each pixel has the depth of the nearest measurement. Photos with more than 640
-pixels on the longer side are reduced to that size with their camera: a scan has hundreds of them.
+pixels on the longer side are reduced to that size with their camera, unless the user names another one (``reading_at``): a scan
+has hundreds of them.
 
 Phones record up to 60 frames a second, far more than a map needs. Of such recordings the dataset has five frames a second, and
 the sequence all of them.
@@ -26,6 +27,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.datasets.incomplete import remark
+from bidnerf_core.datasets.rgbd import largest_side
 from bidnerf_core.depth.images import DepthImage
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import Frame
@@ -34,7 +36,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import reduced
 
 LARGEST_SIDE = 640
-"""Maximum number of pixels on the longer side of a photo once it is read."""
+"""Usual number of pixels on the longer side of a photo once it is read."""
 LIDAR_RANGE = 5.0
 """Range of the lidar (metres) according to Apple."""
 HIGH_CONFIDENCE = 2
@@ -70,15 +72,14 @@ def scan_frame(
     camera: Intrinsics,
     depth: Measured | None,
     image: Path | str,
-    largest: int = LARGEST_SIDE,
 ) -> Frame:
-    """Return a frame of a photo and its depth, reduced to at most ``largest`` pixels on the longer side.
+    """Return a frame of a photo and its depth, reduced to at most ``LARGEST_SIDE`` pixels on the longer side by default.
 
     ``rgb`` is in [0, 1], or bytes as in ``read_compact_image``. ``camera`` is scaled to the photo. Raises ``InputError`` where camera or depth are of another aspect ratio.
     """
     raster = Raster(rgb.shape[1], rgb.shape[0])
     whole = CameraSource(camera).find(image, raster).intrinsics
-    small = whole.scaled(min(1.0, largest / max(raster.size)))
+    small = whole.scaled(min(1.0, (largest_side(LARGEST_SIDE) or math.inf) / max(raster.size)))
     pixels = rgb if small.width == raster.width else reduced(rgb, small.width, small.height)
     size = (small.width, small.height)
     metres = None if depth is None else fit_depth(depth.depth, raster, size, f"{depth.where}: depth")

@@ -34,20 +34,38 @@ class DepthFile:
     )
 
 
-_largest: ContextVar[int | None] = ContextVar("largest", default=None)
+@dataclass(frozen=True)
+class _Side:
+    pixels: int | None  # None where images keep their own size
+    asked: bool
+
+
+_side: ContextVar[_Side | None] = ContextVar("side", default=None)
 
 
 @contextmanager
-def reading_at(largest: int) -> Iterator[None]:
-    """Let ``read_rgbd`` reduce images to ``largest`` pixels along the longer side within the context, in this thread.
+def reading_at(largest: int | None, asked: bool = False) -> Iterator[None]:
+    """Let readers reduce images to ``largest`` pixels along the longer side within the context, in this thread.
 
-    Images are then never in memory at their own size. Readers that do not use ``read_rgbd`` do without.
+    Images are then never in memory at their own size. ``asked`` says that the user named this size, or for None that images
+    should keep theirs: it then replaces a smaller limit of the format. Readers learn of it by ``largest_side``, as
+    ``read_rgbd`` does for them; those that do not use it do without.
     """
-    token = _largest.set(largest)
+    token = _side.set(_Side(largest, asked))
     try:
         yield
     finally:
-        _largest.reset(token)
+        _side.reset(token)
+
+
+def largest_side(usual: int | None = None) -> int | None:
+    """Return the pixels along the longer side to which images are reduced now, or None; ``usual`` is the format's own limit."""
+    side = _side.get()
+    if side is None:
+        return usual
+    if side.asked or usual is None:
+        return side.pixels
+    return usual if side.pixels is None else min(side.pixels, usual)
 
 
 def read_rgbd(
@@ -67,7 +85,7 @@ def read_rgbd(
     """
     header = read_header(image)
     camera, size = camera_of(header.width, header.height), (header.width, header.height)
-    largest, reduced = _largest.get(), None
+    largest, reduced = largest_side(), None
     if largest is not None and isinstance(camera, Intrinsics) and max(size) > largest:
         camera = camera.scaled(largest / max(size))
         size = reduced = (camera.width, camera.height)

@@ -25,6 +25,7 @@ from bidnerf_core.captures.cameras import at_stored_poses, stored_cameras
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.queries import Photos, photo_files
 from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.datasets.rgbd import reading_at
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.fields.rendering import render_image
@@ -184,10 +185,11 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> list[Frame]:
                 photo_files([path]), CameraSource(assumed=assumed), background=scene.bounds.background
             )
             photos = [source.read(n).frame for n in range(len(source.names))]
+    sides = [max(c.intrinsics.width, c.intrinsics.height) for c in scene.info.cameras]
     if isinstance(photos, Dataset):
         names = photos.frame_names(split)
-        photos = [view.frame for name in names for view in photos.views(split, [name])]
-    sides = [max(c.intrinsics.width, c.intrinsics.height) for c in scene.info.cameras]
+        with reading_at(max(sides, default=None), asked=bool(sides)):
+            photos = [view.frame for name in names for view in photos.views(split, [name])]
     frames = [item.frame if isinstance(item, View) else item for item in photos]
     for frame in frames:
         if not isinstance(frame, Frame):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -116,9 +115,9 @@ def _read(
     """Read the views of a split one after another, so that only one image is in memory at its own size."""
     names = data.frame_names(split)
     views: list[View] = []
-    store, limit = PixelStore(0), 0  # the first image is read at its own size, which is reported
+    store, limit = PixelStore(0), None  # the first image is read at its own size, which is reported
     for place, name in enumerate(names):
-        for view in _one(data, split, name, limit):
+        for view in _one(data, split, name, limit, largest is not None):
             if not views:
                 limit = largest or useful_size(view.frame, len(names))
                 small = view.frame.at_most(limit)
@@ -129,13 +128,13 @@ def _read(
     return views
 
 
-def _one(data: Dataset, split: str, name: str, largest: int) -> list[View]:
-    """Read a frame, at most ``largest`` pixels wide and high unless that is 0.
+def _one(data: Dataset, split: str, name: str, limit: int | None, asked: bool) -> list[View]:
+    """Read a frame, at most ``limit`` pixels wide and high, which the user may have ``asked`` for.
 
     Returns none where a mask hides all of it, as when a whole split is read.
     """
     try:
-        with reading_at(largest) if largest else contextlib.nullcontext():
+        with reading_at(limit, asked):
             return data.views(split, [name])
     except WhollyHidden:
         return []

@@ -19,6 +19,7 @@ is added.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,7 +35,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
 from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.reader import Reader, ReadOptions
-from bidnerf_core.datasets.rgbd import read_rgbd
+from bidnerf_core.datasets.rgbd import largest_side, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.depth.images import MILLIMETRE, DepthImage, read_depth_image
@@ -49,7 +50,7 @@ from bidnerf_core.io.images import Background, decode, reduced
 from bidnerf_core.io.json import Record, read_record
 
 LARGEST_SIDE = 640
-"""Maximum number of pixels on the longer side of a photo once it is read."""
+"""Usual number of pixels on the longer side of a photo once it is read."""
 RANGE = 5.0
 """Range of the LiDAR (metres) according to Apple; depth beyond it was inferred from the photo."""
 HIGH_CONFIDENCE = 2
@@ -89,7 +90,7 @@ class ScannerFrame:
 
 @dataclass(frozen=True)
 class ScannerAppReader(Reader):
-    """The reader of folders of "3D Scanner App"; ``largest`` limits the longer side of its photos (pixels)."""
+    """The reader of folders of "3D Scanner App"; ``largest`` is the usual limit of the longer side of photos (pixels)."""
 
     largest: int = LARGEST_SIDE
     expected = f"frame_0.jpg, frame_0.json ... with {POSE}"
@@ -134,7 +135,8 @@ class ScannerAppDataset(SplitDataset[ScannerFrame]):
     def _with_photo(self, frame: ScannerFrame, photo: Path, name: str) -> Frame:
         whole = read_rgbd(name, photo, partial(scanner_camera, frame.record), self._background)
         camera = whole.intrinsics
-        small = camera.scaled(min(1.0, self._largest / max(camera.width, camera.height)))
+        limit = largest_side(self._largest) or math.inf
+        small = camera.scaled(min(1.0, limit / max(camera.width, camera.height)))
         rgb = whole.rgb if small == camera else reduced(whole.rgb, small.width, small.height)
         depth = None
         if frame.has_depth:

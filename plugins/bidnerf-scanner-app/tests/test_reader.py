@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Dataset, FileSequence, open_dataset, open_sequence
+from bidnerf_core.datasets.rgbd import reading_at
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_scanner_app.reader import LARGEST_SIDE, RANGE, ScannerAppReader
@@ -132,6 +133,8 @@ def test_photos_are_reduced_with_their_camera(scan: Path) -> None:
     assert whole.frame.intrinsics == Intrinsics(FOCAL, FOCAL, CENTRE[0] + 0.5, CENTRE[1] + 0.5, WIDTH, HEIGHT)
     assert whole.frame.intrinsics.resized(small.width, small.height) == small
     assert edge_error(whole) < 3e-4
+    with reading_at(2000, asked=True):
+        assert every_view(open_dataset(scan))["frame_0"].frame.intrinsics == whole.frame.intrinsics
 
 
 def test_poses_have_opencv_axes(scan: Path) -> None:
