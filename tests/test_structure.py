@@ -25,7 +25,8 @@ from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
 from bidnerf_core.structure.mapping import vertical
 from bidnerf_core.structure.pairs import ALL_OF_FRAMES, ALL_OF_PHOTOS, NEIGHBOURS, chosen_pairs, few
-from bidnerf_core.structure.record import begin, clear
+from bidnerf_core.structure.poses import found_before
+from bidnerf_core.structure.record import begin, clear, stored_rows
 from bidnerf_core.structure.sources import SourceImage, lacks_poses, photos_of
 from bidnerf_core.structure.video_frames import MOST, STEP, FrameMeasure, chosen, measured, write_frames
 from commands import Run
@@ -225,9 +226,40 @@ def test_too_few_photos_and_photos_without_overlap(tmp_path: Path) -> None:
         bn.find_poses(one, tmp_path / "out")
     for seed in range(3):
         write_photos(apart, walk(1), seed, first=seed)
-    with pytest.raises(bn.InputError, match="no two show enough of the same"):
-        bn.find_poses(apart, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    for found_again in (3, 0, 3):
+        stages = list[bn.Progress]()
+        with pytest.raises(bn.InputError, match="no two show enough of the same"):
+            bn.find_poses(apart, tmp_path / "out", progress=stages.append)
+        assert sum(now.stage == "finding keypoints" for now in stages) == found_again
+        if found_again == 0:  # half of the keypoints are lost
+            database = tmp_path / "out" / "work" / "database.db"
+            database.write_bytes(database.read_bytes()[: database.stat().st_size // 2])
+    with pytest.raises(bn.InputError, match="1 photo, expected at least 3"):
+        bn.find_poses(one, tmp_path / "out")  # other photos take its place
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_damaged_files_of_earlier_work_are_made_anew(search: Search, tmp_path: Path) -> None:
+    rows, file = [(0, 1), (1, 2)], tmp_path / "pairs.json"
+    assert stored_rows(file, tuple[int, int]) is None
+    for content, expected in (
+        (json.dumps(rows), rows),
+        ("[[0, 1], [1", None),
+        ('[[0, "a"]]', None),
+        ("{}", None),
+    ):
+        file.write_text(content)
+        assert stored_rows(file, tuple[int, int]) == expected
+    record = search.out / "poses.json"
+    whole = record.read_bytes()
+    record.write_bytes(whole[:20])
+    try:
+        with pytest.raises(bn.InputError, match=r"poses\.json"):
+            bn.find_poses(search.photos, search.out)
+        assert found_before(search.out, search.found.inputs, overwrite=True) is None
+    finally:
+        record.write_bytes(whole)
 
 
 @pytest.mark.slow

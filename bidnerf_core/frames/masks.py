@@ -62,10 +62,9 @@ def read_mask(
 
 def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[Tensor, "h w"]:
     """Return the mask of the upright image of ``raster``. Raises ``InputError`` for another aspect ratio."""
-    own = read_exif(path).orientation
-    if own != UPRIGHT and same_aspect((turned := own.upright(stored)).shape[::-1], raster.upright_size):
-        return turned
-    given = (stored.shape[1], stored.shape[0])
+    given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
+    if own != UPRIGHT and same_aspect(own.upright_size(*given), raster.upright_size):
+        return own.upright(stored)
     is_upright = same_aspect(given, raster.upright_size)
     if same_aspect(given, raster.size):
         if is_upright and raster.orientation != UPRIGHT:

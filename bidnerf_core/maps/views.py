@@ -115,9 +115,9 @@ def _read(
     """Read the views of a split one after another, so that only one image is in memory at its own size."""
     names = data.frame_names(split)
     views: list[View] = []
-    store, limit = PixelStore(0), None  # the first image is read at its own size, which is reported
+    store, limit = PixelStore(0), 0  # the first image is read at its own size, which is reported
     for place, name in enumerate(names):
-        for view in _one(data, split, name, limit, largest is not None):
+        for view in _one(data, split, name, limit if views else None, largest is not None):
             if not views:
                 limit = largest or useful_size(view.frame, len(names))
                 small = view.frame.at_most(limit)

@@ -17,7 +17,6 @@ from bidnerf_core.datasets.video import is_video
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
-from bidnerf_core.io.json import read_json
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 from bidnerf_core.structure import video_frames
 from bidnerf_core.structure.keypoints import Described, described, write_cameras, write_keypoints
@@ -33,6 +32,7 @@ from bidnerf_core.structure.mapping import (
 from bidnerf_core.structure.matching import Overlaps, match
 from bidnerf_core.structure.pairs import Pairs, all_pairs, chosen_pairs, few
 from bidnerf_core.structure.record import (
+    DATABASE,
     FRAMES,
     RECORD,
     FoundPoses,
@@ -41,9 +41,13 @@ from bidnerf_core.structure.record import (
     begun_with,
     clear,
     digest,
+    give_up,
+    gives_way,
     is_ours,
     read_found,
     relative,
+    stored_rows,
+    without_damage,
     write_dataset,
     write_found,
 )
@@ -83,12 +87,12 @@ def find_poses(
     pycolmap = pycolmap_for(str(source))
     images = [] if is_video(source) else photos_of(source, folder)
     inputs = digest([image.file for image in images] or [_video(source)], camera)
-    known = found_before(folder, inputs) if reuse or not overwrite else None
+    known = found_before(folder, inputs, overwrite) if reuse or not overwrite else None
     if known is not None:
         log.info(f"{folder}: has the poses of these photos already")
         return known
     with _folder(folder, inputs, overwrite):
-        if overwrite:
+        if overwrite and not reuse:
             clear(folder)
         work = begin(folder, inputs, video=is_video(source))
         try:
@@ -96,14 +100,23 @@ def find_poses(
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command goes on from there") from stopped
         except InputError:
-            clear(folder)
+            give_up(folder)
             raise
 
 
-def found_before(folder: Path, inputs: str | None = None) -> FoundPoses | None:
-    """Return the poses in a folder if they were found for the photos with the digest ``inputs``."""
-    known = read_found(folder)
-    return known if known is not None and inputs in (None, known.inputs) else None
+def found_before(folder: Path, inputs: str, overwrite: bool) -> FoundPoses | None:
+    """Return the poses in a folder if they were found for the photos with the digest ``inputs``.
+
+    Raises ``InputError`` for a damaged record, unless the folder may be overwritten.
+    """
+    try:
+        known = read_found(folder)
+    except InputError as error:
+        if not overwrite:
+            raise
+        log.info(f"{error}; the poses are found anew")
+        return None
+    return known if known is not None and known.inputs == inputs else None
 
 
 def _video(path: Path) -> Path:
@@ -115,7 +128,7 @@ def _video(path: Path) -> Path:
 @contextlib.contextmanager
 def _folder(out: Path, inputs: str, overwrite: bool) -> Iterator[None]:
     """Hold the lock of the folder of the poses, which is empty, or holds interrupted work on the same photos."""
-    goes_on = begun_with(out) == inputs
+    goes_on = begun_with(out) == inputs or gives_way(out)
 
     def describe(folder: Path) -> str | None:
         if (folder / RECORD).exists():
@@ -136,7 +149,7 @@ class _Search:
         self._source, self._folder, self._work, self._inputs = source, folder, work, inputs
         self._camera, self._progress, self._cancel = camera, progress, cancel
         self._pycolmap, self._began = pycolmap, time.monotonic()
-        self._database = work / "database.db"
+        self._database = without_damage(work / DATABASE)
         self._threads = max(1, torch.get_num_threads())
 
     def run(self, images: list[SourceImage]) -> FoundPoses:
@@ -168,10 +181,9 @@ class _Search:
     def _frames(self) -> list[SourceImage]:
         """Return the chosen frames of a video, which are written as images unless they were before."""
         listed = self._work / "frames.json"
-        if listed.exists():
-            return [
-                SourceImage(name, Path(file), at) for name, file, at in read_json(listed, "a list of frames")
-            ]
+        known = stored_rows(listed, tuple[str, str, float])
+        if known is not None and all(Path(file).is_file() for _, file, _ in known):
+            return [SourceImage(name, Path(file), at) for name, file, at in known]
         measures = video_frames.measured(self._source, self._counter("measuring frames", "frames"))
         wanted = video_frames.chosen(measures)
         log.info(
@@ -235,12 +247,13 @@ class _Search:
         if few(len(numbers), ordered):
             return all_pairs(len(numbers))
         stored = self._work / "pairs.json"
-        if not stored.exists():
+        pairs = stored_rows(stored, tuple[int, int])
+        if pairs is None:
             with self._pycolmap.Database.open(self._database) as database:
                 pairs = chosen_pairs([database.read_descriptors(number).data for number in numbers])
             log.info(f"{self._source}: {len(pairs)} pairs of neighbours and of photos that look alike")
             write_file(stored, json.dumps(pairs).encode())
-        return [(i, j) for i, j in read_json(stored, "a list of pairs")]
+        return pairs
 
     def _written(
         self, images: list[SourceImage], found: Described, models: Models, reasons: dict[str, str]

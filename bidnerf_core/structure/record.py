@@ -8,13 +8,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import os
 import re
 import shutil
+import sqlite3
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -23,11 +25,16 @@ from bidnerf_core.datasets.writing import frame_entry
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import from_plain, read_json, to_plain
+from bidnerf_core.io.json import converted, from_plain, read_json, to_plain
 from bidnerf_core.structure.keypoints import DETECTOR, Photo
 from bidnerf_core.structure.library import from_colmap
 
+log = logging.getLogger("bidnerf")
+
+Row = TypeVar("Row")
 RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
+DATABASE = "database.db"
+"""The file of keypoints and matches in the folder of the work."""
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 FRAME_FILE = re.compile(r"\d{6,}\.jpg")
 LARGEST_NAMED = 5
@@ -101,6 +108,48 @@ def begun_with(folder: Path) -> str | None:
     return _begun(folder).get("inputs")
 
 
+def gives_way(folder: Path) -> bool:
+    """Return whether the work in a folder came to an end without poses, so that it may make room for that on other photos."""
+    return _begun(folder).get("failed") is True
+
+
+def give_up(folder: Path) -> None:
+    """Keep the keypoints and matches of photos without poses for another try with the same photos, or remove all if there are none."""
+    if not (folder / WORK / DATABASE).exists():
+        clear(folder)
+        return
+    content = json.dumps(_begun(folder) | {"failed": True})
+    write_file(folder / WORK / "begun.json", content.encode())
+
+
+def without_damage(database: Path) -> Path:
+    """Return the path of a database, which is removed if it is damaged."""
+    if not database.exists():
+        return database
+    try:
+        with contextlib.closing(sqlite3.connect(database)) as opened:
+            (found,) = opened.execute("PRAGMA quick_check(1)").fetchone()
+    except sqlite3.DatabaseError as error:
+        found = str(error)
+    if found != "ok":
+        log.info(f"{database}: damaged ({found}); its keypoints are found anew")
+        for file in database.parent.glob(f"{database.name}*"):  # with SQLite's journals
+            file.unlink()
+    return database
+
+
+def stored_rows(file: Path, kind: type[Row]) -> list[Row] | None:
+    """Return what a file of the work lists; None where there is no such file, or a damaged one, which is to be made anew."""
+    if not file.exists():
+        return None
+    try:
+        rows: list[Row] = converted(list[kind], read_json(file, "a list"), str(file))  # type: ignore[valid-type]
+    except InputError as error:
+        log.info(f"{error}; it is made anew")
+        return None
+    return rows
+
+
 def _begun(folder: Path) -> dict[str, Any]:
     try:
         found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
@@ -122,7 +171,7 @@ def begin(folder: Path, inputs: str, video: bool) -> Path:
                 f"{folder / FRAMES}: exists already, and the frames of the video would be written into it; name another folder"
             )
         work.mkdir(parents=True, exist_ok=True)
-        write_file(work / "begun.json", json.dumps({"inputs": inputs, "video": video}).encode())
+    write_file(work / "begun.json", json.dumps({"inputs": inputs, "video": video}).encode())
     return work
 
 
