@@ -9,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 REQUIREMENTS := pyproject.toml constraints.txt
 DEMO_OUT := demo-out
-SHAPES := tests/test_contract.py::TestHashGrid tests/test_examples.py tests/test_cli_bake.py::test_a_baked_map_needs_no_start
+SHAPES := tests/test_contract.py::TestHashGrid tests/test_cli_bake.py::test_a_baked_map_needs_no_start
 # A process a core, of one thread each; a file's tests share fixtures, and conftest.py puts the longest files first.
 PARALLEL := -n logical --dist loadfile --no-loadscope-reorder
 PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL)
@@ -22,7 +22,7 @@ PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test robustness shapes check lint format types arrows docs clean
+.PHONY: help demo test slow robustness shapes check lint format types arrows docs clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -30,10 +30,13 @@ help: ## this list
 demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw the result in demo-out/
 	@$(BIN)/bidnerf demo --out $(DEMO_OUT) --overwrite
 
-test: $(VENV)/.installed-dev ## all tests; ARGS="-k se3" for some
-	@$(PYTEST) $(ARGS)
+test: $(VENV)/.installed-dev ## tests of all parts, in minutes; ARGS="-k se3" for some
+	@$(PYTEST) -m "not slow" $(ARGS)
 
-shapes: $(VENV)/.installed-dev ## a backend's contract, the examples and a map, with checks of all annotated shapes
+slow: $(VENV)/.installed-dev ## the other tests: those that take seconds each, or run programs and install packages
+	@$(PYTEST) -m slow $(ARGS)
+
+shapes: $(VENV)/.installed-dev ## a backend's contract and a map, with checks of all annotated shapes
 	@BIDNERF_SHAPES=1 $(PYTEST) $(SHAPES) $(ARGS)
 
 robustness: $(VENV)/.installed-dev ## hostile inputs, kills, full disks and crowds, counted; takes half an hour; ARGS="--only fuzz"

@@ -370,6 +370,7 @@ def test_results_of_an_earlier_version_are_resumed_and_reported(
     assert "3 trials" in (tmp_path / "report" / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_repeated_frames_are_announced(evaluate: Evaluate) -> None:
     assert "distinct" not in evaluate("--trials", 2, "--size", 0.3)[1]
     err = evaluate("--frame", "0000", "0001", "--trials", 5, "--size", 0.3, 0.4)[1]
@@ -418,6 +419,7 @@ def test_numbers_and_text_that_nothing_can_hold_are_named(
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_shards_joined_are_the_whole(tmp_path: Path, evaluate: Evaluate) -> None:
     more = ("--trials", 5, "--size", "0.3")
     assert evaluate(*more)[0] == 0
@@ -439,6 +441,7 @@ def test_a_trial_that_fails_ends_the_run_and_keeps_the_others(tmp_path: Path) ->
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [0]
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished(
     tmp_path: Path, evaluate: Evaluate, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -96,6 +96,7 @@ def test_no_image_of_another_bare_wall_is_accepted(kind: str) -> None:
     assert not found(foreign(kind), 0.0).converged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["bid", "bid-lm", "inerf", "inerf-lm"])
 def test_no_method_accepts_a_start_before_a_bare_wall(method: str) -> None:
     answer = found(photograph(QUERY, 0.0), 0.0, method)

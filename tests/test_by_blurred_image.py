@@ -62,6 +62,7 @@ def answer(T: SE3, outcome: Outcome = Outcome.CONVERGED, confidence: float | Non
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("blur", "given"), [(1.5, Outcome.CONVERGED), (2.5, Outcome.IMPRECISE)])
 def test_a_blurred_image_is_refined_and_judged_anew(blur: float, given: Outcome) -> None:
     found = refined_if_blurred(problem(photo(blur)), answer(ASIDE, given))
@@ -103,6 +104,7 @@ def test_nor_one_by_measured_depth_nor_in_a_blurred_field_nor_without_a_surface(
     assert refined_if_blurred(replace(problem(photo(2.0)), colour_noise=0.1), given) is given
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "refined"), [(1.0, True), (1.05, False), (1.5, True)])
 def test_nor_one_with_intrinsics_that_differ_a_little_from_the_maps(factor: float, refined: bool) -> None:
     """A wrong focal length hardly shows in a blurred image, but moves the pose."""
@@ -116,6 +118,7 @@ def test_nor_one_with_intrinsics_that_differ_a_little_from_the_maps(factor: floa
     assert (found is not given) == refined
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outcome", [Outcome.CONVERGED, Outcome.RENDERING_MISMATCH])
 def test_a_blurred_image_of_which_much_shows_something_else_is_rejected(outcome: Outcome) -> None:
     """Most of it is as the map has it, so that a blur is seen; the quarter in the middle has other colours."""

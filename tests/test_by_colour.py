@@ -52,6 +52,7 @@ def assert_right(found: Localization, truth: SE3) -> None:
     assert found.converged, found.reason
 
 
+@pytest.mark.slow
 def test_no_start_is_needed() -> None:
     truth = UNSEEN[1]
     found = localize(problem(photograph(truth)), "auto", QUICK)
@@ -62,6 +63,7 @@ def test_no_start_is_needed() -> None:
     assert float(normalized_error_squared(found.T_world_camera, truth, found.covariance)) < 16.8
 
 
+@pytest.mark.slow
 def test_the_second_round_leaves_out_what_hides_the_scene() -> None:
     """Nothing suggests that the pose is right, however, where a third of the image cannot be explained."""
     truth = UNSEEN[0]

@@ -221,6 +221,7 @@ def test_long_lists_are_cut() -> None:
     assert "p6" not in line
 
 
+@pytest.mark.slow
 def test_a_picture_is_drawn_of_cameras_gaps_and_landmarks(tmp_path: Path) -> None:
     report = damaged()
     gap = Gap(40.0, report.photos[0].name, report.photos[1].name)
@@ -233,6 +234,7 @@ def test_a_picture_is_drawn_of_cameras_gaps_and_landmarks(tmp_path: Path) -> Non
         draw_capture(report, None, None, tmp_path)
 
 
+@pytest.mark.slow
 def test_exact_poses_of_small_images_are_not_called_wrong() -> None:
     """A pose by twenty landmarks scatters more than the usual one by forty."""
     small = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)

@@ -33,6 +33,9 @@ from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
 from commands import Run
 
+pytestmark = pytest.mark.slow
+
+
 COARSE = ["--cells", "30000"]
 
 
@@ -53,7 +56,6 @@ def folder(shared: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(shared / "map", tmp_path / "map"))
 
 
-@pytest.mark.slow
 def test_a_baked_map_needs_no_start(shared: Path, folder: Path, bidnerf: Run) -> None:
     data = shared / "data"
     status, out, err = bidnerf("bake", folder, "--data", data, *COARSE)
@@ -138,7 +140,6 @@ def test_a_map_is_baked_from_what_it_renders(folder: Path, bidnerf: Run) -> None
     assert len(surface.keyframes) == 24
 
 
-@pytest.mark.slow
 def test_a_damaged_surface_is_baked_anew(shared: Path, folder: Path, bidnerf: Run) -> None:
     bake = ["bake", folder, "--data", shared / "data", *COARSE]
     assert bidnerf(*bake)[0] == 0
@@ -149,7 +150,6 @@ def test_a_damaged_surface_is_baked_anew(shared: Path, folder: Path, bidnerf: Ru
     assert load_map(folder).surface is not None
 
 
-@pytest.mark.slow
 def test_training_bakes_unless_told_otherwise(
     shared: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -196,7 +196,6 @@ def test_mistakes_are_told(
     assert said in err
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("_ball")
 def test_how_well_a_field_renders_is_measured_on_photos_alone(
     shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
@@ -228,7 +227,6 @@ def with_photo_landmarks(shared: Path, folder: Path, bidnerf: Run, monkeypatch: 
     return folder
 
 
-@pytest.mark.slow
 def test_landmarks_of_photos_are_kept(with_photo_landmarks: Path, bidnerf: Run) -> None:
     before = load_info(with_photo_landmarks)
     status, out, err = bidnerf("bake", with_photo_landmarks)
@@ -237,7 +235,6 @@ def test_landmarks_of_photos_are_kept(with_photo_landmarks: Path, bidnerf: Run) 
     assert load_info(with_photo_landmarks) == before
 
 
-@pytest.mark.slow
 def test_landmarks_of_rendered_images_are_replaced_each_time(
     with_photo_landmarks: Path, bidnerf: Run
 ) -> None:
@@ -250,7 +247,6 @@ def test_landmarks_of_rendered_images_are_replaced_each_time(
     assert load_info(with_photo_landmarks).landmarks != first.landmarks
 
 
-@pytest.mark.slow
 def test_damaged_landmarks_of_photos_are_replaced(with_photo_landmarks: Path, bidnerf: Run) -> None:
     damaged = with_photo_landmarks / str(load_info(with_photo_landmarks).landmarks)
     damaged.write_bytes(b"")
@@ -261,7 +257,6 @@ def test_damaged_landmarks_of_photos_are_replaced(with_photo_landmarks: Path, bi
     assert load_map(with_photo_landmarks).landmarks is not None
 
 
-@pytest.mark.slow
 def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without depth or silhouettes, training takes distances from landmarks, and the map keeps those landmarks."""
     monkeypatch.setattr(tiny, "CAMERA", Intrinsics(85.0, 85.0, 32.0, 32.0, 64, 64))
@@ -297,7 +292,6 @@ def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
     assert all(view.landmarks is None for view in views)
 
 
-@pytest.mark.slow
 def test_photos_leave_a_record_that_info_shows_and_draws(
     shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,7 +328,6 @@ def test_a_damaged_record_of_photos_is_named_in_a_line(folder: Path, content: st
     assert "no such file" in bidnerf("info", folder).err
 
 
-@pytest.mark.slow
 def test_photos_of_another_scene_are_not_baked_into_a_map(
     shared: Path, folder: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -141,6 +141,7 @@ def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch)
     training_views.prepared(views)
 
 
+@pytest.mark.slow
 def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     points = Points(noise=0.3)
     views = ring(points, 14, depth=1.0)

@@ -9,12 +9,14 @@ import pytest
 
 from bidnerf_core.cli import main
 
+pytestmark = pytest.mark.slow
+
+
 distributed = pytest.importorskip("distributed")
 
 WORDS = ["--trials", "6", "--size", "0.3", "--method", "bid", "--rays", "16", "--max-steps", "2"]
 
 
-@pytest.mark.slow
 def test_two_dask_workers_give_the_results_of_one_process(tmp_path: Path) -> None:
     alone, together = tmp_path / "alone.jsonl", tmp_path / "together.jsonl"
     assert main(["evaluate", "demo:blobs", "--out", str(alone), "--workers", "1", *WORDS]) == 0

@@ -24,6 +24,9 @@ from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
 from bidnerf_core.io.json import from_plain, to_plain
 
+pytestmark = pytest.mark.slow
+
+
 QUICK = json.dumps({"rays": 32, "max_steps": 3})
 
 

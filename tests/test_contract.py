@@ -774,6 +774,7 @@ def test_hits_that_stop_other_light_than_the_density_are_told() -> None:
     assert "of the light of rays" in fault("test_hits_agree_with_the_density", with_field(hits=opaque))
 
 
+@pytest.mark.slow
 def test_the_contract_does_not_need_pytest() -> None:
     code = "import sys; sys.modules['pytest'] = None; from bidnerf_core.testing import BackendContract"
     subprocess.run([sys.executable, "-c", code], check=True)

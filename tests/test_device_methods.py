@@ -87,6 +87,7 @@ def test_auto_by_depth() -> None:
     assert float(pose_error(here.T_world_camera, view.T_ref_camera).translation) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [1, 2])
 def test_auto_by_colour(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
     """The second round follows if the first is not accepted, which a part of the image in one colour prevents."""

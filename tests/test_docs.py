@@ -141,6 +141,7 @@ def executed(page: Path) -> dict[str, Any]:
     return namespace
 
 
+@pytest.mark.slow
 @each([page for page in PAGES if blocks(page, "python")])
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.usefixtures("quick_auto")
@@ -162,6 +163,7 @@ def test_blocks_are_of_known_languages() -> None:
             tomllib.loads(block.text)
 
 
+@pytest.mark.slow
 @each([page for page in PAGES if any(words[0] == "bidnerf" for words in commands(page))])
 @pytest.mark.usefixtures("quick_auto")
 def test_bidnerf_commands_work(page: Path, inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,6 +214,7 @@ def extras(arguments: list[str]) -> set[str]:
     return {name for word in arguments for name in re.findall(r"\[([\w,]+)\]", word)}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_auto")
 def test_the_backend_of_the_readme_trains_and_localizes(inside: Path) -> None:
     namespace = executed(ROOT / "README.md")

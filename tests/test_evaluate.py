@@ -184,6 +184,7 @@ def test_any_thread_evaluates_and_leaves_no_trace() -> None:
     assert (signal.getsignal(signal.SIGINT), torch.get_num_threads()) == (handler, threads)
 
 
+@pytest.mark.slow
 def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
     out, stop = tmp_path / "r.jsonl", threading.Event()
     seen: list[bn.Progress] = []
@@ -243,6 +244,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
             bn.evaluate(**given)
 
 
+@pytest.mark.slow
 def test_maps_in_memory_and_in_folders_are_compared(folder: Path, tmp_path: Path) -> None:
     given = {"trials": 2, "method": "bid", "config": QUICK["config"], "protocol": "bid", "size": 0.3}
     scene, data = bn.load_map(folder / "map"), folder / "data"

@@ -12,11 +12,13 @@ import pytest
 from bidnerf_core import registry
 from bidnerf_core.fields import residuals
 
+pytestmark = pytest.mark.slow
+
+
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 QUICK = {"--steps": "12", "--descent": "3", "--trials": "2"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("example", EXAMPLES, ids=[path.stem for path in EXAMPLES])
 def test_example_runs(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

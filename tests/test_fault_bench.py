@@ -58,6 +58,7 @@ def test_the_method_gets_the_faulty_views() -> None:
     assert torch.equal(blind.frame.rgb, faulty(clean, "occluder:0.2", 0).frame.rgb)
 
 
+@pytest.mark.slow
 def test_evaluate_writes_the_fault_and_resumes_by_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -143,6 +144,7 @@ def test_reports_group_by_fault_and_order_by_size(results: list[TrialResult]) ->
     assert fault_curves(groups[:1]) == []
 
 
+@pytest.mark.slow
 def test_the_figure_shows_success_acceptance_and_silent_errors(
     results: list[TrialResult], tmp_path: Path
 ) -> None:

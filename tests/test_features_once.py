@@ -98,6 +98,7 @@ def test_a_lost_tracker_finds_the_keypoints_of_a_frame_once(searched: Seen) -> N
     assert_all_differ(searched)
 
 
+@pytest.mark.slow
 def test_photos_of_a_capture_are_searched_once(searched: Seen) -> None:
     views = training_views(10)
     tracked = tracked_views(views)

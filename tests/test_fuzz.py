@@ -91,6 +91,7 @@ READERS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", READERS)
 def test_a_damaged_file_is_refused_in_one_line_or_read(
     kind: str, malformed: Any, folder: Path, tmp_path: Path
@@ -140,6 +141,7 @@ JSON_VALUES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(
     values=st.dictionaries(

@@ -20,6 +20,9 @@ from bidnerf_core.maps.map import load_map
 from bidnerf_core.results.plot_style import new_figure, save_figure
 from commands import Run
 
+pytestmark = pytest.mark.slow
+
+
 BAKE = ["--cells", "2000"]
 QUICK = ["--trials", "2", "--workers", "1", "--method", "bid", "--max-steps", "1", "--rays", "32"]
 
@@ -76,7 +79,6 @@ def test_files_of_others_and_of_whole_maps_are_not_overwritten(
         assert "exists already and is not empty" in err
 
 
-@pytest.mark.slow
 def test_a_report_killed_before_its_page_begins_anew(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     out = tmp_path / "report"
     out.mkdir()

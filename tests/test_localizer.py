@@ -187,6 +187,7 @@ def test_warming_up_changes_no_answer_and_no_random_state() -> None:
     assert torch.equal(one, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["auto", "bid"])
 def test_eight_threads_share_a_localizer(method: str) -> None:
     """Neither the order of calls nor what else is being computed changes an answer."""

@@ -191,6 +191,7 @@ def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_pat
     assert load_info(tmp_path / "map").complete
 
 
+@pytest.mark.slow
 def test_a_process_that_trains_into_the_folder_of_a_thread_is_refused(tmp_path: Path) -> None:
     tiny.write_dataset(tmp_path / "data")
     program = "import sys; from bidnerf_core.cli import main; sys.exit(main())"

@@ -46,6 +46,7 @@ def grounds() -> list[Map]:
     return found
 
 
+@pytest.mark.slow
 def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
     maps = bn.MapCollection(grounds, asked=2)
     assert maps.names == tuple(f"ground{seed}" for seed in SEEDS)
@@ -63,6 +64,7 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
         assert torch.equal(found.found.T_world_camera.matrix(), alone.T_world_camera.matrix())
 
 
+@pytest.mark.slow
 def test_two_maps_of_one_place_are_rivals(grounds: list[Map]) -> None:
     copy = grounds[0].scaled(2.0)
     maps = bn.MapCollection([*grounds[:2], replace(copy, info=replace(copy.info, data="copy"))])

@@ -127,6 +127,7 @@ def test_motions_are_noticed_though_the_poses_are_right() -> None:
     assert bool((found.tracked.motion != 0).any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pose_error", [0.0, 0.004])
 @pytest.mark.parametrize(
     "wrong", [{"fy": 1.05 * PINHOLE.fy}, {"cx": PINHOLE.cx + 10}, {"distortion": (0.2, 0, 0, 0)}]
@@ -139,6 +140,7 @@ def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float
     assert bool((found.tracked.motion == 0).all())
 
 
+@pytest.mark.slow
 def test_cameras_at_rest_get_no_motion() -> None:
     found, _, _ = refined(motions(0.0))
     assert found.refined
@@ -167,6 +169,7 @@ def test_views_with_a_motion_are_tracked_with_it() -> None:
     assert torch.equal(tracked_views(moving, points).motion, motions(1.0))
 
 
+@pytest.mark.slow
 def test_the_motion_is_stored_with_the_pose() -> None:
     found, views, _ = refined(motions(1.0))
     poses, moved = found.tracked.T_world_camera, found.tracked.motion
@@ -186,6 +189,7 @@ def test_the_motion_is_stored_with_the_pose() -> None:
     assert f"by {metres:.2g} and {degrees(radians):.2g}°" in lines[1]
 
 
+@pytest.mark.slow
 def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     points, views, _ = capture(motions(1.0), 0.004)
     monkeypatch.setattr(
@@ -238,6 +242,7 @@ def test_the_columns_of_a_portrait_image_are_the_rows_of_its_sensor() -> None:
     assert evidence_prior(tracked_views(views, points)) != STILL
 
 
+@pytest.mark.slow
 def test_a_trial_finds_the_motions_that_the_map_knows() -> None:
     """If it took the images of moving cameras as still, their keypoints would seem to have large common errors."""
     count = 48

@@ -65,6 +65,7 @@ class WithoutDistances(MapWithLandmarks):
     has_distances: bool = False
 
 
+@pytest.mark.slow
 def test_an_accepted_pose_is_imprecise_and_a_rejected_one_stays_rejected() -> None:
     scene = textured_map()
     flat = WithoutDistances(scene.field, scene.bounds, scene.landmarks)

@@ -43,6 +43,7 @@ def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:
     return replace(found, cameras=cameras)
 
 
+@pytest.mark.slow
 def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stored(monkeypatch, landmarks_of(CAMERA))
     status, out, err = bidnerf("localize", "MAP", photo, "--json")
@@ -102,6 +103,7 @@ def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
     assert error.rotation_deg < 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.15])
 def test_colours_alone_do_not_tell_an_approximate_focal_length(photo: Path, factor: float) -> None:
     """Neither landmarks of unknown cameras nor colours: the ground looks nearly flat."""

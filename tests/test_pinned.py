@@ -37,12 +37,14 @@ the number of steps: an Intel processor takes 40 for the 41 of the AMD one of th
 SEARCH_TOLERANCE = 3e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in RECORD if name not in SEARCHED])
 def test_the_answer_is_the_recorded_one(name: str) -> None:
     found = pinned_poses.row(all_cases()[name].run())
     assert pinned_poses.differences(RECORD[name], found) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SEARCHED)
 def test_the_answer_of_a_search_is_about_the_recorded_one(name: str) -> None:
     found = pinned_poses.row(all_cases()[name].run())

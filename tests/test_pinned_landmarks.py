@@ -29,6 +29,7 @@ def all_cases() -> dict[str, Case]:
     return {case.name: case for case in pinned_landmarks.cases()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORD)
 def test_the_answer_is_the_recorded_one_and_right(name: str) -> None:
     known, case = RECORD[name], all_cases()[name]

@@ -14,6 +14,9 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
+
 ROOT = Path(__file__).parent.parent
 PLUGINS = sorted(file.parent for file in (ROOT / "plugins").glob("*/pyproject.toml"))
 BUNDLED = {folder.name for folder in (ROOT / "backends").iterdir()}
@@ -61,7 +64,6 @@ def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
     return {(e["group"], e["name"]): e["distribution"] for e in listed if e["fault"] is None}
 
 
-@pytest.mark.slow
 @every_plugin
 def test_a_plugin_is_found(plugin: Path, tmp_path: Path) -> None:
     source = copied(plugin, tmp_path)
@@ -92,7 +94,6 @@ def imported(file: Path) -> set[str]:
     }
 
 
-@pytest.mark.slow
 def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:
     """The commands of its README, word for word."""
     if shutil.which("perl") is None:

@@ -86,6 +86,7 @@ SETTINGS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_view_finds_its_place() -> None:
     field = GaussianBlobs.random()
     truth = orbit(4.0, 3, seed=1)[1]

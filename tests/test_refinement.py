@@ -31,6 +31,7 @@ def rendered(**refinement: Any) -> RenderedCostSettings:
     return RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings(**refinement))
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_many_trials() -> None:
     """Noise of known size on colour and depth: squared errors in units of the covariance average to 6."""
     settings = rendered(least_weight=0)

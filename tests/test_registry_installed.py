@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
+
 GOOD = """from dataclasses import dataclass
 
 @dataclass(frozen=True)
@@ -131,7 +134,6 @@ def test_the_healthy_are_listed_the_broken_marked_and_none_imported(site: Path) 
     assert bidnerf(site, "backends").returncode == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "parts"),
     [
@@ -152,7 +154,6 @@ def test_a_fault_is_told_in_one_line_when_that_backend_is_asked_for(
         assert part in done.stderr
 
 
-@pytest.mark.slow
 def test_of_two_versions_the_one_that_import_would_take_is_loaded(site: Path) -> None:
     done = bidnerf(site, "train", "nowhere", "--backend", "renewed", "--out", str(site / "map"))
     assert "nowhere: no such folder" in done.stderr  # it was loaded, and then there was no data

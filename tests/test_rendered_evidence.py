@@ -158,6 +158,7 @@ def test_a_mirrored_image_stays_rejected_where_renderings_are_compared() -> None
     assert rejection.outcome is Outcome.MIRRORED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rays", "expected"), [(1024, Outcome.CONVERGED), (0, Outcome.AMBIGUOUS)])
 def test_renderings_decide_where_keypoints_do_not_tell_an_image_from_its_mirror_image(
     rays: int, expected: Outcome, monkeypatch: pytest.MonkeyPatch

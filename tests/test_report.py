@@ -154,6 +154,7 @@ def read(folder: Path) -> Page:
     return page
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_beside_it(
     tmp_path: Path, results: list[TrialResult], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -356,6 +357,7 @@ def harmless(text: str) -> bool:
     return all(character.isprintable() or character == "\n" for character in text)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path / "r.jsonl", *map(hostile_result, range(4)))

@@ -34,6 +34,7 @@ def ground() -> Map:
     return Map(info, known.field, known.surface, known.landmarks)
 
 
+@pytest.mark.slow
 def test_all_that_is_computed_scales(ground: Map) -> None:
     view, large = unseen(), ground.scaled(4.0)
     assert (ground.unit, large.unit) == ("units", "metres")
@@ -50,6 +51,7 @@ def test_all_that_is_computed_scales(ground: Map) -> None:
     assert len(levels(large.field)) == len(levels(ground.field))
 
 
+@pytest.mark.slow
 def test_scaling_back_gives_the_same_answers(ground: Map) -> None:
     """To the last bit for a power of two, whose products are exact."""
     back = ground.scaled(0.5).scaled(2.0, "units")

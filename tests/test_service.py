@@ -366,6 +366,7 @@ def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place)
     assert service.pool.metrics.restarts["died"] == before + 1
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, place: Place) -> None:
     nursery = service.pool._nursery
     assert nursery is not None

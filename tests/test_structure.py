@@ -33,6 +33,9 @@ from commands import Run
 from photo_files import write_photo
 from photo_room import CAMERA, looking, photograph, walk, write_photos
 
+pytestmark = pytest.mark.slow
+
+
 pytest.importorskip("pycolmap")
 
 PLACED, OTHERS = 9, 4
@@ -92,7 +95,6 @@ def errors(views: dict[str, bn.View], truth: dict[str, bn.SE3]) -> tuple[float, 
     return max(float(e.translation) for e in found), max(float(e.rotation_deg) for e in found)
 
 
-@pytest.mark.slow
 def test_photos_without_poses_get_the_true_ones(search: Search) -> None:
     views = {view.frame.name: view for view in all_views(bn.open_dataset(search.out))}
     assert sorted(views) == [f"{number:03d}" for number in range(PLACED)]
@@ -152,7 +154,6 @@ def test_poses_that_were_found_are_not_sought_again(search: Search, tmp_path: Pa
         bn.find_poses(fewer, search.out)
 
 
-@pytest.mark.slow
 def test_train_takes_photos_without_poses(
     search: Search, bidnerf: Run, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -262,7 +263,6 @@ def test_damaged_files_of_earlier_work_are_made_anew(search: Search, tmp_path: P
         record.write_bytes(whole)
 
 
-@pytest.mark.slow
 def test_photos_from_one_place_are_refused(tmp_path: Path) -> None:
     write_photos(tmp_path / "turned", [looking((0, 0, 0), (1.7, 0.5 + 0.25 * n, 0.1)) for n in range(4)])
     with pytest.raises(
@@ -271,7 +271,6 @@ def test_photos_from_one_place_are_refused(tmp_path: Path) -> None:
         bn.find_poses(tmp_path / "turned", tmp_path / "out")
 
 
-@pytest.mark.slow
 def test_three_photos_of_one_wall_by_a_known_camera(tmp_path: Path) -> None:
     """A plane determines poses if the camera is known; the camera that was given is kept."""
     poses = [looking((0.2, -0.9 + 0.8 * n, 0.3 * (n % 2) - 0.2), (2, 0.1 * n, 0.1)) for n in range(4)]
@@ -386,7 +385,6 @@ def test_frames_are_chosen_at_equal_steps_of_motion_the_sharpest_near_each() -> 
     assert MOST / 2 < len(chosen(long)) <= MOST
 
 
-@pytest.mark.slow
 def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path) -> None:
     """The camera moves, rests with trembling hands, and moves again; one frame in three is blurred."""
     generator = np.random.default_rng(0)

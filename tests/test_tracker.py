@@ -99,7 +99,7 @@ def test_frames_that_show_nothing_do_not_delay_the_search(count: int) -> None:
 @pytest.mark.slow
 def test_frames_that_come_slowly_are_all_searched() -> None:
     """Lost for more frames than are all searched, by images of another place."""
-    count = 5
+    count = 3
     generator = torch.Generator().manual_seed(0)
     tracker, frames = Tracker(localizer(), TrackerConfig(patience=1)), flight()
     slow = [(0.5 * i, f, T) for i, (_, f, T) in enumerate(frames)]

@@ -77,6 +77,7 @@ def test_its_error_is_that_of_its_pose(trial: Trial, folder: Path) -> None:
     assert result.error.translation == pytest.approx(float(error.translation), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_trial_gives_the_same_line_here_and_elsewhere(trial: Trial) -> None:
     first = timeless(run_trial(trial))
     torch.manual_seed(17)

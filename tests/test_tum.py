@@ -83,6 +83,7 @@ def test_images_are_not_opened_before_their_turn(folder: Path) -> None:
         next(iter(sequence))
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_recorded_frames_are_those_of_transforms_json(data_dir: Path, tmp_path: Path) -> None:
     recorded = open_sequence(data_dir / "tum_fr1_xyz")

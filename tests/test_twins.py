@@ -142,6 +142,7 @@ def test_a_start_between_the_places_decides_nothing() -> None:
     assert found.outcome is Outcome.AMBIGUOUS
 
 
+@pytest.mark.slow
 def test_renderings_tell_places_apart_that_look_different() -> None:
     here, there = both_ways()
     assert decided(here, rays=1024).rejection is None

@@ -295,6 +295,7 @@ def test_both_levels_learn_from_a_step() -> None:
     assert outcome.samples_per_ray > 0
 
 
+@pytest.mark.slow
 def test_loss_falls_at_both_levels() -> None:
     field = built()
     views = rgbd_views()
