@@ -208,6 +208,19 @@ def summary(rows: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def condensed(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a capture's row without what its messages say and how long they took."""
+    kept = ("refused", "agreeing", "pairs", "then_agreeing", "remedy_right")
+    wrong = {
+        mistake: {key: found[key] for key in kept if key in found} for mistake, found in row["wrong"].items()
+    }
+    return {
+        "images": row["images"],
+        "right_refused": [part for part, found in row["right"].items() if found["refused"]],
+        "wrong": wrong,
+    }
+
+
 def main() -> None:
     arguments = _lab.parser(__doc__, "pose_conventions")
     arguments.add_argument("data", nargs="+", type=Path, metavar="DATA")
@@ -229,7 +242,8 @@ def main() -> None:
             for name, found in rows[key][kind].items():
                 print(f"{data.name:16} {name:50} {found}", flush=True)
     print(summary(results))
-    _lab.record(given.name, {"summary": summary(results), **results})
+    captures = {name: condensed(row) for name, row in results.items()}
+    _lab.record(given.name, {"summary": summary(results), **captures})
 
 
 if __name__ == "__main__":
