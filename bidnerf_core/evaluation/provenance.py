@@ -25,6 +25,8 @@ from bidnerf_core.io.json import from_plain, read_record, to_plain
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
 SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
 """Folders in which uncommitted changes make a run irreproducible from its commit."""
+LINE = 120
+"""Columns of a record's lines: nested values that fit are written on one."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +145,24 @@ def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
     threads = torch.get_num_threads()
     run = provenance(script_command(), f"one process of {threads} thread{'s' if threads > 1 else ''}")
     record = {"benchmark": path.stem, **to_plain(run), "seed": seed, "results": results}
-    content = json.dumps(record, indent=2, allow_nan=False) + "\n"
+    content = _in_lines(record) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, content.encode())
     return path
+
+
+def _in_lines(value: Any, indent: str = "") -> str:
+    """Return a value as JSON, with each object or list on one line where it fits into ``LINE`` columns."""
+    line = json.dumps(value, allow_nan=False)
+    if len(indent) + len(line) <= LINE or not value or not isinstance(value, (dict, list, tuple)):
+        return line
+    deeper = indent + " "
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(key)}: {_in_lines(part, deeper)}" for key, part in value.items()]
+    else:
+        parts = [_in_lines(part, deeper) for part in value]
+    first, last = "{}" if isinstance(value, dict) else "[]"
+    return f"{first}\n{deeper}" + f",\n{deeper}".join(parts) + f"\n{indent}{last}"
 
 
 def _without_local_path(argument: str, root: Path) -> str:
