@@ -99,28 +99,6 @@ def model(equations: NormalEquations, unknowns: torch.Tensor) -> torch.Tensor:
     return equations.cost + linear + torch.einsum("hi,hij,hj->h", unknowns, equations.hessian, unknowns)
 
 
-def test_elimination_solves_for_all_unknowns_at_once(generator: Generator) -> None:
-    whole = wide(generator)
-    reduced = whole.without_last()
-    step = reduced.solve(torch.zeros(2, dtype=torch.float64))
-    both = -torch.linalg.solve(whole.hessian, whole.gradient)
-    torch.testing.assert_close(step, both[:, :6], rtol=1e-6, atol=1e-9)
-    torch.testing.assert_close(whole.best_last(step), both[:, 6], rtol=1e-6, atol=1e-9)
-    marginal = torch.linalg.inv(whole.hessian)[:, :6, :6]
-    torch.testing.assert_close(torch.linalg.inv(reduced.hessian), marginal)
-
-
-def test_the_reduced_cost_is_that_of_the_best_last_unknown(generator: Generator) -> None:
-    whole = wide(generator)
-    step = 0.1 * torch.randn((2, 6), generator=generator, dtype=torch.float64)
-    best = torch.cat([step, whole.best_last(step)[:, None]], 1)
-    reduced = model(whole.without_last(), step)
-    torch.testing.assert_close(reduced, model(whole, best))
-    for off in (-0.1, 0.1):
-        aside = best + off * torch.eye(7, dtype=torch.float64)[6]
-        assert bool((model(whole, aside) > reduced).all())
-
-
 def test_equations_of_other_unknowns_have_the_value_of_what_they_map_to(generator: Generator) -> None:
     whole = wide(generator)
     updates = torch.randn((7, 3), generator=generator, dtype=torch.float64)

@@ -39,21 +39,6 @@ class NormalEquations:
         """Return the equations in n other unknowns, which the matrix ``updates`` maps to these unknowns."""
         return NormalEquations(self.cost, self.gradient @ updates, updates.mT @ self.hessian @ updates)
 
-    def without_last(self) -> NormalEquations:
-        """Eliminate the last unknown, which takes its best value for each value of the others (Schur complement)."""
-        coupling, own, pull = self.hessian[:, :-1, -1], self.hessian[:, -1, -1], self.gradient[:, -1]
-        share = coupling / own[:, None]
-        return NormalEquations(
-            self.cost - pull**2 / own,
-            self.gradient[:, :-1] - share * pull[:, None],
-            self.hessian[:, :-1, :-1] - share[:, :, None] * coupling[:, None, :],
-        )
-
-    def best_last(self, others: Float[Tensor, "h n"]) -> Float[Tensor, "h"]:
-        """Return the best step of the last unknown, given a step of the others."""
-        row = self.hessian[:, -1]
-        return -(self.gradient[:, -1] + (row[:, :-1] * others).sum(-1)) / row[:, -1]
-
     def chosen(self, which: Tensor, other: NormalEquations) -> NormalEquations:
         """Return these equations where ``which`` (h) holds, and ``other`` elsewhere."""
         return NormalEquations(
