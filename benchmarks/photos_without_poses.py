@@ -54,7 +54,7 @@ def main() -> None:
     known = given.out / "poses" / "poses.json"
     began = time.monotonic()
     found = bn.find_poses(source, given.out / "poses", progress=_quiet())
-    result = to_plain(found) | ({"seconds": time.monotonic() - began} if not known.exists() else {})
+    result = without_files(to_plain(found)) | ({"seconds": time.monotonic() - began} if not known.exists() else {})
     placed = {v.frame.name: v for v in all_views(bn.open_dataset(given.out / "poses"))}
     if given.video:  # frames are named by their numbers
         placed = {order[int(name)]: renamed(view, order[int(name)]) for name, view in placed.items()}
@@ -78,6 +78,12 @@ def main() -> None:
         result["steps_given"] = scene.info.step
     print(json.dumps(result, indent=1))
     _lab.record(given.name, result)
+
+
+def without_files(found: dict[str, Any]) -> dict[str, Any]:
+    """Return what ``find_poses`` says without the places of the files on this machine."""
+    left_out = [{key: each[key] for key in ("photo", "reason")} for each in found["left_out"]]
+    return found | {"left_out": left_out}
 
 
 def renamed(view: View, name: str) -> View:

@@ -701,6 +701,54 @@ def imported(records: Records) -> str:
     return _table(head, rows, records)
 
 
+@table
+def photos(records: Records) -> str:
+    """Maps from photos whose poses are unknown, beside maps from the poses of the datasets."""
+    names = {"photos_doll": "doll", "photos_corridor": "corridor", "photos_tum_video": "TUM, as a video"}
+    rows = []
+    for name, title in names.items():
+        result = records[name]
+        poses, found, given = result["poses"], result["localized"]["found"], result["localized"]["given"]
+        errors = f"{_length(poses['translation']['median'])}, {poses['rotation_deg']['median']:.2f}°"
+        placed = f"{result['placed']} of {result['photos']}"
+        rows.append(
+            (title, placed, errors, *(_of(found[c]) for c in LIMITS), *(_of(given[c]) for c in LIMITS))
+        )
+    ways = [f"{whose} poses: {limits}" for whose in ("found", "given") for limits in LIMITS.values()]
+    return _table(("scene", "placed", "median error of found poses", *ways), rows, records)
+
+
+LIMITS = {"5deg 0.05": "within 5°, 0.05", "1deg 0.02": "within 1°, 0.02"}
+
+
+@table
+def masks(records: Records) -> str:
+    """A person in half of the images, with and without masks."""
+    result = records["masks"]
+    rows = []
+    for scene, ways in result.items():
+        if isinstance(ways, dict):
+            rows += [(scene, way, *_with_person(found)) for way, found in ways.items()]
+    head = (
+        "scene",
+        "training images",
+        "PSNR",
+        "landmarks",
+        "of these on the person",
+        "right",
+        "right, queries with the person",
+    )
+    return _table(head, rows, records)
+
+
+def _with_person(found: Record) -> Iterator[str]:
+    yield _decibels(found["psnr"])
+    yield str(found["landmarks"])
+    yield str(found["on_person"])
+    yield _of(found["as they are"]["5deg 0.05"])
+    yield _of(found["with person"]["5deg 0.05"])
+
+
 def main() -> None:
     """Rewrite the generated blocks of all pages."""
     for page in PAGES:

@@ -118,7 +118,7 @@ def test_a_disk_that_is_full_at_any_write_leaves_whole_files(
     command: str, bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failed = 0
-    for number in (1, 2, 3, 5, 100):
+    for number in (1, 2, 100):
         folder = tmp_path / str(number)
         shutil.copytree(shared / "map", folder / "map")
         words = {
@@ -144,7 +144,7 @@ def test_a_disk_that_is_full_at_any_write_leaves_whole_files(
         assert (status, "No space left on device" in err.splitlines()[-1]) == (1, True), err
         assert temporaries(folder) == []
         load_map(folder / "map")
-    assert failed >= 2
+    assert failed == 2
     assert bidnerf(*words).status == (1 if command == "train" else 0)  # which exists already
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -45,7 +46,13 @@ class RefinementResult:
     step: float  # length of the Gauss-Newton step on these rays (metres, radians)
     poses: SE3  # (steps + 1): the first pose given, then the best one after each step
     losses: Float[Tensor, "s"]  # before each step
-    support: Support  # by these rays
+    fresh: RenderedCost  # of these rays
+    rivals: SE3 | None  # other poses that were found
+
+    @cached_property
+    def support(self) -> Support:
+        """How well these rays distinguish the pose from its rivals, for which they are rendered at many poses."""
+        return rendered_support(self.fresh, self.T, self.rivals)
 
 
 def refine(
@@ -164,7 +171,8 @@ def _assessed(cost: RenderedCost, T: SE3, rivals: SE3 | None, history: History) 
         step=float(torch.linalg.vector_norm(equations.solve(torch.zeros_like(equations.cost))[best])),
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),
-        support=rendered_support(cost, T[best], rivals),
+        fresh=cost,
+        rivals=rivals,
     )
 
 
