@@ -14,12 +14,14 @@ import tiny
 from bidnerf_core import InputError
 from bidnerf_core.mapping import Features, Keypoints, Sift, tracked_views
 from bidnerf_core.mapping.landmarks.features import (
+    byte_of_zero,
     detected,
     paired_squared_distances,
     quantized,
     root_normalized,
     squared_distances,
     strongest,
+    unrelated_distance,
 )
 
 
@@ -76,6 +78,24 @@ def test_root_normalised_descriptors_are_unit_and_compare_as_hellinger(generator
     torch.testing.assert_close(root.norm(dim=-1), torch.ones(5))
     shares = raw / raw.sum(-1, keepdim=True)
     torch.testing.assert_close(root @ root.T, (shares[:, None] * shares).sqrt().sum(-1))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_zero_and_scale_of_descriptors_are_measured(signed: bool, generator: torch.Generator) -> None:
+    exact = torch.randn(4000, 64, generator=generator)
+    exact = exact if signed else exact.abs()
+    bytes_ = quantized(exact / exact.norm(dim=-1, keepdim=True))
+    assert byte_of_zero(bytes_) == (128 if signed else 0)
+    pairs = squared_distances(bytes_[:2000], bytes_[2000:])
+    assert unrelated_distance(bytes_) == pytest.approx(float(pairs.mean().sqrt()), rel=0.01)
+
+
+def test_zero_of_bits_is_half_of_them_and_of_nothing_0(generator: torch.Generator) -> None:
+    bits = 32 * torch.randint(0, 2, (500, 256), generator=generator).byte()
+    assert byte_of_zero(bits) == 16
+    for few in (bits[:0], bits[:1]):
+        assert byte_of_zero(few) == 0
+        assert unrelated_distance(few) == 0
 
 
 def test_quantising_keeps_the_order_of_signed_descriptors(generator: torch.Generator) -> None:

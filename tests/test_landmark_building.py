@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping import LandmarkConfig, LandmarkMap, Sift, build_landmarks, tracked_views
 from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
 from bidnerf_core.mapping.landmarks.building import robust_covariance, update_scatter
-from bidnerf_core.mapping.landmarks.tracks import Matches, joined_tracks, likely_pairs
+from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks, likely_pairs
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 
@@ -222,3 +223,19 @@ def test_scatter_of_updates_is_that_of_the_images_that_moved_if_most_did() -> No
     assert torch.equal(update_scatter([*updates, *[None] * 400]), found)
     for few in ([*updates, *[None] * 401], updates[:7], []):
         assert torch.equal(update_scatter(few), torch.zeros((6, 6), dtype=torch.float64))
+
+
+@pytest.mark.parametrize("zero", [0, 128])
+def test_descriptors_of_one_point_are_averaged_to_their_usual_length(
+    zero: int, generator: torch.Generator
+) -> None:
+    true = normalize(
+        torch.randn(300, 64, generator=generator).abs()
+        if not zero
+        else torch.randn(300, 64, generator=generator)
+    )
+    point = torch.arange(300).repeat(8)
+    seen = normalize(true[point] + 0.05 * torch.rand(2400, 64, generator=generator))
+    length = 512 if not zero else 256
+    found = _mean_descriptors((zero + length * seen).round().clamp(0, 255).byte(), point, 300).float() - zero
+    torch.testing.assert_close(found.norm(dim=-1), torch.full((300,), float(length)), rtol=0.01, atol=0)

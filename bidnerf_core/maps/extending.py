@@ -68,9 +68,8 @@ STAND_IN_SIDE = 320
 """Pixels along the longer side of what the field renders in place of the photos that it was made of."""
 STAND_IN_DEPTHS = 400
 """Number of pixels of such a rendering whose distances are kept in training."""
-SAME_DESCRIPTOR = 0.35
-"""Largest distance of the descriptors of one landmark, as a share of their length."""
-DESCRIPTOR_LENGTH = 512.0
+SAME_DESCRIPTOR = 0.42
+"""Largest distance of the descriptors of one landmark, in units of that between descriptors of different landmarks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,7 +388,7 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     index = torch.from_numpy(np.asarray(near).reshape(len(more), -1))
     deviation = more.deviations.amax(-1)[:, None] + landmarks.deviations.amax(-1)[index]
     descriptors = landmarks.descriptors[index].float() - more.descriptors[:, None].float()
-    alike = descriptors.norm(dim=-1) <= SAME_DESCRIPTOR * DESCRIPTOR_LENGTH
+    alike = descriptors.norm(dim=-1) <= SAME_DESCRIPTOR * landmarks.unrelated_distance
     return ((distance <= 3 * deviation) & alike).any(-1)
 
 

@@ -26,7 +26,6 @@ from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
-from bidnerf_core.mapping.landmarks.features import NORM
 
 RADII = (3.0, 1.5)
 """Radii of the rounds of guided matching, in units of the inlier threshold."""
@@ -38,8 +37,10 @@ LOOSE = 1.3
 """Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
-MAX_DISTANCE = (0.5 * NORM) ** 2
-"""Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
+MAX_DISTANCE = 0.6
+"""Largest descriptor distance of a guided match where no first inliers show what is usual, in units of the distance between
+descriptors of different landmarks.
+"""
 LEAST_GUIDED_MATCHES = 6
 """Least number of guided matches for another round."""
 MAX_REFITS = 2
@@ -92,15 +93,20 @@ def usual_distance(query: LandmarkQuery, inliers: LandmarkMatches) -> float:
     return LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
 
 
+def _most_distance(query: LandmarkQuery) -> float:
+    """Return the largest squared descriptor distance of a guided match, from the map alone."""
+    return (MAX_DISTANCE * query.landmarks.unrelated_distance) ** 2
+
+
 def confirmed(query: LandmarkQuery, matches: LandmarkMatches, T_world_rig: SE3) -> GuidedPose | None:
     """Refine a pose that was found by other means on guided matches; None if there are too few."""
-    radius = RADII[0] * query.threshold
-    found = guided_matches(query.images, query.landmarks, T_world_rig, radius, MAX_DISTANCE)
+    radius, most = RADII[0] * query.threshold, _most_distance(query)
+    found = guided_matches(query.images, query.landmarks, T_world_rig, radius, most)
     if len(found) < LEAST_GUIDED_MATCHES:
         return None
     correlation = query.landmarks.correlation_of(len(found))
     fit = resect(query.observed(found), T_world_rig, radius / 2, query.prior, correlation=correlation)
-    return _refined(query, matches, fit, found, MAX_DISTANCE)
+    return _refined(query, matches, fit, found, most)
 
 
 def _refined(
@@ -214,10 +220,10 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
 
 def visible_and_matching(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
     """Return how many landmarks should be visible from a pose, how many match near there, and how many would by chance."""
-    radius = RADII[0] * query.threshold
+    radius, most = RADII[0] * query.threshold, _most_distance(query)
     projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)
-    matches = sum(len(found.matches(radius, MAX_DISTANCE)) for found in projections)
-    return sum(map(len, projections)), matches, matches_by_chance(projections, radius, MAX_DISTANCE)
+    matches = sum(len(found.matches(radius, most)) for found in projections)
+    return sum(map(len, projections)), matches, matches_by_chance(projections, radius, most)
 
 
 def matches_by_chance(projections: Sequence[ProjectedLandmarks], radius: float, most: float) -> float:

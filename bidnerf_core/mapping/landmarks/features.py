@@ -5,6 +5,7 @@ Any detector that turns an image into ``Keypoints``, a learned one included, can
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -22,6 +23,8 @@ from bidnerf_core.settings import Range, Settings
 
 NORM = 512.0
 """Length of a quantised descriptor, as is customary for SIFT: it makes good use of the range of a byte."""
+MANY = 2**16
+"""Descriptors that are converted to floats at a time: all of a large map would take gigabytes."""
 STRIP = 2**22
 """Pixels that are converted to grey at a time."""
 FIRST_CENTRE = 0.5
@@ -199,6 +202,34 @@ def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
     negative = len(descriptors) > 0 and float(descriptors.min()) < 0
     scaled = descriptors * (NORM / 2 if negative else NORM) + (128 if negative else 0)
     return scaled.round().clamp(0, 255).to(torch.uint8)
+
+
+def unrelated_distance(descriptors: UInt8[Tensor, "n d"]) -> float:
+    """Return the distance (root mean square) of two descriptors that have nothing in common, which is the scale of a detector."""
+    total, squares, count = (
+        torch.zeros(descriptors.shape[1], dtype=torch.float64),
+        0.0,
+        max(1, len(descriptors)),
+    )
+    for part in descriptors.cpu().split(MANY):
+        total += part.sum(0)
+        squares += float(part.double().square().sum())
+    return math.sqrt(max(0.0, 2 * (squares / count - float((total / count).square().sum()))))
+
+
+def byte_of_zero(descriptors: UInt8[Tensor, "n d"]) -> int:
+    """Return the byte that stands for 0 in a channel of descriptors of one length: 0 for SIFT, 128 for those with negative channels.
+
+    It is the centre of the sphere on which they lie: of the bytes ``z``, that for which the squares of the lengths of
+    ``descriptors - z`` vary least.
+    """
+    parts = [part.double() for part in descriptors.split(MANY)]
+    sums = torch.cat([part.sum(1) for part in parts]) if parts else torch.zeros(0, dtype=torch.float64)
+    if not len(sums) or float(sums.var(unbiased=False)) == 0:
+        return 0
+    squares = torch.cat([part.square().sum(1) for part in parts])
+    slope = ((squares - squares.mean()) * (sums - sums.mean())).mean() / sums.var(unbiased=False)
+    return round(min(255.0, max(0.0, float(slope) / 2)))
 
 
 def squared_distances(

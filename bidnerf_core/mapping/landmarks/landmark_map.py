@@ -15,7 +15,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.geometry.independent import KEYPOINTS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, unrelated_distance
 from bidnerf_core.mapping.landmarks.landmark_cells import LandmarkCells
 
 FEW = 20_000
@@ -86,6 +86,11 @@ class LandmarkMap:
         if self.usual_matches <= 0:
             return self.correlation
         return 1 + max(self.correlation - 1, 0.0) * math.sqrt(matches / self.usual_matches)
+
+    @cached_property
+    def unrelated_distance(self) -> float:
+        """The usual distance between descriptors of different landmarks, in whose unit limits of distances are given."""
+        return unrelated_distance(self.descriptors)
 
     @cached_property
     def cells(self) -> LandmarkCells | None:

@@ -15,7 +15,7 @@ from bidnerf_core.camera.rolling_shutter import AT_REST, poses_of_rows
 from bidnerf_core.frames.frame import SeenLandmarks, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.observations import Sightings
-from bidnerf_core.mapping.landmarks.features import Keypoints, squared_distances
+from bidnerf_core.mapping.landmarks.features import MANY, Keypoints, byte_of_zero, squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 EPIPOLAR_BAND = 2.0
@@ -25,7 +25,9 @@ TRACK_RATIO = 0.95
 RATIO_IN_BAND = 0.85
 """Largest ratio of a match's descriptor distance to that of the next best near the epipolar line."""
 DUPLICATE_DISTANCE = 4.0
-"""Distance (pixels) below which keypoints are duplicates: SIFT returns one for each dominant orientation."""
+"""Distance (pixels) below which keypoints are duplicates: SIFT returns one for each dominant orientation. Within the radius of
+what a keypoint describes, others describe much the same.
+"""
 LEAST_BASELINE = 1e-12
 """Distance (metres) between two cameras below which epipolar lines are undefined."""
 
@@ -55,8 +57,6 @@ def _ranks(count: int, others: int) -> list[int]:
     return [rank for rank in ranks if rank < others] or list(range(others))
 
 
-MANY = 2**16
-"""Descriptors that are converted to floats at a time."""
 ROWS = 1024
 """Views whose dissimilarity to all others is computed at a time: no matrix of all pairs is ever in memory."""
 
@@ -111,7 +111,8 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
     mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
     rows = (mutual & best.isfinite()).nonzero()[:, 0]
     best, partner = best[rows], partner[rows]
-    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < DUPLICATE_DISTANCE
+    reach = (b.keypoints.sizes[partner, None] / 2).clamp(min=DUPLICATE_DISTANCE)
+    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < reach
     next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)
     next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
     good = (best < RATIO_IN_BAND**2 * next_in_band) & (best < TRACK_RATIO**2 * next_best)
@@ -293,14 +294,15 @@ def _mean_descriptors(
 ) -> UInt8[Tensor, "n d"]:
     """Return mean descriptors, rescaled to the mean length, since a shorter descriptor is nearer to all others."""
     total, lengths = torch.zeros((count, descriptors.shape[1])), torch.zeros((count, 1))
-    for rows in torch.arange(len(descriptors)).split(MANY):  # as floats, all of them would take gigabytes
-        values = descriptors[rows].float()
+    zero = byte_of_zero(descriptors)
+    for rows in torch.arange(len(descriptors)).split(MANY):
+        values = descriptors[rows].float() - zero
         total.index_add_(0, point[rows], values)
         lengths.index_add_(0, point[rows], torch.linalg.vector_norm(values, dim=-1, keepdim=True))
     number = torch.bincount(point, minlength=count).clamp(min=1)[:, None]
     mean, length = total / number, lengths / number
     scaled = mean * length / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-9)
-    return scaled.round().clamp(0, 255).to(torch.uint8)
+    return (scaled + zero).round().clamp(0, 255).to(torch.uint8)
 
 
 def _mean(values: Float[Tensor, "m c"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n c"]:

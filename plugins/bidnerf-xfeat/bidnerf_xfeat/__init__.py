@@ -1,0 +1,1 @@
+"""XFeat, a learned detector of keypoints, for the landmarks of bidnerf."""

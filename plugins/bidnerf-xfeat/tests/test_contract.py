@@ -1,0 +1,7 @@
+from __future__ import annotations
+
+from bidnerf_core.testing import FeaturesContract
+
+
+class TestXFeat(FeaturesContract):
+    name = "xfeat"
