@@ -103,6 +103,8 @@ if TYPE_CHECKING:
     from bidnerf_core.structure.record import FoundPoses as FoundPoses
     from bidnerf_core.training import Supervision as Supervision
     from bidnerf_core.training import SupervisionConfig as SupervisionConfig
+    from bidnerf_core.viewer.view import MapView as MapView
+    from bidnerf_core.viewer.view import view as view
 
 HOMES = {
     "AutoConfig": "localization",
@@ -126,6 +128,7 @@ HOMES = {
     "Map": "maps.map",
     "MapCollection": "maps.collection",
     "MapSummary": "maps.summary",
+    "MapView": "viewer.view",
     "Observations": "fields.observations",
     "Outcome": "localization",
     "Placement": "maps.collection",
@@ -186,6 +189,7 @@ HOMES = {
     "settings_of": "localization",
     "track": "results.tracked_path",
     "train": "maps.training",
+    "view": "viewer.view",
     "write_poses": "results.pose_files",
     "write_transforms": "datasets",
 }

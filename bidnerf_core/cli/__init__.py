@@ -31,6 +31,7 @@ COMMANDS = {
     "localize": "find the poses of photos, or of a dataset's frames, in a map",
     "track": "find the poses of a sequence's frames in a map, in the order of time",
     "evaluate": "localize many frames from perturbed starts, one JSON line per trial",
+    "view": "look at a map and at localizations in it, on a page",
     "serve": "answer over HTTP: photos in, poses out",
     "compare": "try the same starts in several maps: success, steps, time, memory",
     "report": "make one page of tables, figures and tests of an evaluation",

@@ -29,6 +29,7 @@ from bidnerf_core.localization.landmarks.mirrored import mirror_evidence, mirror
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.propose import confirm, propose
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.recording import ComparedExplanation, current_record
 from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import ColourSettings, RefinementSettings, RefinementStage
@@ -87,6 +88,9 @@ def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed
             same = replace(here, views=here.views[-len(there.views) :])
             rendered = log_odds_by_rendering(same, there, seed)
             odds += math.copysign(max(0.0, abs(rendered) - AT_COPIES), rendered)
+        if (record := current_record()) is not None:
+            T_other = None if other.rival is None else other.rival.T_world_rig
+            record.explanations.append(ComparedExplanation(other.reason, odds, T_other))
         if odds < -DECISIVE and other.rival is None:
             return Decision(Verdict(Outcome.MIRRORED, other.reason))
         if odds < DECISIVE:

@@ -42,6 +42,7 @@ from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm
 from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.risk import within_risk
 from bidnerf_core.localization.search.occluders import nearest_piece
@@ -214,6 +215,8 @@ def _compared_with_landmarks(
     determine it better.
     """
     near = confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True)
+    if near.pose is not None and (record := current_record()) is not None:
+        record.landmarks.append(near.pose)
     verdict = None if near.pose is None else landmark_verdict(near.pose, WITHOUT_SEARCH)
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)

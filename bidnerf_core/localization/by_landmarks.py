@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.errors import enumeration
+from bidnerf_core.errors import amount, enumeration
 from bidnerf_core.geometry.independent import USUAL, independent
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import (
@@ -38,6 +38,7 @@ from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import propose, updated
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.mapping import SurfaceMap
@@ -100,6 +101,9 @@ def answer_by_landmarks(
     if found is None:
         return None
     found = _with_camera_rendered(problem, found, seed) if rays else found
+    if (record := current_record()) is not None:
+        record.landmarks.append(found)
+        record.add(f"refined on {amount(found.inliers, 'landmark')}", found.T_world_camera)
     verdict, fused_rays = landmark_verdict(found), rays if fused else 0
     found = found if verdict.accepted else replace(found, rivals=())
     decision = decide(problem, found.T_world_camera, found, rays, seed)
@@ -204,6 +208,8 @@ def _fused(
         without = replace(answer, left_out=f"{names[0]}, which contradicts the landmarks")
         rest = rays if points is not None else 0
         return _fused(problem.without_depth(), without, None, rest, seed)
+    if (record := current_record()) is not None:
+        record.add(f"fused with {enumeration(names)}", fused.T)
     covariance = fused.covariance + answer.found.shared_covariance
     return replace(answer, T=fused.T, covariance=covariance, terms=names, depth_factor=fused.state.factor)
 

@@ -236,7 +236,7 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
     without a name, which then is empty. Raises ``InputError`` where a matrix is not a rigid transform, or a name occurs twice.
     """
     path = Path(path)
-    entries = _entries(path, read_file(path, "a pose file"))
+    entries = pose_entries(path, read_file(path, "a pose file"))
     found = dict[str, SE3]()
     for entry in entries:
         rows = entry.get("T_world_camera") if isinstance(entry, dict) else entry
@@ -271,7 +271,7 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
     return poses[name]
 
 
-def _entries(path: Path, content: bytes) -> list[Any]:
+def pose_entries(path: Path, content: bytes) -> list[Any]:
     """Return the objects of a file of poses, or its matrix."""
     try:
         found = parse_json(content, str(path), EXPECTED_POSE)

@@ -85,7 +85,7 @@ def serve(
     Raises ``InputError`` for maps and settings that cannot be served, and for a port that is taken.
     """
     try:
-        import uvicorn
+        import uvicorn  # noqa: F401 (tried before the maps are read)
     except ImportError as error:
         raise InputError(NEEDS) from error
     if not hasattr(os, "fork"):
@@ -96,14 +96,28 @@ def serve(
 
     token = token or (None if host is None or is_loopback(host) else secrets.token_urlsafe(24))
     app = service_app(maps, config=config, token=token, method=method, settings=settings, device=device)
+    run_app(app, host, port, lambda address: ready and ready(address, token), stop)
+
+
+def run_app(
+    app: Starlette,
+    host: str | None,
+    port: int,
+    ready: Callable[[str], Any],
+    stop: threading.Event | None = None,
+) -> None:
+    """Run an application on a port until the process is interrupted, or ``stop`` is set; ``ready`` is called with its address.
+
+    Raises ``InputError`` for a port that is taken.
+    """
+    import uvicorn
+
     with _bound(host or LOOPBACK, port) as bound:
         options = uvicorn.Config(
             app, http=_patient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
             server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=GRACE, backlog=CONNECTIONS,
         )  # fmt: skip
-        asyncio.run(
-            _run(app, uvicorn.Server(options), bound, lambda address: ready and ready(address, token), stop)
-        )
+        asyncio.run(_run(app, uvicorn.Server(options), bound, ready, stop))
 
 
 def named(maps: Maps) -> dict[str, Path]:

@@ -25,6 +25,7 @@ from bidnerf_core.localization.landmarks.refinement import (
 )
 from bidnerf_core.localization.landmarks.twins import second_of_plane, twin_of
 from bidnerf_core.localization.landmarks.unguided import unguided_matches
+from bidnerf_core.localization.recording import current_record
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.landmarks.features import Features
 
@@ -166,6 +167,9 @@ def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Can
         free = focal_consensus(data, query.threshold, seed)
         hypotheses = [h for h in (found, free, *_map_camera_consensus(query, matches, seed)) if h is not None]
         found = max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)
+    if found is not None and (record := current_record()) is not None:
+        agreeing = f"{int(found.inliers.sum())} of {len(matches)} matches agree"
+        record.add(f"sample consensus: {agreeing}", found.T_world_rig)
     if found is None or int(found.inliers.sum()) < LEAST_INLIERS:
         return None
     return found

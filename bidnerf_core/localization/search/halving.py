@@ -11,8 +11,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.devices import moved, without_waiting
+from bidnerf_core.errors import amount
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.normal_equations import Cost
+from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.solvers.pivots import Pivot
 
@@ -79,6 +81,9 @@ def search(
             done = descend(stage.cost, T, stage.steps, stage.pivot.to(device).moved, stage.damping)
             scores = done.equations.cost if stage.score is None else stage.score(done.T)
         best = _best(done.T, scores, stage.keep, distinct if keep_runner_up else None)
+        if (record := current_record()) is not None:
+            taken = f"after {stage.steps} steps from each" if stage.steps else "as they were drawn"
+            record.add(f"{amount(len(scores), 'pose')} {taken}; {len(best)} kept", done.T, scores, len(best))
         paths = [path[:, best] for path in (*paths, done.poses[1:])]
         losses = [values[:, best] for values in (*losses, done.costs[:-1])]
         T, compared = done.T[best], best if keep_runner_up else scores.argsort()

@@ -1,0 +1,158 @@
+"""``bidnerf view``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.cli.camera_options import CameraFile, FieldOfView, FocalLength
+from bidnerf_core.cli.folders import check_output
+from bidnerf_core.cli.options import Device, MapFolder, Names, option, parse, require
+from bidnerf_core.cli.output import console, say, show
+from bidnerf_core.cli.progress import counted
+from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
+from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.errors import InputError, UsageError, spelling_hint
+from bidnerf_core.viewer import server
+
+if TYPE_CHECKING:
+    from bidnerf_core.localization import Localizer
+    from bidnerf_core.viewer.answer import ShownAnswer
+    from bidnerf_core.viewer.table import ShownRow
+
+
+def run(arguments: list[str]) -> None:
+    parse("view", view, arguments)
+
+
+def view(
+    map: MapFolder,
+    query: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        option("[QUERY...]", "photos, folders of photos, or one dataset, to localize and to show", ""),
+    ] = (),
+    *,
+    save: Annotated[
+        Path | None, option("PAGE.html", "write one page that opens without a server or a network, and end", "")
+    ] = None,
+    results: Annotated[
+        Path | None, option("FILE", "results of 'bidnerf evaluate', as a table that leads to their frames", "")
+    ] = None,
+    trajectory: Annotated[
+        Path | None, option("FILE", "poses of 'bidnerf track', or of TUM, EuRoC or KITTI", "")
+    ] = None,
+    depth: Annotated[tuple[Path, ...], option("FILE...", "depth images of the photos, in the same order", "")] = (),
+    camera: CameraFile = None,
+    focal: FocalLength = None,
+    hfov: FieldOfView = None,
+    depth_unit: Annotated[float | None, option("METRES", "metres per step of depth images", "")] = None,
+    frame: Annotated[Names, option("NAME...", "frames of a dataset, each on its own", "all of the split")] = (),
+    split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+    most: Annotated[int, option("N", "images that a saved page holds, spread over all")] = 24,
+    method: Annotated[str, option("NAME", "how poses are found")] = "auto",
+    host: Annotated[
+        str | None,
+        option("ADDRESS", "let other machines look, which need the address with its token", "this machine only"),
+    ] = None,
+    port: Annotated[int, option("N", "port to listen on; 0 takes a free one")] = server.PORT,
+    device: Device = "cpu",
+) -> None:  # fmt: skip
+    """Look at a map in a browser, drop photos on it, and see how and why a pose was found or refused. Ctrl-C ends it.
+
+    The photos and frames of QUERY are offered for choice. With --save, they are localized at once, and the page that is
+    written shows the same without a server.
+    """
+    # Imported when a page is made, since help pages do not need it.
+    from bidnerf_core.localization import Localizer
+    from bidnerf_core.maps.map import load_map
+    from bidnerf_core.viewer.trajectories import shown_trajectory
+    from bidnerf_core.viewer.view import page_of
+
+    require("--most", most, 1)
+    require("--port", port, 0, 65535)
+    names = tuple(name for group in frame for name in group)
+    if names and not query:
+        raise UsageError("--frame names frames of a dataset, expected the dataset as QUERY")
+    if save is not None:
+        check_output(save, (*query, *depth, results, trajectory))
+    path = None if trajectory is None else shown_trajectory(trajectory)
+    rows = () if results is None else rows_of(results)
+    scene = load_map(map, device)
+    localizer = Localizer(scene, method, warm_up=save is None)
+    assumed = scene.landmarks.cameras if scene.landmarks is not None and localizer.matches_landmarks else ()
+    photos = PhotoOptions(depth, CameraSource(camera, focal, hfov, assumed), depth_unit)
+    source = None
+    if query:
+        source = open_queries(query, photos, FrameOptions(split), scene.bounds.background, None)
+        source = Chosen(source, places_of(source.names, names, most if save else len(source.names)))
+    if save is not None:
+        answers = () if source is None else _localized(localizer, source)
+        with console.status("drawing the map"):
+            page_of(scene, answers, path, rows).save(save)
+        show(f"look at {save}")
+        return
+    server.serve_view(
+        localizer,
+        source,
+        path,
+        rows,
+        host=host,
+        port=port,
+        ready=lambda address: say(f"look at {address}; Ctrl-C ends"),
+    )
+
+
+def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, ...]:
+    from bidnerf_core.viewer.view import read_and_localized
+
+    answers, count = [], len(source.names)
+    with counted("localizing", "images", count) as report:
+        for place in range(count):
+            answers.append(read_and_localized(localizer, source, place))
+            report(place + 1, count)
+    return tuple(answers)
+
+
+def rows_of(results: Path) -> tuple[ShownRow, ...]:
+    """Return the trials of a file of results as rows of the page's table."""
+    from bidnerf_core.evaluation.results import read_results
+    from bidnerf_core.viewer.table import shown_row
+
+    return tuple(
+        shown_row(
+            row.frame, row.method, row.outcome, row.converged, row.reason, row.confidence,
+            None if row.error is None else (row.error.translation, row.error.rotation_deg), row.covariance, row.T_world_camera,
+        )
+        for row in read_results([results])
+    )  # fmt: skip
+
+
+class Chosen:
+    """Some of the queries of a source."""
+
+    def __init__(self, source: QuerySource, places: Sequence[int]) -> None:
+        self._source, self._places = source, places
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The names of the chosen queries."""
+        return [self._source.names[place] for place in self._places]
+
+    def read(self, place: int) -> Query:
+        """Read the chosen query at an index."""
+        return self._source.read(self._places[place])
+
+
+def places_of(names: Sequence[str], asked: Sequence[str], most: int) -> list[int]:
+    """Return the places of the frames that were asked for, or of at most ``most``, spread over all."""
+    unknown = [name for name in asked if name not in names]
+    if unknown:
+        raise InputError(f"no frame {unknown[0]!r}{spelling_hint(unknown[0], names)}")
+    if asked:
+        return [names.index(name) for name in asked]
+    return list(range(0, len(names), -(-len(names) // most)))

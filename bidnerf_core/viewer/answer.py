@@ -1,0 +1,313 @@
+"""A localization as the page shows it: pictures, steps, matches, ellipsoid, figures and explanations."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.fields.rendering import RenderedImage, render_image
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import symbol
+from bidnerf_core.io.images import reduced, resampled
+from bidnerf_core.localization import Localization
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
+from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.results.errors import pose_error
+from bidnerf_core.viewer.explanations import ShownExplanation, explanations
+from bidnerf_core.viewer.figures import Figure, acceptance_figures
+from bidnerf_core.viewer.packing import Packed, Picture, drawing, packed, photograph
+from bidnerf_core.viewer.rendering import quick_image
+from bidnerf_core.viewer.scene import CameraShape, at_most, rows_of
+
+PICTURE_SIDE, RUNNER_UP_SIDE = 320, 240
+"""Pixels of the longer side of a photo beside its rendering, and beside that of the runner-up: each rendered pixel takes time."""
+MOST_MATCHES = 600
+"""Matches that are shown; of more, every second, third ... one."""
+SIGMAS = 2.0
+"""Semi-axes of the ellipsoid of the position, in standard deviations."""
+APART, TURNED_DEG = 0.1, 10.0
+"""Share of the distance of the scene's middle, and degrees, beyond which another pose of a search is a different answer."""
+TOO_NEAR, RIGHT, TOO_FAR = (0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)
+"""Colours of a rendered depth that is less than, equal to and larger than the measured one."""
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """The ellipsoid of two standard deviations of the position, and the standard deviations of the orientation."""
+
+    axes: tuple[float, ...]  # semi-axes in the world, 9 numbers: an axis a row, the longest first
+    lengths: tuple[float, float, float]  # of the semi-axes
+    rotation_deg: tuple[float, float, float]  # standard deviations about the camera's x, y and z axes
+
+
+@dataclass(frozen=True)
+class ShownStep:
+    """Poses that were considered at the same time."""
+
+    caption: str
+    poses: Packed  # T_world_camera without the last row, float32 (h, 12), best first
+    scores: tuple[float | None, ...]
+    kept: int
+
+
+@dataclass(frozen=True)
+class ShownMatches:
+    """Keypoints, the landmarks that they were matched to, and where those are seen from the pose found."""
+
+    keypoints: Packed  # float32 (m, 2), as shares of the image's width and height
+    projections: Packed  # the same; NaN behind the camera
+    accepted: Packed  # uint8 (m)
+    agreeing: int
+    refused: int
+
+
+@dataclass(frozen=True)
+class DepthDifference:
+    """Rendered depth less measured depth, in colours."""
+
+    picture: Picture
+    range: float  # difference at the ends of the scale
+    median: float  # of its absolute value
+
+
+@dataclass(frozen=True)
+class RunnerUp:
+    """The best other pose."""
+
+    reason: str
+    pose: tuple[float, ...]  # T_world_camera, 16 numbers by rows
+    rendered: Picture | None
+
+
+@dataclass(frozen=True)
+class ShownAnswer:
+    """A localization, or an image that could not be localized, as the page shows it."""
+
+    name: str
+    outcome: str
+    accepted: bool
+    reason: str
+    method: str = ""
+    seconds: float = 0.0
+    loss: float | None = None
+    unit: str = "units"
+    confidence: float | None = None
+    pose: tuple[float, ...] | None = None  # T_world_camera, 16 numbers by rows; None where it is not finite
+    truth: tuple[float, ...] | None = None
+    error: tuple[float, float] | None = None  # of the position, and of the orientation in degrees
+    shape: CameraShape | None = None
+    camera: str = ""  # whose intrinsics were taken
+    ellipsoid: Ellipsoid | None = None
+    observed: Picture | None = None
+    rendered: Picture | None = None
+    depth: DepthDifference | None = None
+    steps: tuple[ShownStep, ...] = ()
+    path: tuple[tuple[float, float, float], ...] = ()  # positions from the start to the pose found
+    matches: ShownMatches | None = None
+    figures: tuple[Figure, ...] = ()
+    explanations: tuple[ShownExplanation, ...] = ()
+    runner_up: RunnerUp | None = None
+
+
+def shown_answer(
+    scene: SceneMap, name: str, found: Localization, frame: Frame | None = None, record: SearchRecord | None = None,
+    truth: SE3 | None = None, side: int = PICTURE_SIDE, quick: bool = False,
+) -> ShownAnswer:  # fmt: skip
+    """Return a localization as JSON values, with renderings of at most ``side`` pixels if its ``frame`` is known.
+
+    ``record`` is that of its search, ``truth`` the true T_world_camera. A ``quick`` answer has renderings of the surface.
+    """
+    T = found.T_world_camera.to("cpu", torch.float64)
+    finite = bool(T.matrix().isfinite().all())
+    given, frame = frame, None if frame is None else found.frame_as_taken(frame)
+    observed = rendered = depth = None
+    if frame is not None:
+        camera = at_most(frame.intrinsics, side)
+        observed = photograph(reduced(frame.rgb, camera.width, camera.height))
+        if finite:
+            rendered, depth = _compared(scene, camera, T, frame, quick)
+    error = None if truth is None or not finite else pose_error(T, truth, found.unit)
+    other = None if record is None or not finite else _runner_up(scene, T, record, frame, quick)
+    return ShownAnswer(
+        name=name,
+        outcome=str(found.outcome),
+        accepted=found.converged and finite,
+        reason=found.reason,
+        method=found.method,
+        seconds=found.seconds,
+        loss=_finite(found.loss),
+        unit=symbol(found.unit),
+        confidence=_finite(found.confidence),
+        pose=rows_of(T) if finite else None,
+        truth=None if truth is None else rows_of(truth),
+        error=None if error is None else (float(error.translation), float(error.rotation_deg)),
+        shape=None if frame is None else CameraShape.of(frame.intrinsics),
+        camera=_camera(given, found),
+        ellipsoid=ellipsoid(T, found.covariance) if finite else None,
+        observed=observed,
+        rendered=rendered,
+        depth=depth,
+        steps=_steps(found, record),
+        path=_path(found.poses),
+        matches=None if frame is None or record is None or not finite else _matches(frame, record),
+        figures=acceptance_figures(found, record),
+        explanations=explanations(found, record),
+        runner_up=other,
+    )
+
+
+def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Ellipsoid | None:
+    """Return the ellipsoid of a pose's position; None where its covariance is not known or not finite."""
+    if covariance is None or not bool(covariance.isfinite().all()):
+        return None
+    turn = T_world_camera.rotation.double().cpu()
+    covariance = covariance.detach().cpu().double()
+    variances, axes = torch.linalg.eigh(turn @ covariance[:3, :3] @ turn.mT)
+    lengths = (SIGMAS * variances.clamp(min=0).sqrt()).flip(0)
+    a, b, c = lengths.tolist()
+    x, y, z = torch.rad2deg(covariance.diagonal()[3:].clamp(min=0).sqrt()).tolist()
+    return Ellipsoid(tuple((axes.flip(1) * lengths).mT.flatten().tolist()), (a, b, c), (x, y, z))
+
+
+def depth_difference(image: RenderedImage, frame: Frame) -> DepthDifference | None:
+    """Return how much farther the field is than what was measured, where both are known; None where nothing is."""
+    if frame.depth is None or not frame.has_depth:
+        return None
+    height, width = image.depth.shape
+    measured = resampled(frame.depth.cpu(), width, height)
+    known = (measured > 0) & (image.depth > 0)
+    if not bool(known.any()):
+        return None
+    off = (image.depth - measured)[known]
+    most = max(float(off.abs().quantile(0.95)), 1e-9)
+    share = torch.zeros_like(measured)
+    share[known] = (off / most).clamp(-1, 1)
+    near, middle, far = (torch.tensor(colour) for colour in (TOO_NEAR, RIGHT, TOO_FAR))
+    towards = torch.where((share > 0)[..., None], far, near)
+    rgb = middle + share.abs()[..., None] * (towards - middle)
+    pixels = torch.cat([rgb, known[..., None].float()], dim=-1)
+    return DepthDifference(
+        drawing((pixels * 255 + 0.5).to(torch.uint8).numpy()), most, float(off.abs().median())
+    )
+
+
+def _compared(
+    scene: SceneMap, camera: Intrinsics, T: SE3, frame: Frame, quick: bool
+) -> tuple[Picture, DepthDifference | None]:
+    if quick:
+        return photograph(quick_image(scene, camera, T)), None
+    image = render_image(scene.field, camera, T, scene.bounds)
+    return photograph(image.rgb), depth_difference(image, frame)
+
+
+def _camera(frame: Frame | None, found: Localization) -> str:
+    if frame is None:
+        return ""
+    if found.intrinsics is not None:
+        return (
+            f"intrinsics taken or estimated by the localization, focal length times {found.focal_factor:.3f}"
+        )
+    return frame.camera_source or "intrinsics as given"
+
+
+def _steps(found: Localization, record: SearchRecord | None) -> tuple[ShownStep, ...]:
+    steps = [] if record is None else list(record.steps)
+    shown = [ShownStep(s.caption, _poses(s.T), _numbers(s.scores), s.kept) for s in steps]
+    last = found.T_world_camera
+    if bool(last.matrix().isfinite().all()):
+        shown.append(ShownStep("the pose found", _poses(last[None]), (0.0,), 1))
+    return tuple(shown)
+
+
+def _poses(T: SE3) -> Packed:
+    return packed(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
+
+
+def _numbers(values: Float[Tensor, "h"]) -> tuple[float | None, ...]:
+    return tuple(_finite(value) for value in values.tolist())
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _path(poses: SE3) -> tuple[tuple[float, float, float], ...]:
+    places = poses.translation.detach().cpu().double()
+    places = places[places.isfinite().all(-1)]
+    return tuple((x, y, z) for x, y, z in places.tolist())
+
+
+def _matches(frame: Frame, record: SearchRecord) -> ShownMatches | None:
+    """Return the matches of the last pose that landmarks were asked about: those it was refined on, and those refused."""
+    if not record.landmarks:
+        return None
+    pose = record.landmarks[-1]
+    pixels, landmarks, agree = _matched(pose)
+    every = max(1, math.ceil(len(pixels) / MOST_MATCHES))
+    size = torch.tensor([frame.intrinsics.width, frame.intrinsics.height], dtype=torch.float64)
+    camera = pose.intrinsics_of(frame.intrinsics) or frame.intrinsics
+    there = pose.T_world_camera.inverse().apply(landmarks)
+    seen = camera.project(there)
+    seen = torch.where(there[:, 2:] > 0, seen, torch.nan)
+    return ShownMatches(
+        packed((pixels / size)[::every].numpy()),
+        packed((seen / size)[::every].numpy()),
+        packed(agree[::every].to(torch.uint8).numpy()),
+        int(agree.sum()),
+        int((~agree).sum()),
+    )
+
+
+def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3"], Tensor]:
+    """Return keypoints (pixels), landmarks (world) and whether they agree: guided matches, and refused ones by appearance."""
+    last = pose.correspondences.view == pose.correspondences.view.max()
+    agree = (torch.linalg.vector_norm(pose.normalized_residuals, dim=-1) <= 3)[last]
+    pixels = pose.pixels[last].double()
+    if pose.guided is None:
+        return pixels, torch.zeros((len(pixels), 3), dtype=torch.float64), agree
+    guided, query = pose.guided, pose.guided.query
+    positions = query.landmarks.positions.double()
+    landmarks = positions[pose.correspondences.landmark[last]]
+    by_looks = guided.matches[guided.matches.view == len(query.images) - 1]
+    kept = torch.isin(by_looks.keypoint, pose.correspondences.keypoint[last])
+    refused = by_looks[~kept]
+    return (
+        torch.cat([pixels, query.pixels(refused).double()]),
+        torch.cat([landmarks, positions[refused.landmark]]),
+        torch.cat([agree, torch.zeros(len(refused), dtype=torch.bool)]),
+    )
+
+
+def _runner_up(
+    scene: SceneMap, T: SE3, record: SearchRecord, frame: Frame | None, quick: bool
+) -> RunnerUp | None:
+    """Return the least unlikely other explanation that has a pose, else the best different pose of the last search."""
+    rivals = [other for other in record.explanations if other.T is not None]
+    if rivals:
+        best = min(rivals, key=lambda other: other.log_odds)
+        assert best.T is not None
+        return _rendered(scene, best.T, best.reason, frame, quick)
+    x, y, z = scene.bounds.centre
+    reach = APART * float((T.translation - torch.tensor([x, y, z], dtype=torch.float64)).norm())
+    for step in reversed([step for step in record.steps if step.compared]):
+        off = pose_error(step.T, T)
+        different = (off.translation > reach) | (off.rotation_deg > TURNED_DEG)
+        if bool(different.any()):
+            place = int(different.nonzero()[0])
+            return _rendered(scene, step.T[place], "the best different pose of the search", frame, quick)
+    return None
+
+
+def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: bool) -> RunnerUp:
+    picture = None
+    if frame is not None:
+        camera = at_most(frame.intrinsics, RUNNER_UP_SIDE)
+        picture, _ = _compared(scene, camera, T, frame, quick)
+    return RunnerUp(reason, rows_of(T), picture)

@@ -1,0 +1,101 @@
+"""Localizations in the background: one at a time, with what they have found so far."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from bidnerf_core.datasets.queries import Query
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.json import to_plain
+from bidnerf_core.localization import Localizer
+from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.viewer.answer import ShownAnswer
+from bidnerf_core.viewer.view import localized
+
+MOST_WAITING = 8
+"""Localizations that may wait."""
+KEPT = 64
+"""Localizations whose answers are kept for whoever asks."""
+
+State = Literal["waiting", "searching", "rendering", "done"]
+
+
+@dataclass
+class Job:
+    """A localization that was asked for."""
+
+    name: str
+    id: str = field(default_factory=lambda: secrets.token_urlsafe(9))
+    state: State = "waiting"
+    record: SearchRecord | None = None
+    answer: ShownAnswer | None = None
+
+    def plain(self, known: str) -> dict[str, Any]:
+        """Return the state as JSON values, with the answer unless the one of the ``known`` state has been seen."""
+        steps = [] if self.record is None else list(self.record.steps)
+        said = {
+            "id": self.id,
+            "name": self.name,
+            "state": self.state,
+            "caption": steps[-1].caption if steps else "",
+        }
+        return said if self.state == known else said | {"answer": to_plain(self.answer)}
+
+
+class Busy(Exception):
+    """So many localizations are waiting that no other is accepted."""
+
+
+class Jobs:
+    """Localizations in one thread, in the order in which they were asked for."""
+
+    def __init__(self, localizer: Localizer) -> None:
+        self._localizer, self._jobs = localizer, dict[str, Job]()
+        self._thread = ThreadPoolExecutor(1, "localizing")
+        self._lock = threading.Lock()
+
+    def begin(self, name: str, read: Callable[[], Query]) -> Job:
+        """Begin to localize what ``read`` returns. Raises ``Busy``."""
+        with self._lock:
+            if sum(job.state == "waiting" for job in self._jobs.values()) >= MOST_WAITING:
+                raise Busy
+            job = Job(name)
+            self._jobs[job.id] = job
+            done = [each.id for each in self._jobs.values() if each.state == "done"]
+            for old in done[: max(0, len(self._jobs) - KEPT)]:
+                del self._jobs[old]
+        self._thread.submit(self._work, job, read)
+        return job
+
+    def find(self, id: str) -> Job | None:
+        """Return a localization that was asked for and is still kept."""
+        return self._jobs.get(id)
+
+    def close(self) -> None:
+        """Drop those that wait."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def _work(self, job: Job, read: Callable[[], Query]) -> None:
+        def begun(record: SearchRecord) -> None:
+            job.record = record
+
+        def found_pose(answer: ShownAnswer) -> None:
+            job.answer, job.state = answer, "rendering"
+
+        job.state = "searching"
+        try:
+            job.answer = localized(self._localizer, read(), begun=begun, found_pose=found_pose)
+        except InputError as error:
+            job.answer = ShownAnswer(job.name, "bad input", False, str(error))
+        except (
+            Exception
+        ) as error:  # whatever a method, a backend or a reader of others raises; the page has to say so
+            job.answer = ShownAnswer(job.name, "fault", False, f"{type(error).__name__}: {error}")
+            raise
+        finally:
+            job.state = "done"

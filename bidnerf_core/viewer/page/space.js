@@ -1,0 +1,298 @@
+// The map in space: points, cameras, poses of the search, ellipsoid and trajectory.
+import { colourOf, numbers, scaleColour } from "./data.js";
+
+const FOV = 55;
+
+const VERTEX = `
+uniform float radius, height, least;
+attribute vec3 tint;
+varying vec3 vTint;
+void main() {
+  vec4 seen = modelViewMatrix * vec4(position, 1.0);
+  gl_Position = projectionMatrix * seen;
+  gl_PointSize = clamp(radius * height * projectionMatrix[1][1] / max(-seen.z, 1e-6), least, 40.0);
+  vTint = tint;
+}`;
+const FRAGMENT = `
+varying vec3 vTint;
+void main() {
+  vec2 off = gl_PointCoord - 0.5;
+  if (dot(off, off) > 0.25) discard;
+  gl_FragColor = vec4(vTint, 1.0);
+}`;
+
+function matrixOf(pose) {
+  return new THREE.Matrix4().set(...pose.slice(0, 12), 0, 0, 0, 1);
+}
+
+// The edges of a camera's pyramid of the given depth, in its own axes (x right, y down, z forward).
+function pyramid(shape, depth) {
+  const s = shape ?? { left: -0.6, right: 0.6, top: -0.45, bottom: 0.45 };
+  const corners = [[s.left, s.top], [s.right, s.top], [s.right, s.bottom], [s.left, s.bottom]].map(([x, y]) => [x * depth, y * depth, depth]);
+  const lines = [];
+  corners.forEach((corner, i) => { lines.push([0, 0, 0], corner, corner, corners[(i + 1) % 4]); });
+  const peak = [(corners[0][0] + corners[1][0]) / 2, corners[0][1] * 1.25, depth];  // marks the upper side of the image
+  lines.push(corners[0], peak, peak, corners[1]);
+  return { lines, corners };
+}
+
+export class Space {
+  constructor(canvas, map) {
+    this.canvas = canvas; this.map = map; this.moved = () => {};
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
+    this.renderer.setClearColor(0, 0);
+    this.scene = new THREE.Scene();
+    this.camera = new THREE.PerspectiveCamera(FOV, 1, map.extent / 2000, map.extent * 60);
+    this.layers = {};
+    this.size = 0.05 * map.extent;
+    for (const name of ["surface", "landmarks", "cameras", "search", "answer", "runner", "matches", "track"]) {
+      this.layers[name] = new THREE.Group();
+      this.scene.add(this.layers[name]);
+    }
+    this.overview();
+    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+    this.resize();
+    this.addMap();
+    const draw = (now) => {
+      if (this.flight) this.fly(now);
+      if (this.dirty) { this.dirty = false; this.renderer.render(this.scene, this.camera); this.drawn = (this.drawn ?? 0) + 1; }
+      requestAnimationFrame(draw);
+    };
+    requestAnimationFrame(draw);
+  }
+
+  changed() { this.dirty = true; }
+
+  resize() {
+    const box = this.canvas.parentElement.getBoundingClientRect();
+    if (!box.width || !box.height) return;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setSize(box.width, box.height, false);
+    this.camera.aspect = box.width / box.height;
+    this.camera.updateProjectionMatrix();
+    const height = box.height * this.renderer.getPixelRatio();
+    this.scene.traverse((each) => { if (each.material?.uniforms?.height) each.material.uniforms.height.value = height; });
+    this.changed();
+    this.moved();
+  }
+
+  // Controls keep the upward direction with which they are made.
+  control(up, target) {
+    this.controls?.dispose();
+    this.camera.up.copy(up);
+    this.controls = new THREE.OrbitControls(this.camera, this.canvas);
+    this.controls.zoomSpeed = 0.8;
+    this.controls.target.copy(target);
+    this.controls.update();
+    this.controls.addEventListener("change", () => { this.changed(); this.moved(); });
+    this.changed();
+    this.moved();
+  }
+
+  overview() {
+    const { extent } = this.map, up = new THREE.Vector3(...this.map.up).normalize();
+    const centre = new THREE.Vector3(...this.map.centre);
+    const level = new THREE.Vector3(Math.abs(up.x) < 0.8 ? 1 : 0, Math.abs(up.x) < 0.8 ? 0 : 1, 0);
+    level.addScaledVector(up, -level.dot(up)).normalize();
+    const behind = new THREE.Vector3(), middle = new THREE.Vector3();
+    for (const { pose } of this.map.cameras) {  // look the way in which the cameras do
+      behind.add(new THREE.Vector3(-pose[2], -pose[6], -pose[10]));
+      middle.add(new THREE.Vector3(pose[3], pose[7], pose[11]));
+    }
+    behind.addScaledVector(up, -behind.dot(up));
+    if (behind.length() > 0.25 * this.map.cameras.length) level.copy(behind.normalize());
+    const narrow = Math.min(1, this.camera.aspect || 1);
+    const from = centre.clone().addScaledVector(level, 1.15 * extent / narrow).addScaledVector(up, 0.7 * extent / narrow);
+    this.camera.fov = FOV;
+    this.camera.updateProjectionMatrix();
+    this.camera.position.copy(from);
+    this.control(up, centre);
+  }
+
+  fit() {
+    const from = this.where();
+    this.overview();
+    this.travel(from);
+  }
+
+  where() {
+    return { position: this.camera.position.clone(), target: this.controls.target.clone(), fov: this.camera.fov };
+  }
+
+  // Move smoothly from another place to the present one.
+  travel(from) {
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+    const to = this.where(), began = performance.now();
+    this.flight = { from, to, began };
+    this.fly(began);
+  }
+
+  fly(now) {
+    const { from, to, began } = this.flight, x = Math.max(0, Math.min(1, (now - began) / 450)), t = x * x * (3 - 2 * x);
+    this.camera.position.lerpVectors(from.position, to.position, t);
+    this.controls.target.lerpVectors(from.target, to.target, t);
+    this.camera.fov = from.fov + t * (to.fov - from.fov);
+    this.camera.updateProjectionMatrix();
+    if (x >= 1) this.flight = null;
+    this.controls.update();
+    this.changed();
+  }
+
+  // Look from a pose, with the field of view of its image.
+  from(pose, shape) {
+    const before = this.where(), m = pose;
+    const up = new THREE.Vector3(-m[1], -m[5], -m[9]), forward = new THREE.Vector3(m[2], m[6], m[10]);
+    const place = new THREE.Vector3(m[3], m[7], m[11]);
+    const s = shape ?? { left: -0.6, right: 0.6, top: -0.45, bottom: 0.45 };
+    const half = Math.max(Math.max(-s.top, s.bottom), Math.max(-s.left, s.right) / this.camera.aspect);
+    this.camera.fov = 2 * Math.atan(1.08 * half) * 180 / Math.PI;
+    this.camera.updateProjectionMatrix();
+    this.camera.position.copy(place);
+    this.control(up, place.clone().addScaledVector(forward, 0.3 * this.map.extent));
+    this.travel(before);
+  }
+
+  // Look at a pose from behind and above, near enough to see what surrounds it.
+  near(pose, distance = 6 * this.size) {
+    const before = this.where(), up = new THREE.Vector3(...this.map.up).normalize();
+    const place = new THREE.Vector3(pose[3], pose[7], pose[11]);
+    const back = new THREE.Vector3(-pose[2], -pose[6], -pose[10]);
+    this.camera.fov = FOV;
+    this.camera.updateProjectionMatrix();
+    this.camera.position.copy(place).addScaledVector(back, distance).addScaledVector(up, 0.55 * distance);
+    this.control(up, place);
+    this.travel(before);
+  }
+
+  show(name, visible) { this.layers[name].visible = visible; this.changed(); }
+
+  clear(name) {
+    for (const child of [...this.layers[name].children]) {
+      this.layers[name].remove(child);
+      child.traverse((each) => { each.geometry?.dispose(); each.material?.map?.dispose(); each.material?.dispose(); });
+    }
+    this.changed();
+  }
+
+  lines(layer, places, colour, { colours = null, opacity = 1, strip = false } = {}) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(places.flat()), 3));
+    if (colours) geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(colours.flat()), 3));
+    const material = new THREE.LineBasicMaterial({ color: colours ? 0xffffff : new THREE.Color(colour), vertexColors: !!colours, opacity, transparent: opacity < 1 });
+    const made = strip ? new THREE.Line(geometry, material) : new THREE.LineSegments(geometry, material);
+    made.frustumCulled = false;
+    this.layers[layer].add(made);
+    this.changed();
+    return made;
+  }
+
+  points(layer, geometry, radius, least) {
+    const height = this.canvas.height || 600;
+    const material = new THREE.ShaderMaterial({
+      vertexShader: VERTEX, fragmentShader: FRAGMENT,
+      uniforms: { radius: { value: radius }, height: { value: height }, least: { value: least } },
+    });
+    const made = new THREE.Points(geometry, material);
+    made.frustumCulled = false;
+    this.layers[layer].add(made);
+    this.changed();
+    return made;
+  }
+
+  addMap() {
+    const { surface, landmarks } = this.map;
+    for (const [name, part, least] of [["surface", surface, 1.5], ["landmarks", landmarks, 2.5]]) {
+      if (!part) continue;
+      const geometry = new THREE.BufferGeometry(), places = numbers(part.points.places), count = places.length / 3;
+      const positions = new Float32Array(places.length), { lower, size } = part.points;
+      for (let i = 0; i < places.length; i++) positions[i] = lower[i % 3] + places[i] / 65535 * size;
+      geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+      let tints;
+      if (part.colours) tints = numbers(part.colours);
+      else { tints = new Uint8Array(3 * count); for (let i = 0; i < count; i++) tints.set([222, 138, 26], 3 * i); }
+      geometry.setAttribute("tint", new THREE.BufferAttribute(tints, 3, true));
+      this.points(name, geometry, 1.7 * part.radius, least);
+    }
+    const places = [];
+    for (const { pose, shape } of this.map.cameras) places.push(...this.moved3(pyramid(shape, 0.35 * this.size).lines, pose));
+    if (places.length) this.lines("cameras", places, "#8a939c", { opacity: 0.8 });
+  }
+
+  moved3(lines, pose) {
+    const m = matrixOf(pose), v = new THREE.Vector3();
+    return lines.map((place) => v.set(...place).applyMatrix4(m).toArray());
+  }
+
+  // A camera's pyramid, with its photo on the far side.
+  frustum(layer, pose, shape, colour, { picture = null, depth = this.size, opacity = 1 } = {}) {
+    const { lines, corners } = pyramid(shape, depth);
+    this.lines(layer, this.moved3(lines, pose), colour, { opacity });
+    if (!picture) return;
+    const geometry = new THREE.BufferGeometry(), quad = this.moved3(corners, pose);
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(quad.flat()), 3));
+    geometry.setAttribute("uv", new THREE.BufferAttribute(new Float32Array([0, 1, 1, 1, 1, 0, 0, 0]), 2));
+    geometry.setIndex([0, 2, 1, 0, 3, 2]);
+    const texture = new THREE.Texture(), image = new Image();
+    texture.colorSpace = THREE.SRGBColorSpace;
+    image.onload = () => { texture.image = image; texture.needsUpdate = true; this.changed(); };
+    image.src = picture;
+    const material = new THREE.MeshBasicMaterial({ map: texture, side: THREE.DoubleSide, transparent: true, opacity: 0.85 });
+    this.layers[layer].add(new THREE.Mesh(geometry, material));
+  }
+
+  axes(layer, pose, length) {
+    const ends = this.moved3([[0, 0, 0], [length, 0, 0], [0, 0, 0], [0, length, 0], [0, 0, 0], [0, 0, length]], pose);
+    const red = [0.85, 0.2, 0.2], green = [0.2, 0.65, 0.25], blue = [0.25, 0.45, 0.95];
+    this.lines(layer, ends, null, { colours: [red, red, green, green, blue, blue] });
+  }
+
+  ellipsoid(layer, pose, axes, factor, colour) {
+    const mesh = new THREE.Mesh(
+      new THREE.SphereGeometry(1, 32, 20),
+      new THREE.MeshBasicMaterial({ color: new THREE.Color(colour), transparent: true, opacity: 0.35, depthWrite: false }),
+    );
+    const [a, b, c] = [0, 3, 6].map((i) => new THREE.Vector3(...axes.slice(i, i + 3)).multiplyScalar(factor));
+    for (const axis of [a, b, c]) if (axis.length() < 1e-9) axis.setLength(1e-9);
+    mesh.matrixAutoUpdate = false;
+    mesh.matrix.makeBasis(a, b, c).setPosition(pose[3], pose[7], pose[11]);
+    mesh.name = "ellipsoid";
+    this.layers[layer].add(mesh);
+    const place = [pose[3], pose[7], pose[11]], ends = [];
+    for (const axis of [a, b, c]) for (const sign of [-1, 1]) ends.push(place.map((x, i) => x + sign * axis.getComponent(i)));
+    this.lines(layer, ends, colour);
+    return mesh;
+  }
+
+  // The poses of a step of the search, coloured by score, the best last so that they are in front.
+  hypotheses(step, shape) {
+    this.clear("search");
+    const rows = numbers(step.poses), count = rows.length / 12, kept = [], others = [], tints = [], grey = [];
+    const known = step.scores.filter((s) => s !== null), low = Math.min(...known), high = Math.max(...known, low + 1e-9);
+    for (let i = count - 1; i >= 0; i--) {
+      const pose = [...rows.subarray(12 * i, 12 * i + 12), 0, 0, 0, 1];
+      const places = this.moved3(pyramid(shape, this.size * (i === 0 ? 0.8 : 0.4)).lines, pose);
+      const score = step.scores[i] ?? high, tint = scaleColour(1 - (score - low) / (high - low));
+      if (i < step.kept) { kept.push(...places); tints.push(...places.map(() => tint)); } else { others.push(...places); grey.push(...places.map(() => tint)); }
+    }
+    if (others.length) this.lines("search", others, null, { colours: grey, opacity: 0.4 });
+    if (kept.length) this.lines("search", kept, null, { colours: tints });
+  }
+
+  // The number of the map's camera that is drawn nearest to a place on the canvas, or -1 if none is near.
+  cameraAt(x, y, reach = 14) {
+    const box = this.canvas.getBoundingClientRect(), v = new THREE.Vector3();
+    let best = -1, least = reach;
+    if (!this.layers.cameras.visible) return best;
+    this.map.cameras.forEach(({ pose }, i) => {
+      v.set(pose[3], pose[7], pose[11]).project(this.camera);
+      const off = Math.hypot((v.x + 1) / 2 * box.width - x, (1 - v.y) / 2 * box.height - y);
+      if (v.z < 1 && off < least) { least = off; best = i; }
+    });
+    return best;
+  }
+
+  pose() {
+    this.camera.updateMatrixWorld();
+    return this.camera.matrixWorld.clone().transpose().toArray();  // by rows; camera axes x right, y up, z backward
+  }
+}

@@ -1,0 +1,201 @@
+"""A map as the page shows it: surface, landmarks, and the cameras of its images with thumbnails."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures.cameras import StoredCamera, poses_of
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import symbol
+from bidnerf_core.maps.map import Map
+from bidnerf_core.viewer.packing import (
+    Packed,
+    PackedPoints,
+    Picture,
+    jpeg,
+    packed_colours,
+    packed_points,
+    photograph,
+)
+from bidnerf_core.viewer.rendering import quick_image
+
+MOST_SURFELS, MOST_LANDMARKS = 120_000, 20_000
+"""Points that a page holds; of more, a random part is shown."""
+THUMBNAIL, THUMBNAIL_QUALITY = 80, 75
+"""Pixels of the longer side of a thumbnail, and its quality as a JPEG."""
+MOST_THUMBNAILS = 60
+"""Thumbnails that a saved page holds, since each has to be rendered."""
+MOST_OF_SCENE = 0.98
+"""Share of the points that the first view of a scene is made for; a few may be far away."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of the surface or of the landmarks; of many, a part."""
+
+    points: PackedPoints
+    colours: Packed | None
+    count: int  # in the map
+    radius: float  # in the unit of the map
+
+
+@dataclass(frozen=True)
+class CameraShape:
+    """The pyramid that a camera sees, by the tangents of its sides, and the size of its image."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+    width: int
+    height: int
+
+    @staticmethod
+    def of(camera: Intrinsics) -> CameraShape:
+        """Return the shape of a camera's pyramid, without the distortion of its lens."""
+        return CameraShape(
+            -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx,
+            -camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy, camera.width, camera.height,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ShownCamera:
+    """A camera of the map's images."""
+
+    name: str
+    pose: tuple[float, ...]  # T_world_camera, 16 numbers by rows
+    shape: CameraShape
+    thumbnail: Picture | None
+
+
+@dataclass(frozen=True)
+class ShownMap:
+    """A map as the page shows it."""
+
+    name: str
+    facts: tuple[tuple[str, str], ...]
+    unit: str  # symbol that follows a length
+    up: tuple[float, float, float]
+    up_source: str  # what the upward direction was found from
+    centre: tuple[float, float, float]
+    extent: float  # in the unit of the map: what the first view should show
+    surface: Points | None
+    landmarks: Points | None
+    cameras: tuple[ShownCamera, ...]
+
+
+def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> ShownMap:
+    """Return a map as JSON values; ``thumbnails`` is the largest number of cameras whose view is rendered."""
+    up = scene.up
+    centre, extent = _framing(scene)
+    return ShownMap(
+        name=scene.folder.resolve().name if scene.folder is not None else "map in memory",
+        facts=_facts(scene),
+        unit=symbol(scene.unit),
+        up=(0.0, 0.0, 1.0) if up is None else up.direction,
+        up_source="not known" if up is None else up.source,
+        centre=centre,
+        extent=extent,
+        surface=_surface(scene),
+        landmarks=_landmarks(scene),
+        cameras=_cameras(scene, thumbnails),
+    )
+
+
+def thumbnail_jpeg(scene: Map, camera: StoredCamera) -> bytes:
+    """Return what a camera of the map sees, as a small JPEG file."""
+    return jpeg(_small_image(scene, camera), THUMBNAIL_QUALITY)
+
+
+def _small_image(scene: Map, camera: StoredCamera) -> Float[Tensor, "h w 3"]:
+    return quick_image(scene, at_most(camera.intrinsics, THUMBNAIL), camera.pose)
+
+
+def at_most(camera: Intrinsics, side: int) -> Intrinsics:
+    """Return a camera with at most ``side`` pixels along its longer side."""
+    scale = side / max(camera.width, camera.height)
+    return camera if scale >= 1 else camera.scaled(scale)
+
+
+def rows_of(T: SE3) -> tuple[float, ...]:
+    """Return a pose as 16 numbers by rows."""
+    return tuple(T.matrix().detach().cpu().double().flatten().tolist())
+
+
+def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
+    up = scene.up
+    surfels = 0 if scene.surface is None else len(scene.surface.surfels)
+    landmarks = 0 if scene.landmarks is None else len(scene.landmarks)
+    return (
+        ("backend", scene.info.backend),
+        ("images", f"{len(scene.info.cameras):,}"),
+        ("surface", f"{surfels:,} surfels" if surfels else "not baked"),
+        ("landmarks", f"{landmarks:,}" if landmarks else "none"),
+        ("lengths", "metres" if scene.unit == "metres" else "units of the map; no scale is known"),
+        ("up", "not known" if up is None else f"from {up.source}"),
+    )
+
+
+def _surface(scene: Map) -> Points | None:
+    if scene.surface is None:
+        return None
+    surfels = scene.surface.surfels
+    some = _some(len(surfels), MOST_SURFELS)
+    radius = scene.surface.cell * max(1.0, (len(surfels) / max(len(some), 1)) ** 0.5) / 2
+    return Points(
+        packed_points(surfels.positions[some]), packed_colours(surfels.rgb[some]), len(surfels), radius
+    )
+
+
+def _landmarks(scene: Map) -> Points | None:
+    if scene.landmarks is None:
+        return None
+    some = _some(len(scene.landmarks), MOST_LANDMARKS)
+    return Points(packed_points(scene.landmarks.positions[some]), None, len(scene.landmarks), 0.0)
+
+
+def _some(count: int, most: int) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randperm(count, generator=generator)[:most].sort().values
+
+
+def _cameras(scene: Map, thumbnails: int) -> tuple[ShownCamera, ...]:
+    cameras = scene.info.cameras
+    every = max(1, math.ceil(len(cameras) / max(thumbnails, 1)))
+    return tuple(
+        ShownCamera(
+            camera.name,
+            rows_of(camera.pose),
+            CameraShape.of(camera.intrinsics),
+            photograph(_small_image(scene, camera), THUMBNAIL_QUALITY)
+            if thumbnails and number % every == 0
+            else None,
+        )
+        for number, camera in enumerate(cameras)
+    )
+
+
+def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
+    """Return the middle of a scene and how far most of it extends."""
+    if scene.surface is not None and len(scene.surface.surfels):
+        points = scene.surface.surfels.positions
+    elif scene.landmarks is not None and len(scene.landmarks):
+        points = scene.landmarks.positions
+    else:
+        x, y, z = scene.bounds.centre
+        return (x, y, z), max(scene.bounds.size)
+    points = points[_some(len(points), 20_000)].cpu().double()
+    if scene.info.cameras:  # as many as if each had seen a hundredth of them
+        places = poses_of(scene.info.cameras).translation
+        points = torch.cat([points, places.repeat(1 + len(points) // (100 * len(places)), 1)])
+    beyond = (1 - MOST_OF_SCENE) / 2
+    low, high = (points.quantile(q, dim=0) for q in (beyond, 1 - beyond))
+    x, y, z = ((low + high) / 2).tolist()
+    return (x, y, z), max(float((high - low).max()), 1e-9)

@@ -1,0 +1,64 @@
+"""The viewer on a port: ``serve_view``, which runs until it is stopped."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Callable
+
+from bidnerf_core.datasets.queries import QuerySource
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization import Localizer
+from bidnerf_core.maps.map import Map
+from bidnerf_core.service.server import run_app
+from bidnerf_core.service.settings import ServiceConfig, checked_token
+from bidnerf_core.viewer.page_state import PageState
+from bidnerf_core.viewer.scene import shown_map
+from bidnerf_core.viewer.table import ShownRow
+from bidnerf_core.viewer.trajectories import ShownTrajectory
+
+PORT = 8010
+NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); --save writes a page without it"
+
+
+def serve_view(
+    localizer: Localizer,
+    source: QuerySource | None = None,
+    trajectory: ShownTrajectory | None = None,
+    results: tuple[ShownRow, ...] = (),
+    *,
+    host: str | None = None,
+    port: int = PORT,
+    token: str | None = None,
+    config: ServiceConfig | None = None,
+    ready: Callable[[str], None] | None = None,
+    stop: threading.Event | None = None,
+) -> None:
+    """Show a map in browsers, which may localize photos in it, until the process is interrupted or ``stop`` is set.
+
+    ``source`` holds images that may be localized by choosing them. Only browsers on this
+    machine are answered, unless a ``host``, such as 0.0.0.0, is named: the address that ``ready`` is called with then holds a
+    ``token``, which is made up where none is given. Raises ``InputError`` without the extra, and for a port that is taken.
+    """
+    try:
+        import uvicorn  # noqa: F401
+
+        from bidnerf_core.service.access import is_loopback
+        from bidnerf_core.viewer.app import Shown, viewer_app
+    except ImportError as error:
+        raise InputError(NEEDS) from error
+    scene = localizer.map
+    if not isinstance(scene, Map):
+        raise InputError(f"the viewer shows a Map, got a {type(scene).__name__}")
+    is_local = host is None or is_loopback(host)
+    token = checked_token(token or (None if is_local else secrets.token_urlsafe(24)))
+    names = () if source is None else tuple(source.names)
+    state = PageState(
+        shown_map(scene, thumbnails=0), live=True, queries=names, trajectory=trajectory, results=results
+    )
+
+    def announce(address: str) -> None:
+        if ready is not None:
+            ready(address if token is None else f"{address}/?token={token}")
+
+    run_app(viewer_app(Shown(localizer, source, state), token, config), host, port, announce, stop)

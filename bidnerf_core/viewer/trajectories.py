@@ -1,0 +1,94 @@
+"""Trajectories as the page shows them: poses in the order of time, with their uncertainty and outcome where a file has them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidnerf_core.datasets.trajectories import read_trajectory
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.io.files import read_file
+from bidnerf_core.results.errors import standard_deviations
+from bidnerf_core.results.pose_files import pose_entries
+from bidnerf_core.viewer.packing import Packed, packed
+
+MOST_POSES = 20_000
+"""Poses that are shown; of more, every second, third ... one."""
+
+
+@dataclass(frozen=True)
+class ShownTrajectory:
+    """The poses of a trajectory; what a file does not say is None, or an empty text."""
+
+    name: str
+    poses: Packed  # T_world_camera without the last row, float32 (n, 12)
+    frames: tuple[str, ...]
+    times: tuple[float | None, ...]  # seconds
+    sigmas: tuple[float | None, ...]  # standard deviation of the position
+    outcomes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Posed:
+    T: SE3
+    frame: str = ""
+    time: float | None = None
+    sigma: float | None = None
+    outcome: str = ""
+
+
+def shown_trajectory(path: Path) -> ShownTrajectory:
+    """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or one of TUM, EuRoC or KITTI.
+
+    Raises ``InputError`` where it holds no pose.
+    """
+    found = _from_json(path) if path.suffix.lower() in (".json", ".jsonl") else _from_rows(path)
+    if not found:
+        raise InputError(f"{path}: holds no pose, expected those of a trajectory")
+    some = found[:: max(1, math.ceil(len(found) / MOST_POSES))]
+    return ShownTrajectory(
+        path.name,
+        packed(SE3.stack([each.T for each in some]).matrix()[:, :3].flatten(1).numpy()),
+        tuple(each.frame for each in some),
+        tuple(each.time for each in some),
+        tuple(each.sigma for each in some),
+        tuple(each.outcome for each in some),
+    )
+
+
+def _from_rows(path: Path) -> list[_Posed]:
+    found = read_trajectory(path)
+    rows = zip(found.times.tolist(), found.rotations, found.translations, strict=True)
+    return [_Posed(SE3(rotation, translation), time=time) for time, rotation, translation in rows]
+
+
+def _from_json(path: Path) -> list[_Posed]:
+    entries = pose_entries(path, read_file(path, "a trajectory"))
+    return [
+        _posed(entry, path) for entry in entries if isinstance(entry, dict) and entry.get("T_world_camera")
+    ]
+
+
+def _posed(entry: dict[str, Any], path: Path) -> _Posed:
+    try:
+        rows = torch.tensor(entry["T_world_camera"], dtype=torch.float64)
+        covariance = entry.get("covariance")
+        sigma = None
+        if covariance is not None:
+            sigma = standard_deviations(torch.tensor(covariance, dtype=torch.float64).reshape(6, 6))[0]
+        time = entry.get("time")
+        time = None if time is None else float(time)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(
+            f"{path}: {entry.get('frame')!r} has no matrices of numbers, expected poses"
+        ) from error
+    finite = sigma is not None and math.isfinite(sigma)
+    return _Posed(
+        pose_from_matrix(rows, f"{path}: T_world_camera"), str(entry.get("frame", "")), time,
+        sigma if finite else None, str(entry.get("outcome", "")),
+    )  # fmt: skip

@@ -1,0 +1,198 @@
+"""The viewer's page: what it says of a localization, and that it is whole, closed and safe."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import viewed
+from bidnerf_core import SE3, InputError, Localizer, view
+from bidnerf_core.localization.acceptance import LandmarkThresholds
+from bidnerf_core.localization.recording import current_record, recorded
+from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid, shown_answer
+from bidnerf_core.viewer.packing import packed_points
+from bidnerf_core.viewer.page_state import PageState
+from bidnerf_core.viewer.saving import MODULES, page_html
+from bidnerf_core.viewer.scene import shown_map
+from bidnerf_core.viewer.view import localized
+from commands import Run
+
+
+@pytest.fixture(scope="module")
+def localizer() -> Localizer:
+    return Localizer(viewed.room())
+
+
+@pytest.fixture(scope="module")
+def found(localizer: Localizer) -> ShownAnswer:
+    return localized(localizer, viewed.query())
+
+
+@pytest.fixture(scope="module")
+def refused(localizer: Localizer) -> ShownAnswer:
+    return localized(localizer, viewed.query(viewed.HOSTILE, seed=5))
+
+
+def test_an_accepted_pose_passes_its_figures(found: ShownAnswer) -> None:
+    assert found.accepted
+    assert found.error is not None
+    assert found.error[0] < 0.02
+    assert all(figure.passed is not False for figure in found.figures)
+    assert found.matches is not None
+    assert found.matches.agreeing >= LandmarkThresholds().inliers
+    assert [step.caption for step in found.steps][-1] == "the pose found"
+    assert found.ellipsoid is not None
+    assert found.observed is not None
+    assert found.rendered is not None
+    assert found.depth is not None
+
+
+def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: ShownAnswer) -> None:
+    assert not refused.accepted
+    assert any(figure.passed is False and figure.fulfilled < 1 for figure in refused.figures)
+    assert max(len(step.scores) for step in refused.steps) > 50  # the hypotheses of the search on the surface
+    assert refused.runner_up is not None
+
+
+def test_probabilities_of_the_answers_to_a_question_add_up(found: ShownAnswer, refused: ShownAnswer) -> None:
+    for answer in (found, refused):
+        for question in {each.question for each in answer.explanations}:
+            total = sum(each.probability for each in answer.explanations if each.question == question)
+            assert (
+                total <= 1 + 1e-9 or question == "which pose"
+            )  # each rival is weighed against the pose alone
+
+
+def test_a_localization_is_not_recorded_unless_asked_for(localizer: Localizer) -> None:
+    query = viewed.query()
+    with recorded() as record:
+        with_record = localizer(query.views)
+    steps = len(record.steps)
+    without = localizer(query.views)
+    assert current_record() is None
+    assert len(record.steps) == steps > 0
+    assert torch.equal(with_record.T_world_camera.matrix(), without.T_world_camera.matrix())
+
+
+def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator: torch.Generator) -> None:
+    root = torch.randn((6, 6), generator=generator, dtype=torch.float64)
+    covariance = root @ root.mT
+    T = SE3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
+    found = ellipsoid(T, covariance)
+    assert found is not None
+    axes = torch.tensor(found.axes, dtype=torch.float64).reshape(3, 3)
+    world = T.rotation @ covariance[:3, :3] @ T.rotation.mT
+    torch.testing.assert_close(axes.mT @ axes, 4 * world)
+    assert found.lengths == tuple(sorted(found.lengths, reverse=True))
+    assert ellipsoid(T, torch.full((6, 6), torch.nan)) is None
+    assert ellipsoid(T, None) is None
+
+
+def test_depth_difference_is_the_offset_of_a_shifted_measurement(localizer: Localizer) -> None:
+    image = localizer.map.render(viewed.query().views[0])
+    frame = viewed.query().frame
+    shifted = depth_difference(
+        image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0))
+    )
+    assert shifted is not None
+    assert math.isclose(shifted.median, 0.25, rel_tol=1e-4)
+    assert depth_difference(image, replace(frame, depth=None)) is None
+
+
+def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) -> None:
+    points = 1000 + 7 * torch.randn((50, 3), generator=generator, dtype=torch.float64)
+    found = packed_points(points)
+    from base64 import b64decode
+
+    places = np.frombuffer(b64decode(found.places.base64), "<u2").reshape(-1, 3)
+    back = np.array(found.lower) + places / 65535 * found.size
+    assert np.abs(back - points.numpy()).max() <= found.size / 65535
+    assert packed_points(points[:0]).places.shape == (0, 3)
+
+
+def test_the_page_holds_its_state_and_hostile_names_stay_text(
+    found: ShownAnswer, refused: ShownAnswer
+) -> None:
+    state = PageState(shown_map(viewed.room(), 2), (found, refused), title=viewed.HOSTILE)
+    page = page_html(state)
+    assert viewed.HOSTILE not in page
+    assert page.count("</script>") == 3  # of the state, of three.js and of the modules
+    held = viewed.state_of(page)
+    assert [answer["name"] for answer in held["answers"]] == ["unseen", viewed.HOSTILE]
+    assert len(held["map"]["cameras"]) == 8
+    assert held["map"]["unit"] == "m"
+
+
+def test_the_page_asks_nobody_for_anything(found: ShownAnswer) -> None:
+    page = page_html(PageState(shown_map(viewed.room(), 0), (found,)))
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    assert "connect-src 'none'" in policy[1]
+    script = re.search(r"script-src ([^;]*);", policy[1])
+    assert script is not None
+    assert "unsafe" not in script[1]
+    assert not re.search(r'(?:src|href)="(?!data:)[^"]', page.partition("<script>")[0])
+    modules = page.rpartition('<script type="module">')[2]
+    assert "import " not in re.sub(r"//.*", "", modules)
+    assert len(MODULES) == len(set(MODULES))
+
+
+def test_names_of_the_pages_modules_are_defined_once() -> None:
+    page = page_html(PageState(shown_map(viewed.room(), 0)))
+    modules = page.rpartition('<script type="module">')[2]
+    names = re.findall(r"^(?:async )?(?:function|class|const|let) (\w+)", modules, re.MULTILINE)
+    assert len(names) == len(set(names))
+
+
+def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(found: ShownAnswer) -> None:
+    query = viewed.query()
+    shown = view(viewed.room(), frame=query.frame)
+    markup = shown._repr_html_()
+    assert 'sandbox="allow-scripts"' in markup
+    source = re.search(r'srcdoc="([^"]*)"', markup)
+    assert source is not None
+    assert viewed.state_of(html.unescape(source[1]))["answers"][0]["outcome"] == "converged"
+    assert "1 localization" in repr(shown)
+
+
+def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(
+    localizer: Localizer, tmp_path: Path
+) -> None:
+    localizer(viewed.query().views).save(tmp_path / "pose.json")
+    from bidnerf_core import Localization
+
+    answer = shown_answer(viewed.room(), "earlier", Localization.load(tmp_path / "pose.json"))
+    assert answer.accepted
+    assert answer.rendered is None
+    assert answer.figures[0].name == "confidence"
+
+
+def test_what_is_no_map_is_refused() -> None:
+    with pytest.raises(InputError, match="expected a Map"):
+        view("room")  # type: ignore[arg-type]
+
+
+def test_view_saves_a_page_of_photos(bidnerf: Run, tmp_path: Path) -> None:
+    photo, page = viewed.photo_file(tmp_path), tmp_path / "page.html"
+    folder = viewed.room().folder
+    done = bidnerf("view", folder, photo, "--save", page)
+    assert done.status == 0, done.err
+    (answer,) = viewed.state_of(page.read_text())["answers"]
+    assert answer["name"] == "photo"
+    assert answer["accepted"], answer["reason"]
+    assert bidnerf("view", folder, photo, "--save", tmp_path / "page.txt").status != 0
+    assert bidnerf("view", folder, photo, "--save", photo).status != 0
+    assert (
+        bidnerf("view", folder, tmp_path / "none.png", "--save", page).status == 0
+    )  # the page says what is wrong
+    (answer,) = viewed.state_of(page.read_text())["answers"]
+    assert not answer["accepted"]
+    assert "none.png" in answer["reason"]

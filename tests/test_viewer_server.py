@@ -1,0 +1,203 @@
+"""The live viewer: photos in, answers out, and nothing else that can be asked for."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import struct
+import tempfile
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from http.client import HTTPConnection
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+from urllib.parse import quote, urlsplit
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra 'viewer' is not installed")
+pytest.importorskip("uvicorn", reason="the extra 'viewer' is not installed")
+
+from PIL import Image
+
+import viewed
+from bidnerf_core import Localizer, ServiceConfig
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.datasets.queries import Photos
+from bidnerf_core.viewer.server import serve_view
+from photo_room import CAMERA
+
+TOKEN = "a-token-of-enough-characters"
+CONFIG = ServiceConfig(max_megabytes=1.0, max_megapixels=1.0)
+VIEW = {"pose": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "width": 32, "height": 24}
+
+
+@dataclass
+class Reply:
+    """An answer over HTTP."""
+
+    status_code: int
+    headers: dict[str, str]
+    content: bytes
+
+    def json(self) -> Any:
+        return json.loads(self.content)
+
+
+@dataclass
+class Client:
+    """Asks a viewer, with paths as they are written."""
+
+    port: int
+
+    def request(
+        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
+    ) -> Reply:
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=120)
+        try:
+            connection.request(method, path, body, headers or {})
+            found = connection.getresponse()
+            return Reply(found.status, {k.lower(): v for k, v in found.getheaders()}, found.read())
+        finally:
+            connection.close()
+
+    def get(self, path: str, **headers: str) -> Reply:
+        return self.request("GET", path, headers=headers)
+
+    def post(self, path: str, content: bytes = b"", **headers: str) -> Reply:
+        return self.request("POST", path, content, headers)
+
+
+@contextlib.contextmanager
+def serving(token: str | None = None) -> Iterator[Client]:
+    """Run a viewer of the room, with one photo to choose."""
+    stop, ready = threading.Event(), SimpleQueue[str]()
+    with tempfile.TemporaryDirectory() as folder:
+        source = Photos([viewed.photo_file(Path(folder))], CameraSource(assumed=(CAMERA,)))
+        options = {"port": 0, "token": token, "config": CONFIG, "ready": ready.put, "stop": stop}
+        thread = threading.Thread(target=serve_view, args=(Localizer(viewed.room()), source), kwargs=options)
+        thread.start()
+        try:
+            yield Client(int(urlsplit(ready.get(timeout=120)).port or 0))
+        finally:
+            stop.set()
+            thread.join(60)
+    assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with serving() as found:
+        yield found
+
+
+def answer_of(client: Client, reply: Any) -> Any:
+    """Wait for the answer that a reply promises."""
+    assert reply.status_code == 202, reply.text
+    until = time.monotonic() + 120
+    while time.monotonic() < until:
+        said = client.get(f"/api/job/{reply.json()['job']}").json()
+        if said["state"] == "done":
+            return said["answer"]
+        time.sleep(0.02)
+    raise AssertionError("no answer")
+
+
+def test_a_photo_that_is_uploaded_is_localized_in_the_background(client: Client, tmp_path: Path) -> None:
+    before = set(Path(tempfile.gettempdir()).glob("bidnerf-view-*"))
+    content = viewed.photo_file(tmp_path).read_bytes()
+    began = time.perf_counter()
+    reply = client.post(f"/api/photo?name={quote(viewed.HOSTILE)}", content)
+    assert time.perf_counter() - began < 1
+    answer = answer_of(client, reply)
+    assert answer["accepted"], answer["reason"]
+    assert answer["name"] == viewed.HOSTILE
+    assert answer["rendered"]["url"].startswith("data:image/jpeg")
+    assert set(Path(tempfile.gettempdir()).glob("bidnerf-view-*")) == before
+
+
+def bomb(side: int) -> bytes:
+    """Return a small PNG file of a very large image."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        check = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    rows = zlib.compress(bytes(1000))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_bad_uploads_are_refused_with_the_reason(client: Client) -> None:
+    assert client.post("/api/photo", bytes(2 * 2**20)).status_code == 413
+    assert client.post("/api/photo").status_code == 400
+    answer = answer_of(client, client.post("/api/photo", bomb(20_000)))
+    assert not answer["accepted"]
+    assert "expected at most 1 megapixels" in answer["reason"]
+    assert tempfile.gettempdir() not in answer["reason"]
+    answer = answer_of(client, client.post("/api/photo", b"no image"))
+    assert answer["outcome"] == "bad input"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/map.json", "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/api/thumbnail/..%2f..%2fetc%2fpasswd",
+        "/api/thumbnail/-1", "/api/thumbnail/8", "/api/thumbnail/../../map.json", "/api/job/..%2f..%2fetc%2fpasswd",
+        "/api/query/0/..%2f..", "//etc/passwd", "/api/thumbnail/1e1",
+    ],
+)  # fmt: skip
+def test_no_file_can_be_asked_for(client: Client, path: str) -> None:
+    for method in ("GET", "POST"):
+        assert client.request(method, path).status_code in (404, 405)
+
+
+def test_images_are_chosen_by_number_among_those_given(client: Client) -> None:
+    assert client.post("/api/query/1").status_code == 404
+    answer = answer_of(client, client.post("/api/query/0"))
+    assert answer["name"] == "photo"
+    assert answer["accepted"]
+
+
+def test_thumbnails_and_renderings_are_images_of_the_size_asked_for(client: Client) -> None:
+    reply = client.get("/api/thumbnail/3")
+    assert max(Image.open(io.BytesIO(reply.content)).size) == 80
+    for quick in (True, False):
+        reply = client.post("/api/view", json.dumps(VIEW | {"quick": quick}).encode())
+        assert Image.open(io.BytesIO(reply.content)).size == (32, 24)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"width": 100_000}, {"height": 0}, {"fov": 1e9}, {"pose": [1, 2]}, {"pose": ["x"] * 16}, {"quick": None, "pose": None},
+        {"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"width": "1e400"},
+    ],
+)  # fmt: skip
+def test_cameras_that_are_none_are_refused(client: Client, wrong: dict[str, Any]) -> None:
+    assert client.post("/api/view", json.dumps(VIEW | {"quick": True} | wrong).encode()).status_code == 400
+
+
+def test_without_a_token_only_pages_of_this_machine_are_answered(client: Client) -> None:
+    assert client.get("/", Host="evil.example").status_code == 403
+    assert client.post("/api/query/0", Origin="https://evil.example").status_code == 403
+    assert client.get("/").status_code == 200
+
+
+def test_a_token_in_the_address_becomes_a_cookie_that_scripts_cannot_read() -> None:
+    with serving(TOKEN) as client:
+        for path in ("/", "/?token=wrong", "/api/thumbnail/0", f"/api/thumbnail/0?token={TOKEN}"):
+            assert client.get(path).status_code == 401
+        reply = client.get(f"/?token={TOKEN}")
+        assert reply.status_code == 303
+        assert reply.headers["location"] == "/"
+        cookie = reply.headers["set-cookie"]
+        assert "httponly" in cookie.lower()
+        assert "samesite=strict" in cookie.lower()
+        assert client.get("/", Cookie=cookie.partition(";")[0]).status_code == 200
+        assert client.get("/", Cookie="bidnerf_token=other").status_code == 401
