@@ -164,6 +164,7 @@ class Importance:
 
     field: RadianceField
     count: int
+    padding: float = 1e-5  # added to the weight of each interval, so that some places are found anywhere
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         with torch.no_grad():
@@ -171,7 +172,7 @@ class Importance:
             if rough.starts.shape[-1] == 0:
                 return rough
             weights = rendering_weights(query_samples(self.field, rays, rough).density, rough)
-            weights = torch.where(rough.valid, weights + 1e-5, 0)
+            weights = torch.where(rough.valid, weights + self.padding, 0)
             return _cut(rough, *inverse_transform(rough, weights, self.count, jitter))
 
 

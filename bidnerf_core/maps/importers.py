@@ -41,6 +41,9 @@ class ImportedField:
         None  # points (metres, world) on the matter of a scan, and their colours: its surface, which need not be rendered
     )
     is_coloured: bool = True  # whether its colours mean something; otherwise renderings give no landmarks
+    photos: Path | None = (
+        None  # dataset of its training images, whose poses are in the world; not used where others are given
+    )
     is_solid: bool = False  # whether matter encloses no free space, so that the scene is seen from around it
 
 

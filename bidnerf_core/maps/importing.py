@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of
@@ -94,7 +95,8 @@ def import_map(
         found = chosen.read(path, settings, placement)
         for line in found.found:
             log.info(f"{path}: {line}")
-        read = None if photos is None else read_views(photos, split, progress=progress, cancel=cancel)
+        images = _own_photos(found, str(path)) if photos is None else photos
+        read = None if images is None else read_views(images, split, progress=progress, cancel=cancel)
         views: list[View] = [] if read is None else read.views
         unit: LengthUnit = "metres" if scale != 1 else "units" if read is None else read.unit
         _tell_extent(found, str(path), unit)
@@ -115,6 +117,19 @@ def import_map(
             scene = replace(scene, info=save_map(place, scene.info, state), folder=place)
         settings_of_bake = bake if isinstance(bake, BakeConfig) else USUAL_BAKE
         return _baked(scene, found, views, settings_of_bake, progress, cancel) if bake else scene
+
+
+def _own_photos(found: ImportedField, where: str) -> Dataset | None:
+    """Return the dataset of the training images that the file names, or None where that names none or cannot be read."""
+    if found.photos is None:
+        return None
+    try:
+        dataset = open_dataset(found.photos)
+    except InputError as error:
+        log.info(f"{where}: the images of its training cannot be read: {error}")
+        return None
+    log.info(f"{where}: photos of its training in {found.photos}")
+    return dataset
 
 
 def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], where: str) -> Any:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.torch_files import check_sizes, read_saved
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 
+EXPECTED = "a checkpoint of nerf-pytorch"
 NETWORKS = {"coarse": "model_coarse_state_dict", "fine": "model_fine_state_dict"}
 HIDDEN = re.compile(r"layers_xyz\.\d+\.weight")
 
@@ -33,11 +33,12 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
     ``octaves`` is the only choice that the weights do not show. Raises ``InputError``, in one line, where there is no such
     file, it holds code or is not a checkpoint of nerf-pytorch, the fine network is missing, or the architecture is unknown.
     """
-    found = _loaded(path)
+    found = read_saved(path, EXPECTED)
     if not isinstance(found, dict) or not isinstance(found.get(NETWORKS["coarse"]), dict):
         raise InputError(f"{path}: no {NETWORKS['coarse']!r} in it, expected a checkpoint of nerf-pytorch")
     if not isinstance(found.get(NETWORKS["fine"]), dict):
         raise InputError(f"{path}: it has no fine network, expected a coarse and a fine one")
+    check_sizes(path, [found[key] for key in NETWORKS.values()], EXPECTED)
     kinds: dict[str, NetworkConfig] = {}
     tensors: dict[str, Tensor] = {}
     for level, key in NETWORKS.items():
@@ -47,23 +48,6 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
         raise InputError(f"{path}: the networks differ ({kinds['coarse']}; {kinds['fine']}), expected alike")
     steps = found.get("iter")
     return Checkpoint(kinds["fine"], tensors, steps + 1 if type(steps) is int and steps >= 0 else 0)
-
-
-def _loaded(path: Path) -> Any:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a checkpoint of nerf-pytorch")
-    path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # each kind of damage raises another exception
-        code = re.search(r"GLOBAL ([\w.]+)", str(error))
-        if isinstance(error, pickle.UnpicklingError) and code:
-            raise InputError(
-                f"{path}: it would run code ({code[1]}) and was not read, expected tensors and numbers only"
-            ) from error
-        raise InputError(
-            f"{path}: not written by torch.save, or damaged ({type(error).__name__}); expected a checkpoint"
-        ) from error
 
 
 def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> NetworkConfig:

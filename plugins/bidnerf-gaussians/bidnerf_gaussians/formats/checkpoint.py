@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.torch_files import check_sizes, read_saved
 from bidnerf_gaussians.gaussians import Gaussians
 
 EXPECTED = "a checkpoint of gsplat or splatfacto"
@@ -41,11 +40,7 @@ def read(path: Path) -> Gaussians:
     missing = [name for name in ("means", "log_scales", "quaternions", "logits", "sh0") if name not in found]
     if missing:
         raise InputError(f"{path}: has no {', '.join(missing)}, expected {EXPECTED}")
-    needed, size = sum(value.numel() * value.element_size() for value in found.values()), path.stat().st_size
-    if needed > size:  # a stored number may stand for any count of them
-        raise InputError(
-            f"{path}: its tensors have {needed:,} bytes, for which its {size:,} bytes are too few"
-        )
+    check_sizes(path, found, EXPECTED)
     try:
         parts = {name: value.float() for name, value in found.items()}
         count = len(parts["means"])
@@ -60,16 +55,7 @@ def read(path: Path) -> Gaussians:
 
 
 def _parameters(path: Path) -> dict[str, Tensor]:
-    try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # each kind of damage raises another exception
-        code = re.search(r"GLOBAL ([\w.]+)", str(error))
-        if isinstance(error, pickle.UnpicklingError) and code:
-            raise InputError(
-                f"{path}: it would run code ({code[1]}) and was not read, expected {EXPECTED}"
-            ) from error
-        raise InputError(f"{path}: not written by torch.save, or damaged ({type(error).__name__})") from error
-    tensors = _inside(found)
+    tensors = _inside(read_saved(path, EXPECTED))
     return {
         ours: tensors[theirs] for theirs, ours in NAMES.items() if isinstance(tensors.get(theirs), Tensor)
     }

@@ -1,0 +1,82 @@
+"""Files that ``torch.save`` wrote, read without running code in them."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+
+CODE = re.compile(r"GLOBAL ([\w.]+)")
+"""How torch names what a file wanted to call."""
+
+
+class _Ignored:
+    """Stands for a number of NumPy, which programs store among the settings of their optimizers; nothing of it is kept."""
+
+    def __init__(self, *parts: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        pass
+
+
+STAND_INS = (
+    "numpy._core.multiarray.scalar", "numpy.core.multiarray.scalar", "numpy.dtype", "numpy.dtypes.Float64DType",
+    "numpy.dtypes.Float32DType", "_codecs.encode",
+)  # fmt: skip
+"""Names in pickles that become ``_Ignored`` rather than what they name."""
+
+
+def read_saved(path: Path, expected: str) -> Any:
+    """Return what ``torch.save`` wrote: tensors and numbers in dicts and lists. Numbers of NumPy come back as placeholders.
+
+    ``expected`` says in a few words what the file should be. Raises ``InputError``, in one line, where there is no such file,
+    it is damaged, or it would run code. A tensor may be larger than what is stored of it, see ``check_sizes``.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, expected {expected}")
+    path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
+    try:
+        with torch.serialization.safe_globals([(_Ignored, name) for name in STAND_INS]):
+            found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # each kind of damage raises another exception
+        code = CODE.search(str(error))
+        if isinstance(error, pickle.UnpicklingError) and code:
+            raise InputError(
+                f"{path}: it would run code ({code[1]}) and was not read, expected {expected}"
+            ) from error
+        raise InputError(
+            f"{path}: not written by torch.save, or damaged ({type(error).__name__}); expected {expected}"
+        ) from error
+    return found
+
+
+def check_sizes(path: Path, found: Any, expected: str) -> None:
+    """Raise ``InputError`` for a tensor in which a stored number stands for many, to be called before it is copied."""
+    size = path.stat().st_size
+    for tensor in _tensors(found):
+        needed = tensor.numel() * tensor.element_size()
+        held = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
+        if needed > min(held, size):
+            raise InputError(
+                f"{path}: a tensor {tuple(tensor.shape)} has {needed:,} bytes, for which its {size:,} bytes are too few;"
+                f" expected {expected}"
+            )
+
+
+def _tensors(found: Any) -> Iterator[Tensor]:
+    if isinstance(found, Tensor):
+        yield found
+    elif isinstance(found, dict):
+        for value in found.values():
+            yield from _tensors(value)
+    elif isinstance(found, list | tuple):
+        for value in found:
+            yield from _tensors(value)

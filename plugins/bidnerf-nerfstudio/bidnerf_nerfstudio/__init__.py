@@ -1,0 +1,1 @@
+"""Trained runs of nerfstudio as maps: nerfacto, instant-ngp and vanilla-nerf, rebuilt in PyTorch."""

@@ -1,0 +1,168 @@
+"""The parts of which nerfstudio's fields are made: hash encoding, layers, spherical harmonics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bidnerf_core.devices import constant
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.contraction import contract
+from bidnerf_core.settings import Count, Layers, Range, Settings
+
+PRIMES = (1, 2654435761, 805459861)
+"""Factors of the coordinates in the hash (Müller et al. 2022, eq. 4)."""
+LARGEST_LOG_DENSITY = 15.0
+"""Limit of the exponent of densities: what is that dense is opaque within a thousandth of any length that matters."""
+FIRST_TABLE = 1e-3
+"""Largest entry of an untrained table."""
+
+
+@dataclass(frozen=True)
+class HashConfig(Settings):
+    """A multiresolution hash encoding, and the layers that follow it."""
+
+    levels: Annotated[int, Range(1, 64)] = 16  # levels of resolution
+    features: Annotated[int, Range(1, 64)] = 2  # features of an entry
+    log2_table_size: Annotated[int, Range(1, 30)] = 19  # entries of a level's table, as a power of two
+    base_resolution: Annotated[int, Range(1, 2**20)] = 16  # cells along a side at the coarsest level
+    finest_resolution: Annotated[int, Range(1, 2**20)] = 2048  # cells along a side at the finest level
+    width: Count = 64  # units of a hidden layer
+    layers: Layers = 2  # layers of weights, the last one included
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.base_resolution > self.finest_resolution:
+            raise InputError(
+                f"base_resolution is {self.base_resolution}, expected {self.finest_resolution} (finest_resolution) or less"
+            )
+
+
+class HashEncoding(nn.Module):
+    """Positions in the unit cube as the concatenated features of all levels, all of which are hashed."""
+
+    def __init__(self, config: HashConfig) -> None:
+        super().__init__()
+        self.size = 2**config.log2_table_size
+        count = config.levels
+        growth = 1.0
+        if count > 1:
+            ratio = math.log(config.finest_resolution) - math.log(config.base_resolution)
+            growth = math.exp(ratio / (count - 1))
+        # In single precision as in nerfstudio, since the fraction that is cut off decides the resolution.
+        self.resolutions: tuple[float, ...] = tuple(
+            torch.floor(config.base_resolution * growth ** torch.arange(count)).tolist()
+        )
+        table = torch.rand(self.size * count, config.features) * 2 - 1
+        self.table = nn.Parameter(table * FIRST_TABLE)
+
+    def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n w"]:
+        """Return the features of each level after those of the level before."""
+        return torch.cat([self._level(points, number) for number in range(len(self.resolutions))], dim=-1)
+
+    def _level(self, points: Float[Tensor, "n 3"], number: int) -> Float[Tensor, "n f"]:
+        scaled = points * self.resolutions[number]
+        lower = scaled.detach().floor()
+        x, y, z = (scaled - lower).unbind(-1)
+        corner = lower.long()
+        a, b, c = (
+            torch.stack([corner[:, axis], corner[:, axis] + 1]) * prime for axis, prime in enumerate(PRIMES)
+        )
+        places = (a[:, None, None] ^ b[None, :, None] ^ c[None, None]) & (self.size - 1)
+        entries = self.table.index_select(0, places.reshape(-1) + number * self.size)
+        found = entries.reshape(2, 2, 2, len(points), entries.shape[-1])
+        for weight in (x, y, z):
+            found = torch.lerp(found[0], found[1], weight[:, None].expand_as(found[0]))
+        return found
+
+
+class Perceptron(nn.Module):
+    """Linear layers with ReLU between them."""
+
+    def __init__(self, inputs: int, width: int, outputs: int, layers: int, skip: int | None = None) -> None:
+        super().__init__()
+        self.skip = skip  # number of the layer to which the input is given once more
+        widths = [inputs, *[width] * (layers - 1), outputs]
+        self.layers = nn.ModuleList(
+            nn.Linear(a + (inputs if number == skip else 0), b)
+            for number, (a, b) in enumerate(pairwise(widths))
+        )
+
+    def forward(self, given: Float[Tensor, "n i"]) -> Float[Tensor, "n o"]:
+        """Return the outputs, without an activation."""
+        found = given
+        for number, layer in enumerate(self.layers):
+            if number:
+                found = found.relu()
+            if number == self.skip:
+                found = torch.cat([given, found], dim=-1)
+            found = layer(found)
+        return found
+
+
+class HashNetwork(nn.Module):
+    """A hash encoding followed by layers."""
+
+    def __init__(self, config: HashConfig, outputs: int) -> None:
+        super().__init__()
+        self.encoding = HashEncoding(config)
+        self.head = Perceptron(config.levels * config.features, config.width, outputs, config.layers)
+
+    def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n o"]:
+        """Return the outputs at points of the unit cube."""
+        found: Tensor = self.head(self.encoding(points))
+        return found
+
+
+def unit_cube(
+    positions: Float[Tensor, "p 3"], box: SceneBounds
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"]]:
+    """Return positions (trained coordinates) in [0, 1], 0 where outside of it, and 1 where they are inside and else 0.
+
+    In a contracted scene, all space within a cube about the origin fills the inner half of each axis, whatever its box is.
+    """
+    if box.contracted:
+        points = (contract(positions) + 2) / 4
+    else:
+        points = (positions - constant(box.lower, positions)) / constant(box.size, positions)
+    inside = ((points > 0) & (points < 1)).all(-1)
+    return torch.where(inside[:, None], points, 0), inside.to(points.dtype)
+
+
+def density_of(raw: Float[Tensor, "p"], factor: float) -> Float[Tensor, "p"]:
+    """Return the density (per trained unit) of raw outputs: ``factor`` times their exponential."""
+    return factor * raw.clamp(max=LARGEST_LOG_DENSITY).exp()
+
+
+def spherical_harmonics(directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 16"]:
+    """Return the real spherical harmonics of degrees 0 to 3 as polynomials of the components, which need not be of length 1."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479177387814),
+            0.4886025119029199 * y,
+            0.4886025119029199 * z,
+            0.4886025119029199 * x,
+            1.0925484305920792 * x * y,
+            1.0925484305920792 * y * z,
+            0.9461746957575601 * zz - 0.31539156525251999,
+            1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+            0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            0.4570457994644658 * y * (5 * zz - 1),
+            0.3731763325901154 * z * (5 * zz - 3),
+            0.4570457994644658 * x * (5 * zz - 1),
+            1.445305721320277 * z * (xx - yy),
+            0.5900435899266435 * x * (xx - 3 * yy),
+        ],
+        dim=-1,
+    )

@@ -1,0 +1,198 @@
+"""The folder of a trained run: its config, its latest checkpoint, and how its poses were transformed. No code in it is run."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.json import Record, read_record
+from bidnerf_core.io.torch_files import check_sizes, read_saved
+from bidnerf_nerfstudio.placement import after, inverse
+
+CONFIG = "config.yml"
+TRANSFORMS = "dataparser_transforms.json"
+EXPECTED = "the folder of a run of nerfstudio, with config.yml and nerfstudio_models/step-*.ckpt"
+LARGEST_CONFIG = 4 * 2**20
+"""Bytes; a config has ten thousand, and YAML is slow to parse."""
+STEP = re.compile(r"step-(\d+)\.ckpt")
+PREFIX = "_model."
+COLMAP = ((0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0))
+"""What nerfstudio takes for a missing ``applied_transform`` of data that it processed with COLMAP."""
+RIGID = 1e-3
+"""Largest entry by which the product of a rotation and its transpose may differ from one; nerfstudio has single precision."""
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Reads objects of Python as the plain values that they are written with: nothing is imported, nothing is called."""
+
+
+def _plain(loader: yaml.SafeLoader, suffix: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    return suffix.partition(":")[2] or loader.construct_scalar(node)  # type: ignore[arg-type]
+
+
+_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of nerfstudio, as far as it can be read without nerfstudio."""
+
+    folder: Path
+    config: Record
+
+    @property
+    def model(self) -> Record:
+        """The settings of the model."""
+        return _part(_part(self.config, "pipeline"), "model")
+
+    @property
+    def kind(self) -> str:
+        """Name of the model's class, such as "NerfactoModel"."""
+        return (self.model.text("_target") or "").rpartition(".")[2]
+
+    @property
+    def parser(self) -> Record:
+        """The settings of what read the dataset."""
+        return _part(_part(_part(self.config, "pipeline"), "datamanager"), "dataparser")
+
+    @property
+    def data(self) -> Path | None:
+        """The dataset that the run was trained on, a folder or a JSON file, as the config names it."""
+        manager = _part(_part(self.config, "pipeline"), "datamanager")
+        for record in (self.parser, manager, self.config):
+            parts = record.value("data")
+            if isinstance(parts, list) and parts and all(isinstance(part, str) for part in parts):
+                return Path(*parts)
+        return None
+
+    @cached_property
+    def checkpoint(self) -> Path:
+        """The checkpoint of the latest step. Raises ``InputError`` where there is none."""
+        parts = self.config.value("relative_model_dir")
+        named = isinstance(parts, list) and bool(parts) and all(isinstance(part, str) for part in parts)
+        folder = self.folder.joinpath(*parts) if named else self.folder / "nerfstudio_models"
+        found = [
+            (int(match[1]), path) for path in folder.glob("*.ckpt") if (match := STEP.fullmatch(path.name))
+        ]
+        if not found:
+            raise InputError(
+                f"{folder}: no step-*.ckpt, expected the checkpoint of a training that has saved one"
+            )
+        return max(found)[1]
+
+    def weights(self) -> tuple[dict[str, Tensor], int]:
+        """Return the tensors of the model by name, and the number of training steps. Raises ``InputError`` for damage."""
+        found = read_saved(self.checkpoint, EXPECTED)
+        tensors = found.get("pipeline") if isinstance(found, dict) else None
+        if not isinstance(tensors, dict):
+            raise InputError(f"{self.checkpoint}: no 'pipeline' in it, expected a checkpoint of nerfstudio")
+        named = {
+            name.removeprefix("module.").removeprefix(PREFIX): value
+            for name, value in tensors.items()
+            if isinstance(name, str) and isinstance(value, Tensor) and ".lpips." not in name
+        }
+        check_sizes(self.checkpoint, named, EXPECTED)
+        step = found.get("step")
+        return named, step + 1 if type(step) is int and step >= 0 else 1
+
+    def trained_from_data(self, data: Path | None) -> tuple[Similarity, str]:
+        """Return the transform from the coordinates of the dataset to those of the training, and a sentence on it.
+
+        ``data`` is the dataset, where it still is. Without it, coordinates are those before ``applied_transform``, which the
+        dataset may name; without the run's own file, they are those of the training.
+        """
+        path = self.folder / TRANSFORMS
+        if not path.is_file():
+            return Similarity(1.0, SE3.identity()), (
+                f"no {TRANSFORMS}, which older versions did not write: poses come out in the coordinates of the training"
+            )
+        record = read_record(path, "the transform and the scale of nerfstudio's poses")
+        scale = record.number("scale")
+        if scale is None or not 1e-12 < scale < 1e12:
+            raise record.error(f"scale is {scale}, expected a number above 0")
+        found = Similarity(scale, _moved(record, _rows(record, "transform"), scale))
+        if data is None:
+            return found, (
+                "poses come out in the coordinates of the original data, before any applied_transform: the dataset is not"
+                " where the config says (--data)"
+            )
+        applied = _applied(data)
+        told = "poses come out in the coordinates of the dataset"
+        if applied is None:
+            return found, told
+        return after(found, inverse(applied)), f"{told}, whose applied_transform is taken into account"
+
+
+def read_run(path: Path) -> Run:
+    """Return the run in a folder, or that of a config.yml. Raises ``InputError`` for anything else."""
+    folder = path.parent if path.name == CONFIG else path
+    file = folder / CONFIG
+    if not file.is_file():
+        raise InputError(f"{path}: no {CONFIG}, expected {EXPECTED}")
+    if file.stat().st_size > LARGEST_CONFIG:
+        raise InputError(f"{file}: has {file.stat().st_size:,} bytes, expected a config of nerfstudio")
+    text = read_file(file, "a config of nerfstudio").decode("utf-8", "replace")
+    try:
+        found = yaml.load(text, _PlainLoader)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{file}: not readable ({reason}), expected a config of nerfstudio") from error
+    if not isinstance(found, dict) or not isinstance(found.get("pipeline"), dict):
+        raise InputError(f"{file}: has no pipeline, expected a config of nerfstudio")
+    return Run(folder, Record(str(file), found))
+
+
+def _part(record: Record, key: str) -> Record:
+    found = record.value(key)
+    if not isinstance(found, dict):
+        raise record.error(f"no {key}, expected a config of nerfstudio")
+    return Record(f"{record.where}: {key}", found)
+
+
+def _rows(record: Record, key: str) -> Float[Tensor, "3 4"]:
+    """Return a matrix of 3 rows (or 4) of 4 numbers."""
+    rows = record.items(key) or []
+    if not (len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)):
+        raise record.error(f"{key} is not readable, expected 3 rows of 4 numbers")
+    numbers = [[record.checked_number(value, key) for value in row] for row in rows[:3]]
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def _moved(record: Record, rows: Float[Tensor, "3 4"], scale: float) -> SE3:
+    """Return the motion that follows scaling, of a motion that precedes it."""
+    rotation = rows[:, :3]
+    off = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
+    if not (float(off) < RIGID and float(torch.linalg.det(rotation)) > 0):
+        raise record.error("transform is no rotation and shift, expected one")
+    u, _, vh = torch.linalg.svd(rotation)
+    return SE3(u @ vh, scale * rows[:, 3])
+
+
+def _applied(data: Path) -> Similarity | None:
+    """Return what was applied to the poses of a dataset before they were stored in it, or None where nothing is said."""
+    file = data if data.suffix == ".json" else data / "transforms.json"
+    if not file.is_file():
+        return None
+    record = read_record(file)
+    scale = record.number("applied_scale") or 1.0
+    if record.value("applied_transform") is not None:
+        return Similarity(scale, _moved(record, _rows(record, "applied_transform"), scale))
+    if (data / "colmap" / "sparse" / "0").exists():
+        return Similarity(scale, _moved(record, torch.tensor(COLMAP, dtype=torch.float64), scale))
+    return None if scale == 1.0 else Similarity(scale, SE3.identity())
