@@ -1,9 +1,9 @@
 """Makes the runs beside the tests, with nerfstudio itself and what it renders: needs nerfstudio 1.1.5, but no GPU.
 
     python -c "
-    from bidnerf_core import open_dataset
+    from bidnerf_core.scenes.closed_form_data import closed_form_data
     from bidnerf_core.datasets.writing import write_transforms
-    room = open_dataset('demo:room')
+    room = closed_form_data('demo:room')
     write_transforms('room', {split: room.views(split) for split in room.splits}, room.background)"
     python make_runs.py runs
 
@@ -46,9 +46,16 @@ def config_of(method: str, steps: int) -> Any:
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = NEVER
     config.mixed_precision, config.vis = False, "tensorboard"
     config.machine.device_type = "cpu"
-    config.data, config.output_dir, config.experiment_name, config.timestamp = DATA, Path("out"), "room", "run"
+    config.data, config.output_dir, config.experiment_name, config.timestamp = (
+        DATA,
+        Path("out"),
+        "room",
+        "run",
+    )
     config.pipeline.datamanager = VanillaDataManagerConfig(
-        data=DATA, dataparser=NerfstudioDataParserConfig(data=DATA, eval_mode="all"), train_num_rays_per_batch=512
+        data=DATA,
+        dataparser=NerfstudioDataParserConfig(data=DATA, eval_mode="all"),
+        train_num_rays_per_batch=512,
     )
     return config
 
@@ -76,13 +83,17 @@ def nerfacto(folder: Path, steps: int = 400) -> None:
         there.parent.mkdir(parents=True, exist_ok=True)
         there.write_bytes(file.read_bytes())
     trained = trainer.pipeline.model.eval()
+    trained.proposal_sampler.set_anneal(1.0)  # as in a model that is loaded
     found = at_points(trained.field)
     for number, network in enumerate(trained.proposal_networks):
         found[f"proposal{number}"] = network.density_fn(found["points"])[:, 0]
     cameras = trainer.pipeline.datamanager.train_dataset.cameras
     trained.renderer_rgb.background_color = "black"  # "last_sample" depends on where a ray is sampled
     seen = trained.get_outputs_for_camera_ray_bundle(cameras.generate_rays(camera_indices=CAMERA))
-    found |= {"rgb": seen["rgb"][::SPACING, ::SPACING], "opacity": seen["accumulation"][::SPACING, ::SPACING, 0]}
+    found |= {
+        "rgb": seen["rgb"][::SPACING, ::SPACING],
+        "opacity": seen["accumulation"][::SPACING, ::SPACING, 0],
+    }
     frames = sorted(json.loads(DATA.read_text())["frames"], key=lambda frame: frame["file_path"])
     found["pose"] = torch.tensor(frames[CAMERA]["transform_matrix"])
     found["lens"] = torch.tensor([frames[CAMERA][key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")])
@@ -96,8 +107,15 @@ def at_points(field: Any) -> dict[str, Tensor]:
     directions = torch.nn.functional.normalize(torch.randn((POINTS, 3), generator=generator), dim=-1)
     none = torch.zeros(POINTS, 1)
     frustums = Frustums(points, directions, none, none, none + 1)
-    values = {kind.value: value for kind, value in field(RaySamples(frustums, camera_indices=none.long())).items()}
-    return {"points": points, "directions": directions, "density": values["density"][:, 0], "colours": values["rgb"]}
+    values = {
+        kind.value: value for kind, value in field(RaySamples(frustums, camera_indices=none.long())).items()
+    }
+    return {
+        "points": points,
+        "directions": directions,
+        "density": values["density"][:, 0],
+        "colours": values["rgb"],
+    }
 
 
 def with_drawn_weights(method: str, folder: Path, box: float, **changes: Any) -> tuple[Any, dict[str, Any]]:
@@ -108,19 +126,30 @@ def with_drawn_weights(method: str, folder: Path, box: float, **changes: Any) ->
     (folder / method).mkdir(parents=True, exist_ok=True)
     (folder / method / "config.yml").write_text(yaml.dump(config))
     aabb = torch.tensor([[-box] * 3, [box] * 3])
-    model = config.pipeline.model.setup(scene_box=SceneBox(aabb), num_train_data=3, metadata={}, device="cpu").eval()
+    model = config.pipeline.model.setup(
+        scene_box=SceneBox(aabb), num_train_data=3, metadata={}, device="cpu"
+    ).eval()
     state = model.state_dict()
     kept = ("layers", "hash_table", "embedding", "net", "binaries")
-    shapes = {name: tuple(value.shape) for name, value in state.items() if any(part in name for part in kept)}
+    shapes = {
+        name: tuple(value.shape)
+        for name, value in state.items()
+        if any(part in name for part in kept)
+        and not name.startswith("sampler.")  # which has the grid a second time
+    }
     weights = drawn(shapes)
     model.load_state_dict({name: weights.get(name, value) for name, value in state.items()})
-    others = {n: v.tolist() for n, v in state.items() if n not in shapes and v.numel() < 7 and "lpips" not in n}
+    others = {
+        n: v.tolist() for n, v in state.items() if n not in shapes and v.numel() < 7 and "lpips" not in n
+    }
     (folder / method / "tensors.json").write_text(json.dumps({"drawn": shapes, "others": others}, indent=1))
     return model, weights
 
 
 def vanilla(folder: Path) -> None:
-    model, _ = with_drawn_weights("vanilla-nerf", folder, 1.0, num_coarse_samples=16, num_importance_samples=24)
+    model, _ = with_drawn_weights(
+        "vanilla-nerf", folder, 1.0, num_coarse_samples=16, num_importance_samples=24
+    )
     found = at_points(model.field_fine)
     generator = torch.Generator().manual_seed(1)
     directions = torch.nn.functional.normalize(torch.randn((64, 3), generator=generator), dim=-1)
@@ -143,7 +172,10 @@ def instant_ngp(folder: Path) -> None:
 
 
 def write(folder: Path, values: dict[str, Tensor]) -> None:
-    save_file({name: value.detach().contiguous() for name, value in values.items()}, folder / "reference.safetensors")
+    save_file(
+        {name: value.detach().contiguous() for name, value in values.items()},
+        folder / "reference.safetensors",
+    )
 
 
 if __name__ == "__main__":
