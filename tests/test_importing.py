@@ -14,6 +14,7 @@ from torch import Tensor
 import tiny
 from bidnerf_core import import_map, load_map
 from bidnerf_core.cli import main
+from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, SceneBounds
 from bidnerf_core.fields.sampling import Stratified
@@ -97,6 +98,22 @@ def test_photos_give_the_cameras(file: Path) -> None:
     other = [replace(v, frame=replace(v.frame, rgb=1 - v.frame.rgb, alpha=None)) for v in photos]
     with pytest.raises(InputError, match="expected photos of the same scene"):
         import_map(file, photos=other, bake=False)
+
+
+def test_photos_that_the_file_names(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They are used where no others are given and, where they cannot be read, left aside with a word."""
+    write_transforms(tmp_path / "photos", {"train": tiny.views(5, seed=2)}, demo_object().bounds.background)
+    read = TinyImporter.read
+    for folder, names in (("photos", [view.frame.name for view in tiny.views(5, seed=2)]), ("none", None)):
+        monkeypatch.setattr(
+            TinyImporter, "read", lambda *given, f=tmp_path / folder: replace(read(*given), photos=f)
+        )
+        with caplog.at_level(logging.INFO, "bidnerf"):
+            found = [camera.name for camera in import_map(file, bake=False).info.cameras]
+        assert found == names or (names is None and len(found) == VIEWS)
+    assert "the images of its training cannot be read" in caplog.text
 
 
 def test_depth_in_another_unit_is_told(file: Path) -> None:

@@ -23,7 +23,6 @@ from typing import Any
 
 import torch
 import yaml
-from drawn import drawn
 from nerfacc.grid import _query
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.configs.method_configs import all_methods
@@ -32,6 +31,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.scene_box import SceneBox
 from safetensors.torch import save_file
 from torch import Tensor
+
+from drawn import drawn
 
 DATA = Path("room/transforms_train.json")
 POINTS = 200

@@ -1,0 +1,66 @@
+"""What ``torch.save`` wrote is read without running code, and without allocating what is only declared."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.torch_files import check_sizes, read_saved
+
+Saved = Callable[[Any], Path]
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Saved:
+    def save(content: Any) -> Path:
+        torch.save(content, tmp_path / "a.ckpt")
+        return tmp_path / "a.ckpt"
+
+    return save
+
+
+class Code:
+    def __init__(self, command: str) -> None:
+        self.command = command
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, (self.command,)
+
+
+def test_numbers_of_numpy_do_not_prevent_reading(saved: Saved) -> None:
+    """nerfstudio's trainer stores learning rates as such; they are no code, but torch refuses them."""
+    path = saved({"weights": torch.arange(3.0), "schedulers": {"rate": np.float64(0.1), "step": np.int64(3)}})
+    found = read_saved(path, "a checkpoint")
+    assert torch.equal(found["weights"], torch.arange(3.0))
+    assert not isinstance(found["schedulers"]["rate"], float)
+
+
+def test_code_is_refused_and_not_run(saved: Saved, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"would run code \(posix.system\).*expected a checkpoint"):
+        read_saved(saved({"a": Code(f"touch {tmp_path}/mark")}), "a checkpoint")
+    assert not (tmp_path / "mark").exists()
+
+
+def test_damage_and_absence_are_told_in_one_line(saved: Saved, tmp_path: Path) -> None:
+    path = saved({"a": torch.zeros(100)})
+    path.write_bytes(path.read_bytes()[:-200])
+    for file, said in ((path, "damaged"), (tmp_path / "none", "no such file"), (tmp_path, "no such file")):
+        with pytest.raises(InputError, match=said):
+            read_saved(file, "a checkpoint")
+
+
+def test_a_number_that_stands_for_many(saved: Saved) -> None:
+    shared = torch.zeros(50)
+    path = saved({"a": [shared, shared], "b": (shared[:20], shared.reshape(5, 10).t())})
+    check_sizes(path, read_saved(path, "a checkpoint"), "a checkpoint")
+    for large in (torch.zeros(1).expand(10**9), torch.zeros(2, 2).to_sparse()):
+        path = saved({"a": [large]})
+        with pytest.raises(InputError, match="are too few"):
+            check_sizes(path, read_saved(path, "a checkpoint"), "a checkpoint")
