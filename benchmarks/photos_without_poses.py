@@ -54,7 +54,9 @@ def main() -> None:
     known = given.out / "poses" / "poses.json"
     began = time.monotonic()
     found = bn.find_poses(source, given.out / "poses", progress=_quiet())
-    result = without_files(to_plain(found)) | ({"seconds": time.monotonic() - began} if not known.exists() else {})
+    result = without_files(to_plain(found)) | (
+        {"seconds": time.monotonic() - began} if not known.exists() else {}
+    )
     placed = {v.frame.name: v for v in all_views(bn.open_dataset(given.out / "poses"))}
     if given.video:  # frames are named by their numbers
         placed = {order[int(name)]: renamed(view, order[int(name)]) for name, view in placed.items()}
