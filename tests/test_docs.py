@@ -52,7 +52,19 @@ NOT_RUN: dict[tuple[str, str], str] = {
     ("maps.md", "from bidnerf_core import find_poses"): "needs photos that overlap, and seconds for each",
 }
 """Python blocks that are not executed, by page and first line, each with the reason."""
-TOO_SLOW = {"train", "poses", "demo", "evaluate", "compare", "report", "import", "serve", "extend", "scale"}
+TOO_SLOW = {
+    "train",
+    "poses",
+    "demo",
+    "evaluate",
+    "compare",
+    "report",
+    "import",
+    "serve",
+    "view",
+    "extend",
+    "scale",
+}
 """Commands that are only parsed: they take minutes, or the results of one that does, files of a plugin's, or run until stopped."""
 OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest", "curl"}
 """Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""

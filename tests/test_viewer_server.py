@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import struct
 import tempfile
-import threading
 import time
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
-from http.client import HTTPConnection
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 import pytest
 
@@ -26,68 +21,10 @@ pytest.importorskip("uvicorn", reason="the extra 'viewer' is not installed")
 from PIL import Image
 
 import viewed
-from bidnerf_core import Localizer, ServiceConfig
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.queries import Photos
-from bidnerf_core.viewer.server import serve_view
-from photo_room import CAMERA
+from viewer_client import Client, serving
 
 TOKEN = "a-token-of-enough-characters"
-CONFIG = ServiceConfig(max_megabytes=1.0, max_megapixels=1.0)
 VIEW = {"pose": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "width": 32, "height": 24}
-
-
-@dataclass
-class Reply:
-    """An answer over HTTP."""
-
-    status_code: int
-    headers: dict[str, str]
-    content: bytes
-
-    def json(self) -> Any:
-        return json.loads(self.content)
-
-
-@dataclass
-class Client:
-    """Asks a viewer, with paths as they are written."""
-
-    port: int
-
-    def request(
-        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
-    ) -> Reply:
-        connection = HTTPConnection("127.0.0.1", self.port, timeout=120)
-        try:
-            connection.request(method, path, body, headers or {})
-            found = connection.getresponse()
-            return Reply(found.status, {k.lower(): v for k, v in found.getheaders()}, found.read())
-        finally:
-            connection.close()
-
-    def get(self, path: str, **headers: str) -> Reply:
-        return self.request("GET", path, headers=headers)
-
-    def post(self, path: str, content: bytes = b"", **headers: str) -> Reply:
-        return self.request("POST", path, content, headers)
-
-
-@contextlib.contextmanager
-def serving(token: str | None = None) -> Iterator[Client]:
-    """Run a viewer of the room, with one photo to choose."""
-    stop, ready = threading.Event(), SimpleQueue[str]()
-    with tempfile.TemporaryDirectory() as folder:
-        source = Photos([viewed.photo_file(Path(folder))], CameraSource(assumed=(CAMERA,)))
-        options = {"port": 0, "token": token, "config": CONFIG, "ready": ready.put, "stop": stop}
-        thread = threading.Thread(target=serve_view, args=(Localizer(viewed.room()), source), kwargs=options)
-        thread.start()
-        try:
-            yield Client(int(urlsplit(ready.get(timeout=120)).port or 0))
-        finally:
-            stop.set()
-            thread.join(60)
-    assert not thread.is_alive()
 
 
 @pytest.fixture(scope="module")
@@ -136,10 +73,11 @@ def bomb(side: int) -> bytes:
 def test_bad_uploads_are_refused_with_the_reason(client: Client) -> None:
     assert client.post("/api/photo", bytes(2 * 2**20)).status_code == 413
     assert client.post("/api/photo").status_code == 400
-    answer = answer_of(client, client.post("/api/photo", bomb(20_000)))
-    assert not answer["accepted"]
-    assert "expected at most 1 megapixels" in answer["reason"]
-    assert tempfile.gettempdir() not in answer["reason"]
+    for side, most in ((1500, "1 megapixels"), (20_000, "178 megapixels")):
+        answer = answer_of(client, client.post("/api/photo", bomb(side)))
+        assert answer["outcome"] == "bad input"
+        assert f"expected at most {most}" in answer["reason"]
+        assert tempfile.gettempdir() not in answer["reason"]
     answer = answer_of(client, client.post("/api/photo", b"no image"))
     assert answer["outcome"] == "bad input"
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import quote
 
 import tyro
 
@@ -30,6 +32,9 @@ def report(
         option(None, "what counts as success where one criterion is shown", "10%; 5deg 0.05 if trials had no start"),
     ] = None,
     title: Annotated[str, option("TEXT", "title of the page")] = "Localization results",
+    view: Annotated[
+        Path | None, option("PAGE.html", "page of 'bidnerf view --results', to whose frames the report links", "")
+    ] = None,
 ) -> None:  # fmt: skip
     """Write tables, figures and statistical tests of results as one page that needs no network.
 
@@ -47,10 +52,19 @@ def report(
         raise InputError(f"{', '.join(map(str, results))}: no finished trial in it, nothing to report")
     with wrong_usage():
         chosen = chosen_criterion(criterion, table.groups)
+    if view is not None and not view.is_file():
+        raise InputError(
+            f"{view}: no such page, expected one that 'bidnerf view MAP --results ... --save' wrote"
+        )
     check_folder(out, results)
     runs = [(path.name, read_runs(path)) for path in results]
     with console.status("drawing"):
-        page = write_report(table, out, title, chosen, runs)
+        page = write_report(table, out, title, chosen, runs, None if view is None else link_to(view, out))
     for line in str(table).split("\n"):
         show(line)
     show(f"look at {page}")
+
+
+def link_to(page: Path, folder: Path) -> str:
+    """Return the address of a page as a page in a folder refers to it."""
+    return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())

@@ -26,6 +26,7 @@ from bidnerf_core.evaluation.summary import (
     pairwise_tests,
     usual_criterion,
 )
+from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.io.files import is_temporary, open_binary, write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.results.errors import CRITERIA
@@ -38,6 +39,8 @@ UNFINISHED = (
     f"<!doctype html>{MARK}<title>Unfinished report</title>"
     "<p>This report was interrupted; the same command writes it again.</p>\n"
 )
+LISTED_FRAMES = 100
+"""Frames that a report lists with links to the page of a map."""
 LENGTH_OF_HEAD = 4096  # bytes at the beginning of a page that contain the mark of a report
 FAULT_CAPTION = (
     "Trials by fault of the images and its size, with Wilson's 95 % intervals: right (within 5 degrees and 0.05 units), "
@@ -64,11 +67,13 @@ def write_report(
     title: str = "Localization results",
     criterion: str | None = None,
     runs: Sequence[tuple[str, Sequence[Provenance]]] = (),
+    view: str | None = None,
 ) -> Path:
     """Write ``index.html``, and its figures as PNG and SVG, to ``folder``, and return the path of the page.
 
     ``criterion`` is the one of ``CRITERIA`` that is shown where there is room for only one. ``runs`` has the name of each file
-    of results and the runs that made it. An earlier report in the folder is replaced. Raises ``InputError`` without results or
+    of results and the runs that made it. ``view`` is the address of a page of ``bidnerf view --results``, to whose frames
+    the report links. An earlier report in the folder is replaced. Raises ``InputError`` without results or
     matplotlib, and for a folder that holds anything but a report.
     """
     if not table.rows:
@@ -82,7 +87,7 @@ def write_report(
         if not path.exists():  # so that an interrupted report is recognised as one
             write_file(path, UNFINISHED.encode())
         figures = draw_figures(table.groups, folder, chosen)
-        write_file(path, page(title, table, figures, runs, chosen).encode())
+        write_file(path, page(title, table, figures, runs, chosen, view).encode())
     return path
 
 
@@ -136,6 +141,7 @@ def page(
     figures: Sequence[Figure],
     runs: Sequence[tuple[str, Sequence[Provenance]]],
     criterion: str,
+    view: str | None = None,
 ) -> str:
     """Return the HTML of a report."""
     environment = Environment(
@@ -165,9 +171,21 @@ def page(
         absolute=ABSOLUTE,
         pairs=[(start, found) for start, found in pairs if found],
         count=sum(len(found) for _, found in pairs),
+        view=view,
+        frames=doubtful(table.rows)[:LISTED_FRAMES],
         criterion=CRITERION_NAMES[criterion],
         runs=[(name, _facts(name, known), _commands(known)) for name, known in runs],
     )
+
+
+def doubtful(rows: Sequence[TrialResult]) -> list[TrialResult]:
+    """Return the trials that were accepted although they are wrong (beyond 5 degrees or 0.05 units), then the refused ones."""
+
+    def is_wrong(row: TrialResult) -> bool:
+        return row.error is None or row.error.translation > 0.05 or row.error.rotation_deg > 5
+
+    found = [row for row in rows if not row.converged or is_wrong(row)]
+    return sorted(found, key=lambda row: not row.converged)
 
 
 def _printed(value: Any) -> Any:

@@ -173,8 +173,10 @@ async def _photo(request: Request) -> Response:
 
     def read() -> Query:
         with tempfile.TemporaryDirectory(prefix="bidnerf-view-") as folder:
-            photos, _ = upload.read(state.shown.localizer, Path(folder), state.config.max_megapixels * 1e6)
             try:
+                photos, _ = upload.read(
+                    state.shown.localizer, Path(folder), state.config.max_megapixels * 1e6
+                )
                 return named(photos.read(0), upload.name)
             except InputError as error:
                 raise InputError(str(error).replace(f"{folder}/", "")) from error

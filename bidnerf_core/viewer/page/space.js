@@ -102,7 +102,7 @@ export class Space {
     behind.addScaledVector(up, -behind.dot(up));
     if (behind.length() > 0.25 * this.map.cameras.length) level.copy(behind.normalize());
     const narrow = Math.min(1, this.camera.aspect || 1);
-    const from = centre.clone().addScaledVector(level, 1.15 * extent / narrow).addScaledVector(up, 0.7 * extent / narrow);
+    const from = centre.clone().addScaledVector(level, 1.25 * extent / narrow).addScaledVector(up, 0.8 * extent / narrow);
     this.camera.fov = FOV;
     this.camera.updateProjectionMatrix();
     this.camera.position.copy(from);
@@ -289,6 +289,14 @@ export class Space {
       if (v.z < 1 && off < least) { least = off; best = i; }
     });
     return best;
+  }
+
+  // Coloured dots.
+  dots(layer, places, colours, radius) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(places.flat()), 3));
+    geometry.setAttribute("tint", new THREE.BufferAttribute(new Float32Array(colours.flat()), 3));
+    this.points(layer, geometry, radius, 4);
   }
 
   pose() {

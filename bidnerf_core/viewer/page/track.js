@@ -41,6 +41,8 @@ export class Track {
     const { space } = this.page;
     space?.clear("track");
     if (places.length) space?.lines("track", places, null, { colours });
+    const every = Array.from({ length: this.count }, (_, i) => i);
+    space?.dots("track", every.map((i) => this.at(i)), every.map((i) => this.colour(i)), 0.06 * space.size);
     this.marker = null;
     const bar = element("div", { class: "key" });
     bar.style.background = scaleGradient;

@@ -1,0 +1,187 @@
+"""The viewer's page in a browser: live, from disk without a network, and on a phone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra 'viewer' is not installed")
+pytest.importorskip("playwright", reason="Playwright is not installed")
+
+from playwright.sync_api import sync_playwright
+
+import viewed
+from bidnerf_core import Localizer
+from bidnerf_core.viewer.saving import save_page
+from bidnerf_core.viewer.table import shown_row
+from bidnerf_core.viewer.trajectories import shown_trajectory
+from bidnerf_core.viewer.view import localized, page_of
+from viewer_client import serving
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+]  # fmt: skip
+LAPTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+WAIT = 120_000  # ms
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_playwright() as found:
+        browser = found.chromium.launch(executable_path=CHROMIUM, headless=True, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page with an accepted photo, a refused one with a hostile name, results and a trajectory."""
+    folder = tmp_path_factory.mktemp("page")
+    localizer = Localizer(viewed.room())
+    answers = [
+        localized(localizer, viewed.query()),
+        localized(localizer, viewed.query(viewed.HOSTILE, seed=5)),
+    ]
+    entries = [
+        {
+            "frame": f"t{i}", "time": i / 10, "T_world_camera": T.matrix().tolist(), "outcome": "converged" if i % 3 else "ambiguous",
+            "covariance": [[(1 + i) * 1e-4 * (a == b) for b in range(6)] for a in range(6)],
+        }
+        for i, T in enumerate(viewed.walk(12))
+    ]  # fmt: skip
+    (folder / "track.json").write_text(json.dumps(entries))
+    pose = viewed.walk(12)[4].matrix().tolist()
+    rows = [
+        shown_row(name, "auto", outcome, outcome == "converged", "why", 0.9, (0.01, 0.2), None, pose)
+        for name, outcome in (
+            ("unseen", "converged"),
+            (viewed.HOSTILE, "ambiguous"),
+            ("elsewhere", "imprecise"),
+        )
+    ]
+    page = page_of(viewed.room(), answers, shown_trajectory(folder / "track.json"), rows)
+    return save_page(page.state, folder / "page.html")
+
+
+@contextmanager
+def opened(browser: Any, address: str, viewport: dict[str, int], **more: Any) -> Iterator[Any]:
+    """Open a page, and fail on any message of an error, and on requests for anything but what it came from."""
+    context = browser.new_context(viewport=viewport, reduced_motion="reduce", **more)
+    page, faults, asked = context.new_page(), list[str](), list[str]()
+    page.set_default_timeout(WAIT)
+    page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    try:
+        page.goto(address)
+        until(page, "(window.page?.space?.drawn ?? 0) > 0")
+        yield page
+        origin = "file://" if address.startswith("file:") else address.rstrip("/")
+        assert not [url for url in asked if not url.startswith((origin, "data:", "blob:"))]
+        assert not faults
+    finally:
+        context.close()
+
+
+def until(page: Any, expression: str) -> None:
+    """Wait until an expression is true; the page's policy forbids it to evaluate one by itself."""
+    end = time.monotonic() + WAIT / 1000
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, f"not within {WAIT / 1000:g} s: {expression}"
+        page.wait_for_timeout(20)
+
+
+def value(page: Any, field: str) -> str:
+    return str(page.input_value(field))
+
+
+def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> None:
+    photo = viewed.photo_file(tmp_path, "a <b>photo.png")
+    with serving() as client, opened(browser, f"http://127.0.0.1:{client.port}/", LAPTOP) as page:
+        assert page.title().startswith("room")
+        assert page.locator("#query option").count() == 2  # one asks to choose
+        page.set_input_files("#photo", photo)
+        page.wait_for_selector(".outcome.good")
+        until(page, "document.getElementById('note').textContent === ''")
+        assert page.text_content("#answer .name") == "a <b>photo.png"
+        assert page.evaluate("page.space.layers.answer.getObjectByName('ellipsoid') !== undefined")
+        page.keyboard.press("v")
+        until(page, "(page.live.shown ?? 0) > 1")
+        assert page.evaluate("document.getElementById('field').naturalWidth") > 0
+        page.keyboard.press("v")
+        page.keyboard.press("p")  # the image that the viewer was started with
+        until(page, "page.answers.length === 2 && document.getElementById('note').textContent === ''")
+        assert page.text_content("#answer .name") == "photo"
+
+
+def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Path) -> None:
+    with opened(browser, saved.as_uri(), LAPTOP, offline=True) as page:
+        assert page.text_content("#answer .name") == "unseen"
+        assert "Accepted" in page.text_content(".outcome")
+        before = page.evaluate("document.querySelector('.pictures img:nth-of-type(2)').style.clipPath")
+        page.locator("#wipe").fill("80")
+        assert (
+            page.evaluate("document.querySelector('.pictures img:nth-of-type(2)').style.clipPath") != before
+        )
+        for number, mode in enumerate(("Wipe", "Blink", "Difference", "Edges", "Depth", "Matches"), start=1):
+            page.keyboard.press("Escape")
+            page.evaluate("document.activeElement.blur()")
+            page.keyboard.press(str(number))
+            assert page.text_content(".modes [aria-pressed=true]") == mode
+        assert page.locator(".pictures svg circle").count() >= 15
+        ellipsoid = "page.space.layers.answer.getObjectByName('ellipsoid') !== undefined"
+        assert page.evaluate(ellipsoid)
+        page.keyboard.press("e")
+        assert not page.evaluate(ellipsoid)
+
+
+def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path) -> None:
+    with opened(browser, f"{saved.as_uri()}#frame={quote(viewed.HOSTILE)}", LAPTOP, offline=True) as page:
+        assert page.title().startswith("room")  # no script of a name has run
+        assert page.text_content("#answer .name") == viewed.HOSTILE
+        assert page.text_content(".outcome b").startswith("Refused")
+        assert page.locator("#figures tr.failed").count() > 0
+        steps = int(page.get_attribute("#step", "max"))
+        page.locator("#step").fill("0")
+        assert page.text_content("#caption").startswith(f"1 of {steps + 1}")
+        assert page.evaluate("page.space.layers.search.children.length") > 0
+        page.evaluate("document.activeElement.blur()")
+        page.keyboard.press("ArrowRight")
+        assert value(page, "#step") == "1"
+        page.click("#runner")
+        assert page.get_attribute("#runner", "aria-pressed") == "true"
+        assert "runner-up" in page.text_content(".pictures .tag.right")
+
+
+def test_rows_are_filtered_and_lead_to_their_frames(browser: Any, saved: Path) -> None:
+    with opened(browser, saved.as_uri(), LAPTOP, offline=True) as page:
+        assert page.locator("#rows tbody tr").count() == 3
+        page.fill("#filter", "elsewhere")
+        assert page.locator("#rows tbody tr").count() == 1
+        page.click("#rows tbody tr")
+        assert page.text_content("#answer .name") == "elsewhere"
+        page.fill("#filter", "")
+        page.select_option("#kind", "accepted")
+        page.click("#rows tbody tr")
+        assert page.text_content("#answer .name") == "unseen"
+        page.locator("#time").fill("7")
+        assert page.text_content("#place").startswith("8 of 12 · 0.70 s · t7 · converged")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_phone_shows_everything_in_its_width(browser: Any, saved: Path, scheme: str) -> None:
+    with opened(browser, saved.as_uri(), PHONE, offline=True, color_scheme=scheme, has_touch=True) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+        paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (int(paper[4:].split(",")[0]) > 127) == (scheme == "light")
