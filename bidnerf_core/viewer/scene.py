@@ -147,7 +147,7 @@ def _surface(scene: Map) -> Points | None:
     if scene.surface is None:
         return None
     surfels = scene.surface.surfels
-    some = _some(len(surfels), MOST_SURFELS)
+    some = _some(len(surfels), MOST_SURFELS)  # in random order, so that the first ones show the whole
     radius = scene.surface.cell * max(1.0, (len(surfels) / max(len(some), 1)) ** 0.5) / 2
     return Points(
         packed_points(surfels.positions[some]), packed_colours(surfels.rgb[some]), len(surfels), radius
@@ -162,8 +162,7 @@ def _landmarks(scene: Map) -> Points | None:
 
 
 def _some(count: int, most: int) -> Tensor:
-    generator = torch.Generator().manual_seed(0)
-    return torch.randperm(count, generator=generator)[:most].sort().values
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most]
 
 
 def _cameras(scene: Map, thumbnails: int) -> tuple[ShownCamera, ...]:

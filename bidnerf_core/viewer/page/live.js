@@ -1,7 +1,7 @@
 // What only a server can do: localize photos, and render the field from here.
 import { element, find } from "./data.js";
 
-const REST = 250;  // ms without motion after which the field is rendered finely
+const SETTLED = 250;  // ms without motion after which the field is rendered finely
 const QUICK = 360, FINE = [128, 256, 512, 1024];  // pixels of the longer side
 const LARGEST = 32 * 2 ** 20, LONGEST = 200;
 
@@ -102,7 +102,7 @@ export class Live {
     find("field").classList.add("stale");
     this.page.space.show("surface", !this.page.hidden.has("surface"));
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.render(FINE), REST);
+    this.timer = setTimeout(() => this.render(FINE), SETTLED);
     if (!this.busy) this.render([]);
   }
 

@@ -175,7 +175,7 @@ class Page {
     if (remember) history.replaceState(null, "", `#frame=${encodeURIComponent(this.answer.name)}`);
     const { ellipsoid, steps } = this.answer;
     const size = this.space?.size ?? 1;
-    this.factor = ellipsoid ? ENLARGED.find((factor) => factor * ellipsoid.lengths[0] >= 0.12 * size) ?? 1000 : 1;
+    this.factor = ellipsoid ? ENLARGED.find((factor) => factor * ellipsoid.lengths[0] >= 0.3 * size) ?? 1000 : 1;
     find("timeline").hidden = steps.length < 2;
     find("step").max = String(Math.max(0, steps.length - 1));
     this.step = Math.max(0, steps.length - 1);

@@ -2,6 +2,8 @@
 import { colourOf, numbers, scaleColour } from "./data.js";
 
 const FOV = 55;
+const SPREAD = 2.2;  // radius of a point of the surface over that of its surfel, which closes gaps
+const SLOW = 45, REST = 180, LEAST_SHARE = 0.08;  // ms of a frame, ms without motion, share of the points
 
 const VERTEX = `
 uniform float radius, height, least;
@@ -38,7 +40,7 @@ function pyramid(shape, depth) {
 
 export class Space {
   constructor(canvas, map) {
-    this.canvas = canvas; this.map = map; this.moved = () => {};
+    this.canvas = canvas; this.map = map; this.share = 1; this.moved = () => {};
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
     this.renderer.setClearColor(0, 0);
     this.scene = new THREE.Scene();
@@ -55,6 +57,7 @@ export class Space {
     this.addMap();
     const draw = (now) => {
       if (this.flight) this.fly(now);
+      this.adapt(now);
       if (this.dirty) { this.dirty = false; this.renderer.render(this.scene, this.camera); this.drawn = (this.drawn ?? 0) + 1; }
       requestAnimationFrame(draw);
     };
@@ -62,6 +65,22 @@ export class Space {
   }
 
   changed() { this.dirty = true; }
+
+  // Draw fewer and larger points of the surface while the camera moves, as many as keep up with it, and all at rest.
+  adapt(now) {
+    const { surface } = this, took = now - (this.before ?? now), last = this.moving ?? -REST;
+    const moving = last >= (this.before ?? now) || now - last < REST;
+    this.before = now;
+    if (!surface) return;
+    if (moving && took > SLOW) this.share = Math.max(LEAST_SHARE, this.share * Math.max(0.4, SLOW / took));
+    else if (moving && took < SLOW / 2) this.share = Math.min(1, this.share * 1.05);
+    const share = moving ? this.share : 1;
+    if (share === this.drawnShare) return;
+    this.drawnShare = share;
+    surface.geometry.setDrawRange(0, Math.ceil(share * surface.geometry.attributes.position.count));
+    surface.material.uniforms.radius.value = SPREAD * this.map.surface.radius / Math.sqrt(share);
+    this.changed();
+  }
 
   resize() {
     const box = this.canvas.parentElement.getBoundingClientRect();
@@ -84,7 +103,7 @@ export class Space {
     this.controls.zoomSpeed = 0.8;
     this.controls.target.copy(target);
     this.controls.update();
-    this.controls.addEventListener("change", () => { this.changed(); this.moved(); });
+    this.controls.addEventListener("change", () => { this.moving = performance.now(); this.changed(); this.moved(); });
     this.changed();
     this.moved();
   }
@@ -211,7 +230,8 @@ export class Space {
       if (part.colours) tints = numbers(part.colours);
       else { tints = new Uint8Array(3 * count); for (let i = 0; i < count; i++) tints.set([222, 138, 26], 3 * i); }
       geometry.setAttribute("tint", new THREE.BufferAttribute(tints, 3, true));
-      this.points(name, geometry, 1.7 * part.radius, least);
+      const made = this.points(name, geometry, SPREAD * part.radius, least);
+      if (name === "surface") this.surface = made;
     }
     const places = [];
     for (const { pose, shape } of this.map.cameras) places.push(...this.moved3(pyramid(shape, 0.35 * this.size).lines, pose));
