@@ -56,7 +56,7 @@ class Client:
     def get(self, path: str, **headers: str) -> Reply:
         return self.request("GET", path, headers=headers)
 
-    def post(self, path: str, content: bytes = b"", **headers: str) -> Reply:
+    def post(self, path: str, content: bytes | None = None, headers: dict[str, str] | None = None) -> Reply:
         return self.request("POST", path, content, headers)
 
 
