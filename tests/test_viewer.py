@@ -20,7 +20,7 @@ from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid,
 from bidnerf_core.viewer.packing import packed_points
 from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.saving import MODULES, page_html
-from bidnerf_core.viewer.scene import shown_map
+from bidnerf_core.viewer.scene import shown_map, towards
 from bidnerf_core.viewer.view import localized
 from commands import Run
 
@@ -104,6 +104,18 @@ def test_depth_difference_is_the_offset_of_a_shifted_measurement(localizer: Loca
     assert shifted is not None
     assert math.isclose(shifted.median, 0.25, rel_tol=1e-4)
     assert depth_difference(image, replace(frame, depth=None)) is None
+
+
+def test_normals_point_to_the_side_of_the_cameras(generator: torch.Generator) -> None:
+    places = torch.nn.functional.normalize(torch.randn((200, 3), generator=generator), dim=-1)
+    signs = torch.randn((200, 1), generator=generator).sign()
+    inside, outside = (
+        torch.zeros((1, 3)),
+        5 * torch.eye(3).repeat(2, 1) * torch.tensor([[1.0]] * 3 + [[-1.0]] * 3),
+    )
+    torch.testing.assert_close(towards(places, signs * places, inside), -places)
+    torch.testing.assert_close(towards(places, signs * places, outside), places)
+    torch.testing.assert_close(towards(places, places, places[:0]), places)
 
 
 def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) -> None:

@@ -21,7 +21,7 @@ JPEG_QUALITY = 85
 class Packed:
     """An array: its numbers in base64, row by row."""
 
-    type: Literal["uint8", "uint16", "float32"]
+    type: Literal["int8", "uint8", "uint16", "float32"]
     shape: tuple[int, ...]
     base64: str
 
@@ -46,7 +46,7 @@ class Picture:
 
 def packed(array: np.ndarray) -> Packed:
     """Return an array of bytes, 16-bit integers or floats as JSON values."""
-    kinds = {"u1": "uint8", "u2": "uint16", "f4": "float32", "f8": "float32"}
+    kinds = {"i1": "int8", "u1": "uint8", "u2": "uint16", "f4": "float32", "f8": "float32"}
     kind = kinds[array.dtype.str[1:]]
     content = np.ascontiguousarray(array, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
     return Packed(kind, array.shape, base64.b64encode(content).decode())  # type: ignore[arg-type]

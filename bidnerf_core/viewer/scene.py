@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
@@ -19,6 +20,7 @@ from bidnerf_core.viewer.packing import (
     PackedPoints,
     Picture,
     jpeg,
+    packed,
     packed_colours,
     packed_points,
     photograph,
@@ -43,6 +45,7 @@ class Points:
     colours: Packed | None
     count: int  # in the map
     radius: float  # in the unit of the map
+    normals: Packed | None = None  # int8 (n, 3), in 127ths, towards the cameras; what faces away is not drawn
 
 
 @dataclass(frozen=True)
@@ -149,9 +152,23 @@ def _surface(scene: Map) -> Points | None:
     surfels = scene.surface.surfels
     some = _some(len(surfels), MOST_SURFELS)  # in random order, so that the first ones show the whole
     radius = scene.surface.cell * max(1.0, (len(surfels) / max(len(some), 1)) ** 0.5) / 2
+    positions, keyframes = surfels.positions[some].cpu(), scene.surface.keyframes[:, :3, 3].cpu()
+    normals = towards(positions, surfels.normals[some].cpu(), keyframes)
     return Points(
-        packed_points(surfels.positions[some]), packed_colours(surfels.rgb[some]), len(surfels), radius
-    )
+        packed_points(positions), packed_colours(surfels.rgb[some]), len(surfels), radius,
+        packed((127 * normals).round().to(torch.int8).numpy()),
+    )  # fmt: skip
+
+
+def towards(
+    positions: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], cameras: Float[Tensor, "k 3"]
+) -> Float[Tensor, "n 3"]:
+    """Return normals that point to the side of the nearest camera, so that one can look into a room from outside."""
+    if not len(cameras):
+        return normals
+    _, nearest = cKDTree(cameras.numpy()).query(positions.numpy())
+    ahead = ((cameras[torch.from_numpy(nearest)] - positions) * normals).sum(-1, keepdim=True)
+    return torch.where(ahead < 0, -normals, normals)
 
 
 def _landmarks(scene: Map) -> Points | None:

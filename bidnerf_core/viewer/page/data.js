@@ -1,6 +1,6 @@
 // Decodes the state of the page, and makes elements whose text is always text.
 
-const KINDS = { uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
+const KINDS = { int8: Int8Array, uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
 
 export function numbers(packed) {
   const text = atob(packed.base64), bytes = new Uint8Array(text.length);

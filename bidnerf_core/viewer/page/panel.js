@@ -3,7 +3,7 @@ import { element, lengthText, percent } from "./data.js";
 
 export function outcomeOf(answer) {
   const facts = [];
-  if (answer.confidence !== null) facts.push(`${percent(answer.confidence)} likely to be right`);
+  if (answer.accepted && answer.confidence !== null) facts.push(`${percent(answer.confidence)} likely to be right`);
   if (answer.seconds) facts.push(`${answer.seconds.toFixed(2)} s`);
   if (answer.method) facts.push(`method ${answer.method}`);
   const lines = [

@@ -6,14 +6,15 @@ const SPREAD = 2.2;  // radius of a point of the surface over that of its surfel
 const SLOW = 45, REST = 180, LEAST_SHARE = 0.08;  // ms of a frame, ms without motion, share of the points
 
 const VERTEX = `
-uniform float radius, height, least;
-attribute vec3 tint;
+uniform float radius, height, least, sided;
+attribute vec3 tint, facing;
 varying vec3 vTint;
 void main() {
   vec4 seen = modelViewMatrix * vec4(position, 1.0);
   gl_Position = projectionMatrix * seen;
   gl_PointSize = clamp(radius * height * projectionMatrix[1][1] / max(-seen.z, 1e-6), least, 40.0);
   vTint = tint;
+  if (sided > 0.5 && dot(normalMatrix * facing, normalize(-seen.xyz)) < -0.1) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
 }`;
 const FRAGMENT = `
 varying vec3 vTint;
@@ -209,7 +210,7 @@ export class Space {
     const height = this.canvas.height || 600;
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX, fragmentShader: FRAGMENT,
-      uniforms: { radius: { value: radius }, height: { value: height }, least: { value: least } },
+      uniforms: { radius: { value: radius }, height: { value: height }, least: { value: least }, sided: { value: geometry.attributes.facing ? 1 : 0 } },
     });
     const made = new THREE.Points(geometry, material);
     made.frustumCulled = false;
@@ -230,6 +231,7 @@ export class Space {
       if (part.colours) tints = numbers(part.colours);
       else { tints = new Uint8Array(3 * count); for (let i = 0; i < count; i++) tints.set([222, 138, 26], 3 * i); }
       geometry.setAttribute("tint", new THREE.BufferAttribute(tints, 3, true));
+      if (part.normals) geometry.setAttribute("facing", new THREE.BufferAttribute(numbers(part.normals), 3, true));
       const made = this.points(name, geometry, SPREAD * part.radius, least);
       if (name === "surface") this.surface = made;
     }
