@@ -230,6 +230,8 @@ class Page {
     const { space, answer } = this;
     if (!space || !answer) return;
     space.clear("answer");
+    const button = find("show-ellipsoid");
+    if (button) button.textContent = this.factor > 1 && answer.ellipsoid ? `Ellipsoid × ${this.factor}` : "Ellipsoid";
     if (!answer.pose) return;
     const colour = colourOf(answer.accepted ? "--good" : "--bad");
     space.frustum("answer", answer.pose, answer.shape, colour, { picture: answer.observed?.url });
