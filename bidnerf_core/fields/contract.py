@@ -112,6 +112,25 @@ class HitField(RadianceField, Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """The pieces of a field that is made of some, as points: for whoever draws it without casting rays."""
+
+    positions: Float[Tensor, "n 3"]  # metres, world
+    rgb: Float[Tensor, "n 3"]  # in [0, 1], whatever the direction
+    opacity: Float[Tensor, "n"]  # in [0, 1]
+    radius: Float[Tensor, "n"]  # metres: the geometric mean of the standard deviations along its axes
+
+
+@runtime_checkable
+class SplatField(Protocol):
+    """An optional part of a field that is made of pieces, which viewers show."""
+
+    def splats(self) -> Splats:
+        """Return all pieces, in any order."""
+        ...
+
+
 def levels(field: RadianceField) -> tuple[RadianceField, ...]:
     """Return the field's levels of detail, coarsest first; a field that offers none is its own only level."""
     return tuple(getattr(field, "levels", None) or (field,))

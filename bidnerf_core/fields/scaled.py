@@ -16,6 +16,8 @@ from bidnerf_core.fields.contract import (
     Rays,
     RaySampler,
     RaySamples,
+    SplatField,
+    Splats,
     levels,
 )
 
@@ -54,8 +56,20 @@ class ScaledHitField(ScaledField):
         return replace(found, distance=found.distance * self.scale)
 
 
+class ScaledSplatField(ScaledHitField):
+    """A scaled field that is made of pieces."""
+
+    def splats(self) -> Splats:
+        """Return the pieces in the scaled world."""
+        trained: SplatField = self.trained
+        found = trained.splats()
+        return replace(found, positions=found.positions * self.scale, radius=found.radius * self.scale)
+
+
 def scaled_field(field: RadianceField, scale: float) -> ScaledField:
     """Return a field in a world that is ``scale`` times as large; it offers what ``field`` does."""
+    if isinstance(field, HitField) and isinstance(field, SplatField):
+        return ScaledSplatField(field, scale)
     return (ScaledHitField if isinstance(field, HitField) else ScaledField)(field, scale)
 
 

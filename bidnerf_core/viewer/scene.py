@@ -12,6 +12,8 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import StoredCamera, poses_of
+from bidnerf_core.devices import moved
+from bidnerf_core.fields.contract import SplatField
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.maps.map import Map
@@ -33,6 +35,8 @@ THUMBNAIL, THUMBNAIL_QUALITY = 80, 75
 """Pixels of the longer side of a thumbnail, and its quality as a JPEG."""
 MOST_THUMBNAILS = 60
 """Thumbnails that a saved page holds, since each has to be rendered."""
+LEAST_OPACITY = 0.2
+"""Opacity of a splat below which it is not shown."""
 MOST_OF_SCENE = 0.98
 """Share of the points that the first view of a scene is made for; a few may be far away."""
 
@@ -45,6 +49,7 @@ class Points:
     colours: Packed | None
     count: int  # in the map
     radius: float  # in the unit of the map
+    sizes: Packed | None = None  # float32 (n): radii of points that differ in size
     normals: Packed | None = None  # int8 (n, 3), in 127ths, towards the cameras; what faces away is not drawn
 
 
@@ -91,6 +96,7 @@ class ShownMap:
     extent: float  # in the unit of the map: what the first view should show
     surface: Points | None
     landmarks: Points | None
+    splats: Points | None
     cameras: tuple[ShownCamera, ...]
 
 
@@ -108,6 +114,7 @@ def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> ShownMap:
         extent=extent,
         surface=_surface(scene),
         landmarks=_landmarks(scene),
+        splats=_splats(scene),
         cameras=_cameras(scene, thumbnails),
     )
 
@@ -156,7 +163,7 @@ def _surface(scene: Map) -> Points | None:
     normals = towards(positions, surfels.normals[some].cpu(), keyframes)
     return Points(
         packed_points(positions), packed_colours(surfels.rgb[some]), len(surfels), radius,
-        packed((127 * normals).round().to(torch.int8).numpy()),
+        normals=packed((127 * normals).round().to(torch.int8).numpy()),
     )  # fmt: skip
 
 
@@ -176,6 +183,19 @@ def _landmarks(scene: Map) -> Points | None:
         return None
     some = _some(len(scene.landmarks), MOST_LANDMARKS)
     return Points(packed_points(scene.landmarks.positions[some]), None, len(scene.landmarks), 0.0)
+
+
+def _splats(scene: Map) -> Points | None:
+    """Return the pieces of the field that are not nearly transparent, as points of their own sizes."""
+    if not isinstance(scene.field, SplatField):
+        return None
+    splats = moved(scene.field.splats(), "cpu")
+    seen = (splats.opacity >= LEAST_OPACITY).nonzero()[:, 0]
+    some = seen[_some(len(seen), MOST_SURFELS)]
+    return Points(
+        packed_points(splats.positions[some]), packed_colours(splats.rgb[some]), len(splats.positions), 1.0,
+        packed(splats.radius[some].float().numpy()),
+    )  # fmt: skip
 
 
 def _some(count: int, most: int) -> Tensor:

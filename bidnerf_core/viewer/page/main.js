@@ -7,10 +7,10 @@ import { Results } from "./table.js";
 import { Track } from "./track.js";
 import { Live } from "./live.js";
 
-const LAYERS = [["surface", "Surface", "s"], ["landmarks", "Landmarks", "l"], ["cameras", "Cameras", "c"], ["ellipsoid", "Ellipsoid", "e"]];
+const LAYERS = [["surface", "Surface", "s"], ["splats", "Splats", "x"], ["landmarks", "Landmarks", "l"], ["cameras", "Cameras", "c"], ["ellipsoid", "Ellipsoid", "e"]];
 const KEYS = [["← →", "step of the search"], ["space", "play the search"], ["n p", "next, previous image"], ["1 … 6", "way of comparing"],
   ["w W", "wipe"], ["f", "whole map"], ["g", "go to the pose"], ["o", "from the photo"], ["r", "runner-up"],
-  ["s l c e", "surface, landmarks, cameras, ellipsoid"], ["v", "field from here (live)"]];
+  ["s x l c e", "surface, splats, landmarks, cameras, ellipsoid"], ["v", "field from here (live)"]];
 const ENLARGED = [1, 10, 100, 1000];
 
 class Page {
@@ -23,6 +23,8 @@ class Page {
     for (const [key, what] of KEYS) find("keys").append(element("dt", {}, element("kbd", {}, key)), element("dd", {}, what));
     try { this.space = new Space(find("space"), this.map); } catch (error) { this.note("This browser shows no WebGL; the pictures and figures beside are complete."); }
     this.hidden.add("landmarks");
+    if (this.map.splats && this.map.surface) this.hidden.add("surface");
+    this.space?.show("surface", !this.hidden.has("surface"));
     this.space?.show("landmarks", !this.map.surface);
     if (!this.map.surface) this.hidden.delete("landmarks");
     this.buttons();

@@ -8,11 +8,12 @@ const SLOW = 45, REST = 180, LEAST_SHARE = 0.08;  // ms of a frame, ms without m
 const VERTEX = `
 uniform float radius, height, least, sided;
 attribute vec3 tint, facing;
+attribute float extent;
 varying vec3 vTint;
 void main() {
   vec4 seen = modelViewMatrix * vec4(position, 1.0);
   gl_Position = projectionMatrix * seen;
-  gl_PointSize = clamp(radius * height * projectionMatrix[1][1] / max(-seen.z, 1e-6), least, 40.0);
+  gl_PointSize = clamp(extent * radius * height * projectionMatrix[1][1] / max(-seen.z, 1e-6), least, 40.0);
   vTint = tint;
   if (sided > 0.5 && dot(normalMatrix * facing, normalize(-seen.xyz)) < -0.1) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
 }`;
@@ -48,7 +49,7 @@ export class Space {
     this.camera = new THREE.PerspectiveCamera(FOV, 1, map.extent / 2000, map.extent * 60);
     this.layers = {};
     this.size = 0.05 * map.extent;
-    for (const name of ["surface", "landmarks", "cameras", "search", "answer", "runner", "matches", "track"]) {
+    for (const name of ["surface", "landmarks", "splats", "cameras", "search", "answer", "runner", "matches", "track"]) {
       this.layers[name] = new THREE.Group();
       this.scene.add(this.layers[name]);
     }
@@ -207,6 +208,10 @@ export class Space {
   }
 
   points(layer, geometry, radius, least) {
+    if (!geometry.attributes.extent) {
+      const ones = new Uint8Array(geometry.attributes.position.count).fill(1);
+      geometry.setAttribute("extent", new THREE.BufferAttribute(ones, 1));
+    }
     const height = this.canvas.height || 600;
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX, fragmentShader: FRAGMENT,
@@ -221,7 +226,7 @@ export class Space {
 
   addMap() {
     const { surface, landmarks } = this.map;
-    for (const [name, part, least] of [["surface", surface, 1.5], ["landmarks", landmarks, 2.5]]) {
+    for (const [name, part, least] of [["surface", surface, 1.5], ["landmarks", landmarks, 2.5], ["splats", this.map.splats, 1]]) {
       if (!part) continue;
       const geometry = new THREE.BufferGeometry(), places = numbers(part.points.places), count = places.length / 3;
       const positions = new Float32Array(places.length), { lower, size } = part.points;
@@ -231,6 +236,7 @@ export class Space {
       if (part.colours) tints = numbers(part.colours);
       else { tints = new Uint8Array(3 * count); for (let i = 0; i < count; i++) tints.set([222, 138, 26], 3 * i); }
       geometry.setAttribute("tint", new THREE.BufferAttribute(tints, 3, true));
+      if (part.sizes) geometry.setAttribute("extent", new THREE.BufferAttribute(numbers(part.sizes), 1));
       if (part.normals) geometry.setAttribute("facing", new THREE.BufferAttribute(numbers(part.normals), 3, true));
       const made = this.points(name, geometry, SPREAD * part.radius, least);
       if (name === "surface") this.surface = made;

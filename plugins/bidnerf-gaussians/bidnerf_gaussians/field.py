@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
 from bidnerf_core.fields.box_tree import level_sizes, tree_of
-from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds
+from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds, Splats
 from bidnerf_core.fields.met_pieces import (
     Meeting,
     flattened,
@@ -107,6 +107,13 @@ class GaussiansField(nn.Module):
         """Return the Gaussians, on the CPU."""
         names = ("means", "log_scales", "quaternions", "logits", "harmonics")
         return Gaussians(*(getattr(self, name).detach().cpu().float() for name in names))
+
+    @torch.no_grad()
+    def splats(self) -> Splats:
+        """Return the Gaussians as points, in the colours of the first harmonic, which is their mean."""
+        means = self.means.detach()
+        rgb = colours(self.harmonics.detach()[:, :1], means)
+        return Splats(means, rgb, self.logits.detach().sigmoid(), self.log_scales.detach().mean(-1).exp())
 
     @property
     def sampler(self) -> PeakSampler:

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.fields.contract import Rays, SceneBounds
+from bidnerf_core.fields.contract import Rays, SceneBounds, SplatField
 from bidnerf_core.fields.rendering import render
+from bidnerf_core.fields.scaled import scaled_field
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_gaussians import Gaussians, GaussiansConfig, GaussiansField, quaternions
 from bidnerf_gaussians.gaussians import LEAST_OPACITY
-from bidnerf_gaussians.spherical_harmonics import colours
+from bidnerf_gaussians.spherical_harmonics import basis, colours
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.01, 10.0)
 
@@ -143,3 +144,21 @@ def test_quaternions_turn_as_their_matrices() -> None:
     assert torch.allclose(quaternions.matrices(quaternions.product(q, q.flip(0))), R @ R.flip(0))
     for each in R:
         assert torch.allclose(quaternions.matrices(quaternions.quaternion_of(each)), each)
+
+
+def test_splats_are_the_gaussians_as_points(some: Callable[..., Gaussians]) -> None:
+    gaussians = some(40, degree=1)
+    field = field_of(gaussians)
+    assert isinstance(field, SplatField)
+    found, grown = field.splats(), scaled_field(field, 2.0)
+    assert isinstance(grown, SplatField)
+    torch.testing.assert_close(found.positions, gaussians.means)
+    torch.testing.assert_close(found.radius**3, gaussians.log_scales.exp().prod(-1))
+    directions = torch.nn.functional.normalize(torch.randn((4000, 3)), dim=-1)
+    linear = 0.5 + torch.einsum("pk,nkc->npc", basis(directions, 4), gaussians.harmonics)
+    inside = (
+        ((linear > 0) & (linear < 1)).all(1).all(-1)
+    )  # where nothing is clipped, the first harmonic is the mean
+    torch.testing.assert_close(found.rgb[inside], linear.mean(1)[inside], atol=0.02, rtol=0)
+    torch.testing.assert_close(grown.splats().positions, 2 * found.positions)
+    torch.testing.assert_close(grown.splats().radius, 2 * found.radius)
