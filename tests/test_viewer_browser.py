@@ -71,6 +71,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
     ]
     page = page_of(viewed.room(), answers, shown_trajectory(folder / "track.json"), rows)
+    (folder / "notebook.html").write_text(f"<!doctype html><title>notebook</title>{page._repr_html_()}")
     return save_page(page.state, folder / "page.html")
 
 
@@ -185,3 +186,19 @@ def test_a_phone_shows_everything_in_its_width(browser: Any, saved: Path, scheme
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
         paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (int(paper[4:].split(",")[0]) > 127) == (scheme == "light")
+
+
+def test_a_notebook_shows_the_page(browser: Any, saved: Path) -> None:
+    context = browser.new_context(viewport=LAPTOP, offline=True)
+    page, faults = context.new_page(), list[str]()
+    page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.goto((saved.parent / "notebook.html").as_uri())
+    frame = page.frames[1]
+    frame.wait_for_selector(".outcome.good")
+    frame.click("#next")
+    frame.wait_for_selector(".outcome.bad")
+    frame.click("#rows tbody tr")
+    frame.wait_for_selector(".outcome.good")
+    context.close()
+    assert not faults

@@ -36,7 +36,10 @@ class Page {
     if (this.answers.length) this.select(0, false);
     else this.empty();
     this.follow();
+    this.offerViews();
   }
+
+  offerViews() { for (const id of ["go", "from"]) find(id).hidden = !this.pose; }
 
   placeOf(name) { return this.answers.findIndex((answer) => answer.name === name); }
 
@@ -174,7 +177,7 @@ class Page {
     this.current = place;
     if (fresh) this.runner = false;
     find("query").value = String(place);
-    if (remember) history.replaceState(null, "", `#frame=${encodeURIComponent(this.answer.name)}`);
+    if (remember && location.protocol !== "about:") history.replaceState(null, "", `#frame=${encodeURIComponent(this.answer.name)}`);
     const { ellipsoid, steps } = this.answer;
     const size = this.space?.size ?? 1;
     this.factor = ellipsoid ? ENLARGED.find((factor) => factor * ellipsoid.lengths[0] >= 0.3 * size) ?? 1000 : 1;
@@ -229,6 +232,7 @@ class Page {
   stop() { clearInterval(this.playing); this.playing = null; find("play").textContent = "▶"; }
 
   drawAnswer() {
+    this.offerViews();
     const { space, answer } = this;
     if (!space || !answer) return;
     space.clear("answer");
