@@ -411,6 +411,34 @@ def conditions(records: Records) -> str:
 
 
 @table
+def detectors(records: Records) -> str:
+    """Poses by landmarks of each detector, from maps of few photos and under other conditions."""
+    scenes, names = ("phone_doll", "iphone_corridor"), ("sift", "xfeat", "sift-xfeat")
+    rows = []
+    for condition, title in {
+        "every 2, as it is": "every 2nd photo in the map",
+        **{
+            f"every 2, {name}": f"the same, {name}"
+            for name in ("half resolution", "double resolution", "night")
+        },
+        **{f"every {k}, as it is": f"every {k}th photo in the map" for k in (4, 8, 16)},
+    }.items():
+        row: list[object] = [title]
+        for scene in scenes:
+            cells = records["detectors"][scene][condition]
+            row += [f"{cells[name]['right']} of {cells[name]['n']}" for name in names]
+        rows.append(row)
+    times = [
+        records["detectors"][scene]["every 2, as it is"][name]["times_slower"]
+        for scene in scenes
+        for name in names
+    ]
+    rows.append(["time of a query, of SIFT's", *(f"{time:.1f}" for time in times)])
+    head = ("queries right", *(f"{SCENES[scene]}: `{name}`" for scene in scenes for name in names))
+    return _table(head, rows, records)
+
+
+@table
 def rolling_shutter(records: Records) -> str:
     """Poses by landmarks, with and without the motion during the readout."""
     rows = []

@@ -5,3 +5,7 @@ from bidnerf_core.testing import FeaturesContract
 
 class TestXFeat(FeaturesContract):
     name = "xfeat"
+
+
+class TestBoth(FeaturesContract):
+    name = "sift-xfeat"

@@ -17,6 +17,7 @@ from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.localization import LandmarkMatcher, propose
 from bidnerf_core.mapping import build_landmarks
 from bidnerf_core.mapping.landmarks.features import (
+    SIFT,
     byte_of_zero,
     squared_distances,
     strongest,
@@ -24,6 +25,7 @@ from bidnerf_core.mapping.landmarks.features import (
 )
 from bidnerf_core.results.errors import pose_error
 from bidnerf_xfeat.detector import XFeat
+from bidnerf_xfeat.with_sift import WithSift
 
 
 def drawn(height: int, width: int) -> Tensor:
@@ -129,3 +131,20 @@ def test_an_image_is_found_in_a_map_of_others() -> None:
     error = pose_error(found.T_world_camera, query.T_ref_camera)
     assert float(error.translation) < 0.06  # at a distance of 2.7
     assert float(error.rotation_deg) < 1
+
+
+def test_both_detectors_keep_to_themselves() -> None:
+    """Keypoints of both are found in turns, and each is most like another keypoint of its own detector."""
+    found, learned, classic = WithSift()(image()), XFeat()(image()), SIFT(image())
+    assert len(found) == len(learned) + len(classic)
+    assert torch.equal(found.pixels[:4:2], learned.pixels[:2])
+    assert torch.equal(found.pixels[1:4:2], classic.pixels[:2])
+    is_learned = (found.descriptors[:, 64:] == 128).all(1)
+    assert int(is_learned.sum()) == len(learned)
+    distances = squared_distances(found.descriptors, found.descriptors).fill_diagonal_(torch.inf)
+    assert float((is_learned[distances.argmin(1)] == is_learned).double().mean()) > 0.95
+    between = squared_distances(found.descriptors[~is_learned], found.descriptors[~is_learned])
+    assert torch.allclose(
+        4 * between, squared_distances(classic.descriptors, classic.descriptors), rtol=0.05, atol=2000
+    )
+    assert len(strongest(WithSift(), 40)(image())) == 40
