@@ -14,6 +14,12 @@ import torch
 
 import viewed
 from bidnerf_core import SE3, InputError, Localizer, view
+from bidnerf_core.cli.report import link_to
+from bidnerf_core.evaluation.report import doubtful
+from bidnerf_core.evaluation.report import page as report_page
+from bidnerf_core.evaluation.results import ResultTable
+from bidnerf_core.evaluation.summary import usual_criterion
+from bidnerf_core.evaluation.trial import ScalarPoseError
 from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.recording import current_record, recorded
 from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid, shown_answer
@@ -208,3 +214,18 @@ def test_view_saves_a_page_of_photos(bidnerf: Run, tmp_path: Path) -> None:
     (answer,) = viewed.state_of(page.read_text())["answers"]
     assert not answer["accepted"]
     assert "none.png" in answer["reason"]
+
+
+def test_a_report_links_to_the_frames_that_are_wrong_or_refused() -> None:
+    table = ResultTable.load(Path(__file__).parent / "earlier_results.jsonl")
+    first = table.rows[0]
+    wrong = replace(first, converged=True, error=ScalarPoseError(0.3, 1.0), frame="wrong #1")
+    right = replace(first, converged=True, error=ScalarPoseError(0.01, 1.0), frame="right")
+    refused = replace(first, converged=False, error=ScalarPoseError(0.01, 1.0), frame=viewed.HOSTILE)
+    rows = (refused, right, wrong)
+    assert [row.frame for row in doubtful(rows)] == ["wrong #1", viewed.HOSTILE]
+    html_text = report_page("t", ResultTable(rows), [], [], usual_criterion(rows), "view.html")
+    assert 'href="view.html#frame=wrong%20%231"' in html_text
+    assert viewed.HOSTILE not in html_text
+    assert 'href="view.html' not in report_page("t", ResultTable(rows), [], [], usual_criterion(rows))
+    assert link_to(Path("/a/pages/my map.html"), Path("/a/report")) == "../pages/my%20map.html"

@@ -126,7 +126,7 @@ export class Comparison {
     const { width, height } = this.shown.rendered, canvas = element("canvas", { width, height });
     box.append(canvas);
     under.append(element("span", {}, element("i", { class: "dot", style: "background:#00be6e" }), "edges of the photo"),
-      element("span", {}, element("i", { class: "dot", style: "background:#eb008c" }), `of the ${this.shown.label ?? "rendering"}`));
+      element("span", {}, element("i", { class: "dot", style: "background:#eb008c" }), `of the ${this.shown.label === "runner-up" ? "runner-up" : "rendering"}`));
     const [a, b] = await Promise.all([this.shown.observed, this.shown.rendered].map(({ url }) => pixels(url, width, height)));
     const ours = gradient(a), theirs = gradient(b), out = new ImageData(width, height);
     const green = [0, 190, 110], pink = [235, 0, 140];

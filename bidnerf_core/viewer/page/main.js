@@ -198,9 +198,10 @@ class Page {
       onchange: (event) => { this.factor = Number(event.target.value); this.drawAnswer(); this.drawPanel(); } }, ...sizes)) : null;
     this.comparison.show({ ...answer, rendered: this.runner ? other?.rendered : answer.rendered, label: this.runner ? "runner-up" : "rendered",
       depth: this.runner ? null : answer.depth });
+    const allPassed = answer.figures.every((figure) => figure.passed !== false);  // then an explanation tells why it was refused
     find("answer").replaceChildren(...outcomeOf(answer), this.comparison.root,
       ...(runner ? [element("p", { class: "row" }, runner, element("span", { class: "small" }, other.reason))] : []),
-      ...figures(answer), ...explanations(answer), ...uncertainty(answer, this.factor), ...(enlarge ? [enlarge] : []), ...poseText(answer).filter(Boolean));
+      ...(allPassed && !answer.accepted ? [...explanations(answer), ...figures(answer)] : [...figures(answer), ...explanations(answer)]), ...uncertainty(answer, this.factor), ...(enlarge ? [enlarge] : []), ...poseText(answer).filter(Boolean));
   }
 
   toggleRunner() {

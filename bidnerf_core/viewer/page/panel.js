@@ -47,7 +47,7 @@ export function figures(answer) {
   return [element("h2", {}, "Figures and thresholds"), element("table", { id: "figures" }, element("tbody", {}, ...rows))];
 }
 
-export function explanations(answer, look) {
+export function explanations(answer) {
   if (!answer.explanations.length) return [];
   const questions = [...new Set(answer.explanations.map((each) => each.question))];
   const titles = { "whose camera": "Whose camera took it?", "which pose": "Which pose is right?" };
