@@ -13,18 +13,20 @@ import pytest
 import torch
 
 import viewed
-from bidnerf_core import SE3, InputError, Localizer, view
+from bidnerf_core import SE3, InputError, Intrinsics, Localizer, view
 from bidnerf_core.cli.report import link_to
 from bidnerf_core.evaluation.report import doubtful
 from bidnerf_core.evaluation.report import page as report_page
 from bidnerf_core.evaluation.results import ResultTable
 from bidnerf_core.evaluation.summary import usual_criterion
 from bidnerf_core.evaluation.trial import ScalarPoseError
+from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.recording import current_record, recorded
 from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid, shown_answer
 from bidnerf_core.viewer.packing import packed_points
 from bidnerf_core.viewer.page_state import PageState
+from bidnerf_core.viewer.rendering import field_image, quick_image
 from bidnerf_core.viewer.saving import MODULES, page_html
 from bidnerf_core.viewer.scene import shown_map, towards
 from bidnerf_core.viewer.view import localized
@@ -229,3 +231,22 @@ def test_a_report_links_to_the_frames_that_are_wrong_or_refused() -> None:
     assert viewed.HOSTILE not in html_text
     assert 'href="view.html' not in report_page("t", ResultTable(rows), [], [], usual_criterion(rows))
     assert link_to(Path("/a/pages/my map.html"), Path("/a/report")) == "../pages/my%20map.html"
+
+
+def test_a_rendering_in_strips_is_the_whole_one_and_stops_when_it_is_not_wanted(localizer: Localizer) -> None:
+    scene, pose = viewed.room(), viewed.walk(3)[1]
+    camera = Intrinsics.from_hfov(60, 160, 90)
+    whole = render_image(scene.field, camera, pose, scene.bounds).rgb
+    asked = list[bool]()
+
+    def wanted_twice() -> bool:
+        asked.append(True)
+        return len(asked) > 2
+
+    strips = field_image(scene, camera, pose, lambda: False)
+    assert strips is not None
+    torch.testing.assert_close(strips, whole, atol=1e-5, rtol=0)
+    assert field_image(scene, camera, pose, wanted_twice) is None
+    assert len(asked) == 3
+    assert quick_image(scene, camera, pose).shape == whole.shape
+    assert quick_image(replace(scene, surface=None), camera, pose).equal(whole)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 import time
@@ -32,6 +33,11 @@ ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
 ]  # fmt: skip
+DROP = """([content, name]) => {
+  const bytes = Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0)), dataTransfer = new DataTransfer();
+  dataTransfer.items.add(new File([bytes], name, { type: "image/png" }));
+  for (const kind of ["dragenter", "dragover", "drop"]) document.dispatchEvent(new DragEvent(kind, { dataTransfer, bubbles: true }));
+}"""
 LAPTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 WAIT = 120_000  # ms
 
@@ -124,6 +130,9 @@ def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> N
         page.keyboard.press("p")  # the image that the viewer was started with
         until(page, "page.answers.length === 2 && document.getElementById('note').textContent === ''")
         assert page.text_content("#answer .name") == "photo"
+        page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "dropped.png"])
+        until(page, "page.answers.length === 3 && document.getElementById('note').textContent === ''")
+        assert page.text_content("#answer .name") == "dropped.png"
 
 
 def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Path) -> None:
