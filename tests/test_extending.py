@@ -14,6 +14,7 @@ from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.maps.extending import locate
 from bidnerf_core.testing.textured_field import training_views, view
 from commands import Run
+from photo_files import write_photo
 
 STEPS = 12
 BAKE = bn.BakeConfig(rays=20_000, measured=60_000, cells=20_000)
@@ -107,6 +108,21 @@ def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
     assert float((after.info.cameras[7].pose.translation - 2 * truth).norm()) < 0.06
     with pytest.raises(InputError, match="none of the images that the map was made of"):
         bn.extend(large, training_views()[7:8], [replace(old[0], frame=replace(old[0].frame, name="z"))])
+
+
+def test_photos_that_cannot_be_read_are_left_out(
+    map_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = bn.load_map(map_folder)
+    known, photos = training_views()[0].frame, tmp_path / "photos"
+    write_photo(photos / f"{known.name}.png", (known.rgb.numpy() * 255).round().astype("uint8"))
+    (photos / "b.png").write_bytes((photos / f"{known.name}.png").read_bytes()[:500])
+    with caplog.at_level("INFO", "bidnerf"):
+        assert len(bn.extend(scene, photos).info.cameras) == 7
+    assert "0 of 2 photos located, 1 already in the map, 1 left out" in caplog.text
+    (photos / f"{known.name}.png").unlink()
+    with pytest.raises(InputError, match=r"none of 1 photo can be read: .*b\.png"):
+        bn.extend(scene, photos)
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,8 @@ def extend(
 ) -> None:
     """Add photos of its scene to a map: locate them, train the field on, and complete landmarks and surface.
 
-    Photos that the map does not recognise, or that it was made of, are left out. The map is replaced once all is done: Ctrl-C, or a
-    kill, leaves it as it was, and localizers may go on reading it.
+    Photos that cannot be read, that the map does not recognise, or that it was made of, are left out. The map is replaced once
+    all is done: Ctrl-C, or a kill, leaves it as it was, and localizers may go on reading it.
     """
     if steps is not None:
         require("--steps", steps, 1)

@@ -60,6 +60,8 @@ log = logging.getLogger("bidnerf")
 NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Dataset | str | Path
 """Photos to add: frames, a dataset or the path to one, whose own poses are not used, or the path to a photo or a folder of photos."""
 
+LeftOut: TypeAlias = tuple[str, str]
+"""The name of a photo that is not added, and why."""
 LEAST_LOCATED = 0.25
 """Least share of new photos that a map of their scene recognises."""
 SAME_PLACE = 0.02
@@ -77,7 +79,7 @@ class LocatedPhotos:
     """New photos that were found in a map, and those that were not."""
 
     views: tuple[View, ...]
-    left_out: tuple[tuple[str, str], ...] = ()  # name, and why
+    left_out: tuple[LeftOut, ...] = ()
     known: tuple[str, ...] = ()  # photos that the map was made of
 
 
@@ -113,8 +115,8 @@ def extend(
         where = str(scene.folder or scene.info.data or "map in memory")
         if scene.info.interruption is not None:
             raise InputError(f"{where}: cannot be extended: {scene.info.interruption}")
-        frames = _frames(photos, scene, split)
-        located = locate(scene, frames, where, progress, cancel)
+        frames, unread = _frames(photos, scene, split)
+        located = locate(scene, frames, where, progress, cancel, unread)
         if not located.views:
             log.info(f"{where}: made of these photos already; nothing to add")
             return scene
@@ -125,11 +127,12 @@ def extend(
 
 
 def locate(
-    scene: Map, frames: Sequence[Frame], where: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None
+    scene: Map, frames: Sequence[Frame], where: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+    unread: Sequence[LeftOut] = (),
 ) -> LocatedPhotos:  # fmt: skip
     """Return frames at the poses at which a map finds them, with names that the map does not have yet.
 
-    Raises ``InputError`` where the map has no landmarks, and where it recognises hardly any of the frames.
+    ``unread`` are photos that could not be read, which count as left out. Raises ``InputError`` where the map has no landmarks, and where it recognises hardly any of the frames.
     """
     if scene.landmarks is None:
         raise InputError(
@@ -138,7 +141,7 @@ def locate(
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
     near = SAME_PLACE * scene.bounds.side
     count = counter("locating", "photos", progress, cancel)
-    views, left_out, known = list[View](), list[tuple[str, str]](), list[str]()
+    views, left_out, known = list[View](), list(unread), list[str]()
     for number, frame in enumerate(frames, start=1):
         check_cancelled(cancel, "extending")
         try:
@@ -166,36 +169,53 @@ def locate(
             f"{where}: recognises {len(views) + len(known)} of {amount(len(frames), 'photo')}, expected photos of its scene"
         )
     log.info(
-        f"{where}: {len(views)} of {amount(len(frames), 'photo')} located, {len(known)} already in the map,"
+        f"{where}: {len(views)} of {amount(len(frames) + len(unread), 'photo')} located, {len(known)} already in the map,"
         f" {len(left_out)} left out"
     )
     return LocatedPhotos(tuple(views), tuple(left_out), tuple(known))
 
 
-def _frames(photos: NewPhotos, scene: Map, split: str) -> list[Frame]:
-    """Read photos, reduced to the size of the largest image of the map."""
-    if isinstance(photos, str | Path):
-        path = Path(photos)
-        if path.is_dir() and find_reader(path) is not None:
-            photos = open_dataset(path, scene.bounds.background)
-        else:
-            assumed = () if scene.landmarks is None else scene.landmarks.cameras
-            source = Photos(
-                photo_files([path]), CameraSource(assumed=assumed), background=scene.bounds.background
-            )
-            photos = [source.read(n).frame for n in range(len(source.names))]
+def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
+    """Read photos, reduced to the size of the largest image of the map; return those that cannot be read as well."""
     sides = [max(c.intrinsics.width, c.intrinsics.height) for c in scene.info.cameras]
-    if isinstance(photos, Dataset):
-        names = photos.frame_names(split)
-        with reading_at(max(sides, default=None), asked=bool(sides)):
-            photos = [view.frame for name in names for view in photos.views(split, [name])]
-    frames = [item.frame if isinstance(item, View) else item for item in photos]
+    side, unread = max(sides, default=None), list[LeftOut]()
+    source = _opened(Path(photos), scene) if isinstance(photos, str | Path) else photos
+    if isinstance(source, Dataset | Photos):
+        frames, unread = _read_each(source, split, side)
+    else:
+        frames = [item.frame if isinstance(item, View) else item for item in source]
     for frame in frames:
         if not isinstance(frame, Frame):
             raise InputError(f"photos holds a {type(frame).__name__}, expected frames, views, or a path")
+    if not frames and unread:
+        raise InputError(f"none of {amount(len(unread), 'photo')} can be read: {unread[0][1]}")
     if not frames:
         raise InputError("no photos to add, expected at least one")
-    return [frame.at_most(max(sides)) if sides else frame for frame in frames]
+    return [frame if side is None else frame.at_most(side) for frame in frames], unread
+
+
+def _opened(path: Path, scene: Map) -> Dataset | Photos:
+    if path.is_dir() and find_reader(path) is not None:
+        return open_dataset(path, scene.bounds.background)
+    source = CameraSource(assumed=() if scene.landmarks is None else scene.landmarks.cameras)
+    return Photos(photo_files([path]), source, background=scene.bounds.background)
+
+
+def _read_each(photos: Dataset | Photos, split: str, side: int | None) -> tuple[list[Frame], list[LeftOut]]:
+    """Read the frames of a split, or photos, of at most ``side`` pixels; return those that cannot be read as well."""
+    frames, unread = list[Frame](), list[LeftOut]()
+    names = photos.names if isinstance(photos, Photos) else photos.frame_names(split)
+    for place, name in enumerate(names):
+        try:
+            with reading_at(side, asked=side is not None):
+                views = (
+                    photos.read(place).views if isinstance(photos, Photos) else photos.views(split, [name])
+                )
+        except InputError as error:
+            unread.append((name, str(error)))
+            continue
+        frames += [view.frame for view in views]
+    return frames, unread
 
 
 def _old_views(
