@@ -732,7 +732,7 @@ def imported(records: Records) -> str:
 @table
 def photos(records: Records) -> str:
     """Maps from photos whose poses are unknown, beside maps from the poses of the datasets."""
-    names = {"photos_doll": "doll", "photos_corridor": "corridor", "photos_tum_video": "TUM, as a video"}
+    names = {"photos_doll": "doll", "photos_tum_video": "TUM, as a video"}
     rows = []
     for name, title in names.items():
         result = records[name]
@@ -775,6 +775,54 @@ def _with_person(found: Record) -> Iterator[str]:
     yield str(found["on_person"])
     yield _of(found["as they are"]["5deg 0.05"])
     yield _of(found["with person"]["5deg 0.05"])
+
+
+@table
+def scans(records: Records) -> str:
+    """Fused depth as a map, beside registration with the same cloud."""
+    names = {"room_living": "room", "tum_fr1_xyz": "TUM"}
+    rows = []
+    for scene, ways in records["scans"]["scenes"].items():
+        for way, cell in ways.items():
+            accepted = "-" if cell["accepted"] is None else f"{cell['accepted']}, wrong {cell['silent']}"
+            seconds = _seconds(cell["median_cpu_seconds"])
+            rows.append((names[scene], way, *(_of(cell[c]) for c in LIMITS), accepted, seconds))
+    return _table(("scene", "method", *LIMITS.values(), "accepted", "CPU time"), rows, records)
+
+
+@table
+def capture_size(records: Records) -> str:
+    """Memory of captures of many photos of twelve megapixels."""
+    sizes = records["capture_size"]["measurements"]
+    counts = sorted({int(name.split()[1]) for name in sizes})
+    rows = [
+        (n, *(f"{sizes[f'{command} {n}'][kind] / 1000:.1f} GB" for command in COMMANDS for kind in MEMORY))
+        for n in counts
+    ]
+    head = ("photos", *(f"`{command}`{what}" for command in COMMANDS for what in MEMORY.values()))
+    return _table(head, rows, records)
+
+
+COMMANDS = ("train", "bake", "localize")
+MEMORY = {"resident_MB": "", "anonymous_MB": ", without files"}
+
+
+@table
+def living_maps(records: Records) -> str:
+    """A map of 50 photos that is extended by 35 others, beside one of all."""
+    ways = {
+        "first": "first photos alone",
+        "extended": "extended, first photos no longer there",
+        "extended_with_data": "extended, first photos there",
+        "all": "all at once",
+    }
+    rows = []
+    for scene in records["living_maps"]["extend"].values():
+        for way, title in ways.items():
+            found = scene["maps"][way]
+            right = (f"{found['right'][limits]} of {found['test']}" for limits in LIMITS)
+            rows.append((title, found["images"], found["landmarks"], _decibels(found["psnr"]), *right))
+    return _table(("map", "photos", "landmarks", "PSNR", *LIMITS.values()), rows, records)
 
 
 def main() -> None:
