@@ -139,5 +139,5 @@ def test_what_is_required_is_pinned() -> None:
     pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines if "==" in line}
     extras = PROJECT["optional-dependencies"]
     required = [*PROJECT["dependencies"], *extras["dev"], *extras["plots"], *extras["cluster"]]
-    names = {re.split(r"[\[>]", entry)[0] for entry in required}
+    names = {re.split(r"[\[>=]", entry)[0] for entry in required}
     assert {name.lower().replace("_", "-") for name in names} <= pinned
