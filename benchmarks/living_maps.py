@@ -41,7 +41,8 @@ def scaled(scene: Scene, frames: int) -> dict[str, Any]:
     with TemporaryDirectory() as folder:
         scene.map.scaled(0.5, "units").save(Path(folder) / "half")
         half = bn.load_map(Path(folder) / "half")
-    localizers = [bn.Localizer(each) for each in (scene.map, half, half.scaled(2.0, scene.map.unit))]
+        again = half.scaled(2.0, scene.map.unit)
+    localizers = [bn.Localizer(each) for each in (scene.map, half, again)]
     rows = []
     for each in scene.views(count=frames):
         own, small, back = (localizer(without_depth(each).frame) for localizer in localizers)

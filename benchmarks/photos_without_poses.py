@@ -28,6 +28,7 @@ from _lab import Row
 
 import bidnerf_core as bn
 from bidnerf_core import SE3, Frame, Map, View
+from bidnerf_core.datasets.sequence import TimedFrame
 from bidnerf_core.datasets.whole import all_views
 from bidnerf_core.geometry.similarity import Similarity, fit_similarity
 from bidnerf_core.io.json import to_plain
@@ -47,8 +48,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="test photos, evenly spaced (default: all)")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    truth = {timed.frame.name: (timed.split, timed.truth) for timed in bn.open_sequence(given.data)}
-    truth = {name: (split, pose) for name, (split, pose) in truth.items() if pose is not None}
+    truth = {
+        timed.frame.name: (timed.split, timed.truth)
+        for timed in coloured(given.data)
+        if timed.truth is not None
+    }
     order = list(truth)
     source = written(given.data, given.out, given.video)
     known = given.out / "poses" / "poses.json"
@@ -82,6 +86,11 @@ def main() -> None:
     _lab.record(given.name, result)
 
 
+def coloured(data: Path) -> list[TimedFrame]:
+    """Return the frames of a sequence that have colours: phones record depth more often than photos."""
+    return [timed for timed in bn.open_sequence(data) if timed.frame.has_colour]
+
+
 def without_files(found: dict[str, Any]) -> dict[str, Any]:
     """Return what ``find_poses`` says without the places of the files on this machine."""
     left_out = [{key: each[key] for key in ("photo", "reason")} for each in found["left_out"]]
@@ -109,10 +118,10 @@ def written(data: Path, out: Path, video: bool) -> Path:
     if (out / "written").exists():
         return target
     if video:
-        encode(target, [timed.frame for timed in bn.open_sequence(data)])
+        encode(target, [timed.frame for timed in coloured(data)])
     else:
         target.mkdir(exist_ok=True)
-        images = [timed.frame for timed in bn.open_sequence(data)]
+        images = [timed.frame for timed in coloured(data)]
         originals = {file.stem: file for file in data.rglob("*.jpg")}
         for frame in images:
             if frame.name in originals and not (target / f"{frame.name}.jpg").exists():
