@@ -406,9 +406,11 @@ def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
         await send({"type": "http.response.start", "status": 200, "headers": []})
         await send({"type": "http.response.body", "body": b""})
 
+    refused: list[tuple[str, int]] = []
+
     def status(token: str | None, path: str = "/localize", **headers: str) -> int:
         service = Service.__new__(Service)
-        service.app = Access(app, token)
+        service.app = Access(app, token, lambda scope, status: refused.append((scope["path"], status)))
         return asyncio.run(service.ask("POST", path, [], headers)).status
 
     for host in ("localhost:8000", "127.0.0.1", "[::1]:8000", "127.8.8.8"):
@@ -432,6 +434,13 @@ def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
         assert status(token, authorization=wrong) == 401, wrong
     assert status(token, host="example.org", authorization=f"Bearer {token}") == 200
     assert status(token, "/health", host="example.org") == 200
+    assert refused == [("/localize", 403)] * 8 + [("/localize", 401)] * 8
+
+
+def test_refusals_are_counted(service: Service) -> None:
+    before = service.pool.metrics.requests["refused", 403]
+    assert asyncio.run(service.ask("GET", "/maps", [], {"host": "example.org"})).status == 403
+    assert service.pool.metrics.requests["refused", 403] == before + 1
 
 
 def test_geopose_answers_with_an_honest_accuracy(service: Service, place: Place) -> None:

@@ -84,6 +84,8 @@ class TransformsDataset(SplitDataset[FrameRecord]):
     ) -> None:
         self._files = _Files(path, frames)
         super().__init__(Splits(path, self._files.splits), background)
+        units = {frame.unit for group in frames.values() for frame in group}
+        self.unit = units.pop() if len(units) == 1 else None
         self._read_depth = DepthReader()
         self._depth_unit = depth_unit
         self._by_images = background is None

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, get_args
 
 from bidnerf_core.camera.files import CameraRecord, camera_record
 from bidnerf_core.camera.lenses import PANORAMA, PANORAMA_FACES
@@ -18,6 +18,7 @@ from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry.pose_rows import pose_and_scale
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.images import IMAGE_SUFFIXES
 from bidnerf_core.io.json import Record, read_record
 
@@ -42,6 +43,12 @@ class FrameRecord:
     depth_unit: float  # metres
     time: float | None  # seconds
     mask_path: PurePosixPath | None  # black is hidden
+
+    @property
+    def unit(self) -> LengthUnit | None:
+        """The unit of its position, where the file says ``"unit": "metres"`` or ``"units"``, as those of bidnerf do."""
+        said = self.record.value("unit")
+        return said if said in get_args(LengthUnit) else None
 
     @property
     def stem(self) -> str:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.queries import Query, QuerySource
@@ -183,6 +183,9 @@ def _shows_scene(found: Localization) -> bool:
     return found.outcome in RECOGNISED
 
 
+AnswersT = TypeVar("AnswersT", bound=Answers)
+
+
 def localize_each(
     localizer: Localizer,
     queries: QuerySource,
@@ -205,34 +208,51 @@ def localize_each(
         if answers is None
         else answers
     )
+    bare_before = False
+
+    def localize(query: Query, number: int) -> Answer:
+        nonlocal bare_before
+        bare = [view.frame.name for view in query.views if not view.frame.has_depth]
+        if bare and query.truth is not None and query.depth_rays is None and not bare_before:
+            bare_before = True
+            log.info("%s: no measured depth; colour only", ", ".join(bare))
+        if number == 0:
+            _log_depth_noise(query, localizer)
+        found = localizer(query.views, None if start is None else start(query), query.depth_rays, seed)
+        if not bool(found.T_world_camera.matrix().isfinite().all()):
+            raise InputError(
+                f"{query.name}: {found.method} came to a pose that is not finite, expected a sound map"
+            )
+        frame = replace(query.frame, name=query.name)
+        return Answer.of(frame, number, found, truth=query.truth, file=query.file)
+
+    return answer_each(queries, localize, answers, localizer.method, each, progress, cancel)
+
+
+def answer_each(
+    queries: QuerySource,
+    localize: Callable[[Query, int], Answer],
+    answers: AnswersT,
+    method: str,
+    each: Callable[[Query, Answer | Failure], None] | None,
+    progress: ProgressCallback | None,
+    cancel: Cancel | None,
+) -> AnswersT:
+    """Answer each query and its number; one that cannot be read or localized does not stop the others, if there are any."""
     total = len(queries.names)
     count = counter("localizing", "images", progress, cancel)
-    bare_before = False
     for number, name in enumerate(queries.names):
         answer: Answer | Failure
         query = Query(name, ())
         try:
             query = queries.read(number)
-            bare = [view.frame.name for view in query.views if not view.frame.has_depth]
-            if bare and query.truth is not None and query.depth_rays is None and not bare_before:
-                bare_before = True
-                log.info("%s: no measured depth; colour only", ", ".join(bare))
-            if number == 0:
-                _log_depth_noise(query, localizer)
-            found = localizer(query.views, None if start is None else start(query), query.depth_rays, seed)
-            if not bool(found.T_world_camera.matrix().isfinite().all()):
-                raise InputError(
-                    f"{name}: {found.method} came to a pose that is not finite, expected a sound map"
-                )
-            answer = Answer.of(
-                replace(query.frame, name=query.name), number, found, truth=query.truth, file=query.file
-            )
+            answer = localize(query, number)
         except UsageError:
             raise
         except InputError as error:
             if total == 1:
                 raise
-            answer = Failure(name, localizer.method, str(error))
+            answer = Failure(name, method, str(error))
         answers.append(answer)
         if each is not None:
             each(query, answer)

@@ -12,8 +12,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.maps.collection import MapCollection, Placement
-from bidnerf_core.progress import Cancel, ProgressCallback, counter
-from bidnerf_core.results.answers import Answer, Answers, Failure
+from bidnerf_core.progress import Cancel, ProgressCallback
+from bidnerf_core.results.answers import Answer, Answers, Failure, answer_each
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,27 +78,16 @@ def place_each(
 
     Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
     """
+
+    def place(query: Query, number: int) -> PlacedAnswer:
+        if len(query.views) != 1 or query.depth_rays is not None:
+            raise InputError(
+                f"{query.name}: is a rig or has points of a sensor, expected single images in several maps"
+            )
+        placement = maps(query.views[0].frame, seed)
+        backend = getattr(getattr(maps.localizer(placement.map).map, "info", None), "backend", "")
+        frame = replace(query.frame, name=query.name)
+        return PlacedAnswer.placed(frame, number, placement, backend, query.file)
+
     answers = Placements() if answers is None else answers
-    count, total = counter("localizing", "images", progress, cancel), len(queries.names)
-    for number, name in enumerate(queries.names):
-        answer: Answer | Failure
-        query = Query(name, ())
-        try:
-            query = queries.read(number)
-            if len(query.views) != 1 or query.depth_rays is not None:
-                raise InputError(
-                    f"{name}: is a rig or has points of a sensor, expected single images in several maps"
-                )
-            placement = maps(query.views[0].frame, seed)
-            backend = getattr(getattr(maps.localizer(placement.map).map, "info", None), "backend", "")
-            frame = replace(query.frame, name=query.name)
-            answer = PlacedAnswer.placed(frame, number, placement, backend, query.file)
-        except InputError as error:
-            if total == 1:
-                raise
-            answer = Failure(name, maps.method, str(error))
-        answers.append(answer)
-        if each is not None:
-            each(query, answer)
-        count(number + 1, total)
-    return answers
+    return answer_each(queries, place, answers, maps.method, each, progress, cancel)

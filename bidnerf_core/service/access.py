@@ -5,7 +5,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import json
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,11 +20,13 @@ class Access:
     """Lets requests through that carry the token, or that are addressed to this machine by a program on it.
 
     A page that a browser shows may send requests to the loopback interface; they are told by their ``Origin`` or, where a name of
-    another site leads to this machine, by their ``Host``.
+    another site leads to this machine, by their ``Host``. ``refused`` is called with the scope and the status of each refusal.
     """
 
-    def __init__(self, app: ASGIApp, token: str | None) -> None:
-        self.app, self.token = app, token
+    def __init__(
+        self, app: ASGIApp, token: str | None, refused: Callable[[Scope, int], None] = lambda *_: None
+    ) -> None:
+        self.app, self.token, self.refused = app, token, refused
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         refusal = None if scope["type"] != "http" else self._refusal(scope)
@@ -33,6 +35,7 @@ class Access:
         elif refusal is None:
             await self.app(scope, receive, send)
         else:
+            self.refused(scope, refusal[0])
             await _refuse(send, *refusal)
 
     def _refusal(self, scope: MutableMapping[str, Any]) -> tuple[int, str] | None:

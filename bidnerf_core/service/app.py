@@ -18,6 +18,7 @@ from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
+from starlette.types import Scope
 
 from bidnerf_core.service.access import Access, describe_client
 from bidnerf_core.service.description import description
@@ -82,7 +83,7 @@ def application(
         routes=routes,
         lifespan=lifespan,
         exception_handlers=handlers,
-        middleware=[Middleware(Access, token=token)],
+        middleware=[Middleware(Access, token=token, refused=_refused)],
     )
 
 
@@ -106,16 +107,22 @@ def _logged(handler: Handler) -> Handler:
         facts = request.state.facts
         if request.method == "POST":
             pool.metrics.seconds.add(seconds)
-            _log(request, response.status_code, seconds, facts)
+            _log(request.scope, response.status_code, seconds, facts)
         return response
 
     return handle
 
 
-def _log(request: Request, status: int, seconds: float, facts: Mapping[str, Any]) -> None:
+def _refused(scope: Scope, status: int) -> None:
+    """Count a request without the right to ask, and log it. Its path is not one of the description's, but anything."""
+    scope["app"].state.pool.metrics.requests["refused", status] += 1
+    _log(scope, status, 0.0, {})
+
+
+def _log(scope: Scope, status: int, seconds: float, facts: Mapping[str, Any]) -> None:
     line = {
-        "time": round(time.time(), 3), "client": describe_client(request.scope), "method": request.method,
-        "path": request.url.path[:200], "status": status, "seconds": round(seconds, 4), **facts,
+        "time": round(time.time(), 3), "client": describe_client(scope), "method": scope["method"],
+        "path": scope["path"][:200], "status": status, "seconds": round(seconds, 4), **facts,
     }  # fmt: skip
     log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))
 

@@ -30,6 +30,7 @@ from bidnerf_core.io.json import Record
 from bidnerf_core.localization import Localization
 from bidnerf_core.maps.anchor import Anchor, GeographicPose
 from bidnerf_core.results.answers import Answer
+from bidnerf_core.service.requests import LONGEST_NAME
 from bidnerf_core.service.upload import Upload
 
 R_CAMERA_BODY = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
@@ -59,7 +60,8 @@ def answer(
     request = Record("request", body)
     reading = _reading(request)
     blocks = {"photo": reading.image} | _camera(reading) | _prior(anchor, request)
-    found, plain = localize(Upload({"name": reading.record.text("sensorId") or "camera"}, blocks))
+    name = (reading.record.text("sensorId") or "camera")[:LONGEST_NAME]
+    found, plain = localize(Upload({"name": name}, blocks))
     localization = found.found
     if not found.accepted:
         return {
@@ -72,7 +74,7 @@ def answer(
         else _geographic(anchor.geographic(localization.T_world_camera))
     )
     answered = {
-        "id": request.text("id") or "", "timestamp": round(time.time() * 1000),
+        "id": (request.text("id") or "")[:LONGEST_NAME], "timestamp": round(time.time() * 1000),
         "accuracy": accuracy(localization, anchor), "type": "geopose" if anchor else "localpose", **where,
         "localization": plain,
     }  # fmt: skip

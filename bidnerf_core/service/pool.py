@@ -242,8 +242,9 @@ class Pool:
         finally:
             if not asking.done():
                 asking.cancel()
-            with contextlib.suppress(BaseException):
-                await asking
+            await asyncio.wait({asking})  # raises nothing but a cancellation of this task itself
+            if not asking.cancelled():
+                asking.exception()  # has been seen, or it would be reported as forgotten
         worker.stop()  # before its files are removed, or it would write others
         self._forget_files(job)
         if job.answer.done():  # timed out, or its client has left
