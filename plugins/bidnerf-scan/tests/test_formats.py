@@ -35,6 +35,18 @@ def test_meshes_with_colours(tmp_path: Path) -> None:
         assert np.allclose(scan.rgb[scan.faces], BYTES[FACES][..., :3] / 255, atol=2e-3)
 
 
+def test_a_mesh_that_countless_nodes_place_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_scan.formats.by_trimesh.MOST_POINTS", 100)
+    scene, box = trimesh.Scene(), trimesh.creation.box()
+    for number in range(20):
+        scene.add_geometry(box, node_name=f"{number}", geom_name="box")
+    scene.export(tmp_path / "many.glb")
+    with pytest.raises(InputError, match=r"many\.glb: its nodes place \d+ points, expected 100 at most"):
+        read_scan(tmp_path / "many.glb")
+
+
 def test_a_gltf_is_placed_by_its_nodes(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     for number in range(2):

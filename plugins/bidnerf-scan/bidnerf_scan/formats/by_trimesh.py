@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from bidnerf_core.errors import InputError
 from bidnerf_scan.scan import Scan, joined
 
+MOST_POINTS = 2 * 10**8
+"""Largest number of points of all nodes: one small mesh may be placed by any number of them."""
 MOST_TEXELS = 2 * 10**9
 
 
@@ -26,12 +28,16 @@ def read(path: Path, expected: str) -> Scan:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             scene = trimesh.load_scene(str(path), process=False)
-            parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
+            nodes = [(node, scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
+            count = sum(len(getattr(geometry, "vertices", ())) for _, geometry in nodes)
+            parts = [] if count > MOST_POINTS else [_placed(scene, node) for node, _ in nodes]
     except (Exception, RecursionError) as error:  # trimesh raises whatever its parsing steps do
         said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise InputError(
             f"{path}: not readable ({said[:200]}), expected {expected}; is it truncated?"
         ) from error
+    if count > MOST_POINTS:
+        raise InputError(f"{path}: its nodes place {count:,} points, expected {MOST_POINTS:,} at most")
     meshes = [part for part in parts if part.faces is not None and len(part.faces)]
     chosen = meshes or [part for part in parts if len(part.points)]
     if not chosen:
