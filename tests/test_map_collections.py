@@ -16,10 +16,10 @@ import bidnerf_core.maps.collection as collections_module
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
+from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps.collection import maps_in
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
-from bidnerf_core.maps.pooled import visible
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, POSES, ground, training_views, view
 from commands import Run
 

@@ -25,10 +25,10 @@ from bidnerf_core.localization.methods import USUAL_METHOD
 from bidnerf_core.localization.problem import unit_of
 from bidnerf_core.mapping import LandmarkMap, find_features
 from bidnerf_core.mapping.landmarks.features import detected
+from bidnerf_core.mapping.landmarks.vocabulary import Vocabulary, viewpoints
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of, load_info
 from bidnerf_core.maps.files import load_landmarks
 from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.maps.pooled import Vocabulary, viewpoints
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter
 
 log = logging.getLogger("bidnerf")

@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeAlias
 
-import cv2
 import numpy as np
+import torch
+
+from bidnerf_core.mapping.landmarks.vocabulary import Vocabulary
 
 Pairs: TypeAlias = list[tuple[int, int]]
 """Pairs (i < j) of indices of photos."""
@@ -22,10 +24,6 @@ NEIGHBOURS = 10
 """Photos on either side in the order of the names, or of time, with which each is matched."""
 ALIKE = 20
 """Photos that look most alike with which each is matched."""
-WORDS, SAMPLE = 64, 50_000
-"""Number of words of the vocabulary, and of the descriptors from which it is made."""
-ROUNDS = 10
-"""Iterations of k-means."""
 BLOCK = 1000
 """Photos that are compared with all others at a time."""
 
@@ -44,7 +42,7 @@ def chosen_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
     """Return the pairs of photos, given the descriptors (n, 128) of each, that are neighbours or look alike."""
     count = len(descriptors)
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
-    vectors = pooled(descriptors)
+    vectors = _pooled(descriptors)
     for first in range(0, count, BLOCK):
         likeness = vectors[first : first + BLOCK] @ vectors.T
         rows = np.arange(len(likeness))
@@ -56,31 +54,9 @@ def chosen_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
     return sorted(pairs)
 
 
-def pooled(descriptors: Sequence[np.ndarray]) -> np.ndarray:
-    """Return one vector of unit length for the descriptors (n, 128) of each photo; zero where there are none."""
-    words = _vocabulary(descriptors)
-    return np.stack([_aggregated(own.astype(np.float32), words) for own in descriptors])
-
-
-def _vocabulary(descriptors: Sequence[np.ndarray]) -> np.ndarray:
-    generator = np.random.default_rng(0)
-    share = max(1, SAMPLE // max(1, len(descriptors)))
-    parts = [own[generator.permutation(len(own))[:share]] for own in descriptors if len(own)]
-    sample = np.concatenate(parts).astype(np.float32) if parts else np.zeros((1, 128), np.float32)
-    criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
-    cv2.setRNGSeed(0)
-    _, _, words = cv2.kmeans(
-        sample, min(WORDS, len(sample)), np.empty((0,), np.int32), criteria, 1, cv2.KMEANS_PP_CENTERS
-    )
-    return np.asarray(words)
-
-
-def _aggregated(own: np.ndarray, words: np.ndarray) -> np.ndarray:
-    total = np.zeros_like(words)
-    if len(own):
-        distance = (words**2).sum(1) - 2 * own @ words.T
-        nearest = distance.argmin(1)
-        np.add.at(total, nearest, own - words[nearest])
-        total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)  # each word counts alike
-    flat = total.reshape(-1)
-    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+def _pooled(descriptors: Sequence[np.ndarray]) -> np.ndarray:
+    """Return one vector of unit length for the descriptors (n, d) of each photo; zero where there are none."""
+    found = [torch.from_numpy(own) for own in descriptors]
+    vocabulary = Vocabulary.of([own for own in found if len(own)] or [torch.zeros((1, 1), dtype=torch.uint8)])
+    zero = torch.zeros(vocabulary.words.numel())
+    return torch.stack([vocabulary.pooled(own) if len(own) else zero for own in found]).numpy()

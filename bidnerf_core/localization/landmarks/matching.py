@@ -20,6 +20,7 @@ from bidnerf_core.mapping.landmarks.features import (
     squared_distances,
 )
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping.landmarks.vocabulary import BLOCK, k_means, nearest_centre
 
 EXHAUSTIVE = 4_000
 """The number of landmarks up to which the search is exhaustive, and no cells are built."""
@@ -29,12 +30,6 @@ USUAL_IN_CELL = 500
 """Mean number of landmarks of a cell in large maps, where comparing them would otherwise take most of the time."""
 PROBED = 12
 """Number of cells that are searched for each keypoint."""
-SAMPLE = 20
-"""Number of landmarks per cell in the sample on which k-means runs."""
-K_MEANS_ROUNDS = 6
-"""Iterations of Lloyd's algorithm; the cells need to be balanced, not optimal."""
-BLOCK = 2**20
-"""Number of distances to centres of cells that are computed at a time, which bounds the memory."""
 
 
 class LandmarkMatcher:
@@ -136,26 +131,6 @@ class _Cells:
         return (best.values + squares).clamp_(min=0), self._order[
             index.view(queries, -1).gather(1, best.indices)
         ]
-
-
-def k_means(
-    descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
-) -> Float[Tensor, "c d"]:
-    """Return the centres of k-means cells (Lloyd 1982) on a sample; a centre that loses all its members stays in place."""
-    sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLE * count]
-    values = descriptors[sample.to(descriptors.device)].float()
-    centres = values[:count].clone()
-    for _ in range(K_MEANS_ROUNDS):
-        cell = nearest_centre(values, centres)
-        sizes = torch.bincount(cell, minlength=count)
-        total = torch.zeros_like(centres).index_add_(0, cell, values)
-        centres = torch.where(sizes[:, None] > 0, total / sizes.clamp(min=1)[:, None], centres)
-    return centres
-
-
-def nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
-    rows = max(1, BLOCK // len(centres))
-    return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(rows)])
 
 
 def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:

@@ -1,4 +1,4 @@
-"""Pooled descriptors of what cameras see of landmarks, by which the place of an image is found among many maps.
+"""Vocabularies of descriptors, and the vectors to which they pool the descriptors of an image.
 
 A VLAD vector (Jegou et al. 2010, "Aggregating local descriptors into a compact image representation") sums, for each word of a
 vocabulary, the differences of the descriptors nearest to it, so that an image is one vector whatever its number of keypoints.
@@ -12,24 +12,51 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.matching import k_means, nearest_centre
-from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.mapping.landmarks.features import squared_distances
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 WORDS = 32
 SAMPLE = 20_000
 """Largest number of descriptors that a vocabulary is made of."""
+SAMPLED = 20
+"""Number of descriptors per cell in the sample on which k-means runs."""
+ROUNDS = 6
+"""Iterations of Lloyd's algorithm; the cells need to be balanced, not optimal."""
+BLOCK = 2**20
+"""Number of distances to centres of cells that are computed at a time, which bounds the memory."""
 VIEWPOINTS = 48
 """Largest number of cameras of a map that are pooled; of more, evenly spaced ones."""
 OBLIQUE_DEG = 10.0
 """Angle beyond the cone of directions from which a landmark was seen within which it still counts as visible."""
 FEWEST = 8
 """Number of landmarks below which what a camera sees is not pooled."""
+
+
+def k_means(
+    descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
+) -> Float[Tensor, "c d"]:
+    """Return the centres of k-means cells (Lloyd 1982) on a sample; a centre that loses all its members stays in place."""
+    sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLED * count]
+    values = descriptors[sample.to(descriptors.device)].float()
+    centres = values[:count].clone()
+    for _ in range(ROUNDS):
+        cell = nearest_centre(values, centres)
+        sizes = torch.bincount(cell, minlength=count)
+        total = torch.zeros_like(centres).index_add_(0, cell, values)
+        centres = torch.where(sizes[:, None] > 0, total / sizes.clamp(min=1)[:, None], centres)
+    return centres
+
+
+def nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
+    """Return the number of the centre nearest to each descriptor."""
+    rows = max(1, BLOCK // len(centres))
+    return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(rows)])
 
 
 @dataclass(frozen=True, eq=False)
