@@ -23,7 +23,6 @@ from bidnerf_core.maps.photos import posed_images, poses_folder
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
-from bidnerf_core.structure.mapping import vertical
 from bidnerf_core.structure.pairs import ALL_OF_FRAMES, ALL_OF_PHOTOS, NEIGHBOURS, chosen_pairs, few
 from bidnerf_core.structure.poses import found_before
 from bidnerf_core.structure.record import begin, clear, stored_rows
@@ -39,7 +38,6 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("pycolmap")
 
 PLACED, OTHERS = 9, 4
-LEVEL_RIGHT = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [0, 1, 0], [-0.8, 0.6, 0]])
 
 
 @dataclass
@@ -317,15 +315,6 @@ def test_lenses_go_to_colmap_and_back() -> None:
         there = from_colmap(to_colmap(camera, 1, pycolmap))
         assert there.distortion[: len(lens)] == pytest.approx(lens)
         assert (there.fx, there.fy, there.cx, there.cy) == (300, 310, 161, 118)
-
-
-def test_the_vertical_is_at_right_angles_to_level_cameras() -> None:
-    """Also where all cameras look down, as at a desk."""
-    up = np.stack([[0.7 * np.cos(a), 0.7 * np.sin(a), 0.7] for a in (0.1, 0.4, 0.8, 1.2)])
-    np.testing.assert_allclose(vertical(LEVEL_RIGHT, up), (0, 0, 1), atol=1e-9)
-    np.testing.assert_allclose(vertical(LEVEL_RIGHT, -up), (0, 0, -1), atol=1e-9)
-    alike = np.tile([[1.0, 0, 0]], (4, 1))  # all cameras look the same way: only their own up is left
-    np.testing.assert_allclose(vertical(alike, np.tile([[0.0, 0.6, 0.8]], (4, 1))), (0, 0.6, 0.8), atol=1e-9)
 
 
 def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:

@@ -31,6 +31,8 @@ MODELS = (*COLMAP_MODELS, *LENS_MODELS, PANORAMA)
 """The names of all models that are read."""
 MODEL_IDS = COLMAP_MODEL_IDS | LENS_MODEL_IDS
 """Their names by the ids in ``cameras.bin``."""
+MOST_TERMS = 8
+"""Coefficients of distortion of COLMAP's largest perspective model, in OpenCV's order."""
 
 
 def colmap_parameters(model: str) -> int:
@@ -53,3 +55,20 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
         return Intrinsics(fx, fy, cx, cy, width, height, tuple(lens) if any(lens) else ())
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
+
+
+def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
+    """Return the name and the parameters of COLMAP's model of a camera, the simplest that has its lens.
+
+    Raises ``InputError`` for thin prism distortion or a tilted sensor, which none has.
+    """
+    k = camera.distortion
+    if any(k[MOST_TERMS:]):
+        raise InputError(
+            "a camera with thin prism distortion or a tilted sensor, expected one that COLMAP has a model of"
+        )
+    model, count = (
+        ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", MOST_TERMS)
+    )
+    lens = [*k, *[0.0] * MOST_TERMS][:count]
+    return model, [camera.fx, camera.fy, camera.cx, camera.cy, *lens]

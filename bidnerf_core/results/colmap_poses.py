@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from bidnerf_core.camera.colmap_models import colmap_model
 from bidnerf_core.camera.exif import read_exif
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.orientation import UPRIGHT
@@ -21,7 +22,6 @@ from bidnerf_core.results.pose_files import PosedImage, as_stored, frame_of, req
 HEAD = "# written by bidnerf"
 RADIAL_TERMS = 4
 """Coefficients k1 k2 p1 p2 of COLMAP's model OPENCV; FULL_OPENCV has k3 to k6 as well."""
-MOST_TERMS = 8
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
@@ -61,13 +61,9 @@ def image_rows(number: int, T_world_camera: SE3, camera: int, name: str) -> str:
 
 
 def camera_row(number: int, camera: Intrinsics) -> str:
-    """Return the row of a camera. Raises ``InputError`` for a lens with more than eight coefficients."""
-    k = camera.distortion
-    if len(k) > MOST_TERMS:
-        raise InputError(f"a lens of {len(k)} coefficients, expected at most {MOST_TERMS} in a COLMAP model")
-    model, count = ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", 8)
-    lens = (*k, *(0.0,) * MOST_TERMS)[:count]
-    numbers = " ".join(f"{x:.15g}" for x in (camera.fx, camera.fy, camera.cx, camera.cy, *lens))
+    """Return the row of a camera. Raises ``InputError`` for a lens that COLMAP has no model of."""
+    model, parameters = colmap_model(camera)
+    numbers = " ".join(f"{x:.15g}" for x in parameters)
     return f"{number} {model} {camera.width} {camera.height} {numbers}\n"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bidnerf_core.camera.colmap_models import colmap_camera
+from bidnerf_core.camera.colmap_models import colmap_camera, colmap_model
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 
@@ -33,15 +33,7 @@ def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
 
     Raises ``InputError`` for a lens that COLMAP has no model of.
     """
-    model, parameters = "PINHOLE", [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
-    if any(intrinsics.distortion):
-        k1, k2, p1, p2, k3, *rational = [*intrinsics.distortion, *[0.0] * 8][:8]
-        model = "FULL_OPENCV"
-        parameters += [k1, k2, p1, p2, k3, *rational]
-    if any(intrinsics.distortion[8:]):
-        raise InputError(
-            "a camera with thin prism distortion or a tilted sensor, expected one that COLMAP has a model of"
-        )
+    model, parameters = colmap_model(intrinsics)
     return pycolmap.Camera(
         camera_id=number, model=model, width=intrinsics.width, height=intrinsics.height, params=parameters
     )

@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from bidnerf_core.captures.up_direction import up_direction
 from bidnerf_core.errors import amount
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.structure.keypoints import Described, Photo
 from bidnerf_core.structure.matching import Overlaps
 
@@ -22,8 +25,6 @@ photos from one place.
 FEW_KEYPOINTS = 100
 """Number of keypoints below which a photo that is left out shows too little."""
 MOST_MODELS = 20
-SPREAD = 0.02
-"""Least ratio of the second smallest to the largest spread of horizontal axes by which they determine the vertical."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,30 +88,18 @@ def reconstructed(
 
 def turn_upright(model: Any, photos: Mapping[int, Photo], pycolmap: Any) -> None:
     """Turn the world of a model so that z points up, and move its origin to the middle of the cameras."""
-    horizontal, up, centres = [], [], []
+    rotations, centres = [], []
     for number in model.reg_image_ids():
         image = model.image(number)
         R_world_camera = image.cam_from_world().inverse().rotation.matrix()
         right, above = _upright_axes(photos[number])
-        horizontal.append(R_world_camera @ right)
-        up.append(R_world_camera @ above)
+        upright = np.stack([right, -above, np.cross(right, -above)], axis=1)
+        rotations.append(R_world_camera @ upright)
         centres.append(image.projection_center())
-    R = _rotation_to_z(vertical(np.stack(horizontal), np.stack(up)))
+    poses = SE3(torch.from_numpy(np.stack(rotations)), torch.from_numpy(np.stack(centres)))
+    R = _rotation_to_z(np.array(up_direction(poses).direction))
     centre = np.mean(centres, axis=0)
     model.transform(pycolmap.Sim3d(np.concatenate([R, -(R @ centre)[:, None]], axis=1)))
-
-
-def vertical(right: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the direction that points up, given the horizontal and the upward axes (n, 3) of upright photos.
-
-    Photographers hold cameras level from left to right but tilt them up and down, so the vertical is the direction that is
-    most nearly at right angles to all horizontal axes, if these differ enough.
-    """
-    mean = up.mean(axis=0)
-    spread, axes = np.linalg.eigh(right.T @ right)
-    found = axes[:, 0] if spread[1] > SPREAD * spread[2] else mean
-    found = found if float(found @ mean) >= 0 else -found
-    return found / max(float(np.linalg.norm(found)), 1e-12)
 
 
 def _upright_axes(photo: Photo) -> tuple[np.ndarray, np.ndarray]:
