@@ -56,7 +56,9 @@ class TinyImporter:
             raise InputError(f"{path}: cannot be moved by {placement.scale}")
         bounds = demo_object().bounds
         points = config.size * torch.tensor([bounds.lower, bounds.upper]).repeat(200, 1)
-        return ImportedField("hashgrid", tiny.config(40), trained(), bounds, ("3 things",), 40, points)
+        return ImportedField(
+            "hashgrid", tiny.config(40), trained(), bounds, found=("3 things",), steps=40, points=points
+        )
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -30,6 +30,7 @@ class ImportedField:
     config: Any  # of the backend's ``config_type``
     tensors: dict[str, Tensor]  # state_dict of the field
     bounds: SceneBounds
+    _: KW_ONLY
     found: tuple[str, ...] = ()  # sentences on what the file holds, such as counts, and what was left out
     steps: int = 1  # of its training, where that is known
     points: Float[Tensor, "n 3"] | None = (

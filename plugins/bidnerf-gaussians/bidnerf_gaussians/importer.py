@@ -103,8 +103,8 @@ def imported(
         facts.append(f"axes: {of.convention}")
     up = T.rotation.double() @ torch.tensor(UP if of is None else of.up, dtype=torch.float64)
     return ImportedField(
-        "gaussians", settings, dict(field.state_dict()), bounds, tuple(facts), settings.steps, points, cameras,
-        (float(up[0]), float(up[1]), float(up[2])),
+        "gaussians", settings, dict(field.state_dict()), bounds, found=tuple(facts), steps=settings.steps, points=points,
+        cameras=cameras, up=(float(up[0]), float(up[1]), float(up[2])),
     )  # fmt: skip
 
 

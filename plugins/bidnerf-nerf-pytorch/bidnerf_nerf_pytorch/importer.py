@@ -69,7 +69,9 @@ class NerfPytorchImporter:
         field.load_state_dict(found.tensors)
         size = f"{settings.layers} layers of {settings.width}"
         facts = (f"coarse and fine network of {size}, {found.steps} steps",)
-        return ImportedField("nerf-pytorch", settings, dict(field.state_dict()), bounds, facts, found.steps)
+        return ImportedField(
+            "nerf-pytorch", settings, dict(field.state_dict()), bounds, found=facts, steps=found.steps
+        )
 
 
 importer = NerfPytorchImporter()

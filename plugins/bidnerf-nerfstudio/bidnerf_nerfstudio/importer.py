@@ -136,7 +136,7 @@ def _networks(run: Run, placement: Placement, config: ImportSettings) -> Importe
     field: Any = load_backend(model.backend).build(settings, bounds)
     state: dict[str, Tensor] = weights.load(_module(field), read.state)
     facts = (f"{run.kind} of nerfstudio, {steps} steps ({run.checkpoint.name}); {read.told}",)
-    return ImportedField(model.backend, settings, state, bounds, facts, settings.steps)
+    return ImportedField(model.backend, settings, state, bounds, found=facts, steps=settings.steps)
 
 
 def _module(field: Any) -> nn.Module:

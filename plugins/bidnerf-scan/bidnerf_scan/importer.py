@@ -126,8 +126,10 @@ def imported(
     )
     up = placement.T_target_source.rotation.double() @ torch.tensor(UPS[axis], dtype=torch.float64)
     return ImportedField(
-        "scan", settings, dict(field.state_dict()), bounds, tuple(facts), settings.steps, matter, (),
-        (float(up[0]), float(up[1]), float(up[2])), (matter, torch.full_like(matter, GREY) if colours is None else colours), scan.has_colours, solid,
+        "scan", settings, dict(field.state_dict()), bounds, found=tuple(facts), steps=settings.steps, points=matter,
+        up=(float(up[0]), float(up[1]), float(up[2])),
+        surface=(matter, torch.full_like(matter, GREY) if colours is None else colours),
+        is_coloured=scan.has_colours, is_solid=solid,
     )  # fmt: skip
 
 
