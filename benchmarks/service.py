@@ -225,7 +225,7 @@ def asked(server: Server, given: list[Photo], clients: int, seconds: float) -> R
         thread.start()
     for thread in threads:
         thread.join()
-    p50, p95, p99 = np.percentile(taken, [50, 95, 99])
+    p50, p95, p99 = map(float, np.percentile(taken, [50, 95, 99]))
     return {
         "clients": clients, "seconds": seconds, "requests": sum(statuses.values()), "statuses": dict(statuses),
         "latency_seconds": {"p50": p50, "p95": p95, "p99": p99}, "per_second": len(taken) / seconds,

@@ -210,6 +210,8 @@ def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
     part = b'--xyz\r\nContent-Disposition: form-data; name="photo"; filename="../../etc/pass wd.png"\r\n\r\n'
     body = part + place.photo + b"\r\n" + form(start=place.start, focal="32", map="map")
     assert service.post("/localize", body, FORM).json["frame"] == "pass wd"
+    named = form(photo=place.photo, start=place.start, focal="32", map="map", name="<script>")
+    assert service.post("/localize", named, FORM).json["frame"] == "<script>"
     for path in (
         "/maps/..%2f..%2fetc%2fpasswd",
         "/maps/../map.json",

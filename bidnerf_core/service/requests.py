@@ -159,6 +159,11 @@ async def _add_form(query: Query, headers: Headers, content: bytes) -> None:
                 await _add_file(query, name, value)
             else:
                 _add(query, name, value)
+        photo = form.get("photo")
+        if isinstance(photo, UploadFile) and photo.filename:
+            stem = PurePosixPath(photo.filename.replace("\\", "/")).stem[:LONGEST_NAME]
+            if stem:  # text in the answer, never the name of a file; a given name takes precedence
+                query.parameters.setdefault("name", stem)
     finally:
         await form.close()
 
@@ -169,10 +174,6 @@ async def _add_file(query: Query, name: str, file: UploadFile) -> None:
     if name in query.blocks:
         raise Refused(400, f"{name} is given twice, expected once")
     query.blocks[name] = await file.read()
-    if name == "photo" and "name" not in query.parameters and file.filename:
-        stem = PurePosixPath(file.filename.replace("\\", "/")).stem[:LONGEST_NAME]
-        if stem:
-            query.parameters["name"] = stem  # text in the answer, never the name of a file
 
 
 def json_of(content: bytes) -> dict[str, Any]:
