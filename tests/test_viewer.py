@@ -22,8 +22,14 @@ from bidnerf_core.evaluation.summary import usual_criterion
 from bidnerf_core.evaluation.trial import ScalarPoseError
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.localization.acceptance import LandmarkThresholds
-from bidnerf_core.localization.recording import current_record, recorded
+from bidnerf_core.localization.recording import (
+    ComparedExplanation,
+    SearchRecord,
+    current_record,
+    recorded,
+)
 from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid, shown_answer
+from bidnerf_core.viewer.figures import acceptance_figures
 from bidnerf_core.viewer.packing import packed_points
 from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.rendering import field_image, quick_image
@@ -181,6 +187,15 @@ def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(found: ShownA
     assert source is not None
     assert viewed.state_of(html.unescape(source[1]))["answers"][0]["outcome"] == "converged"
     assert "1 localization" in repr(shown)
+
+
+def test_another_explanation_that_fits_as_well_is_the_first_figure(localizer: Localizer) -> None:
+    answer = localizer(viewed.query().views)
+    twin, mirror = ComparedExplanation("a twin", 0.0, None), ComparedExplanation("mirrored", 90.0, None)
+    first = acceptance_figures(answer, SearchRecord(explanations=[mirror, twin]))[0]
+    assert (first.passed, first.value) == (False, "50.00%")
+    assert first.meaning.endswith("a twin")
+    assert acceptance_figures(answer, SearchRecord(explanations=[mirror]))[0].passed
 
 
 def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(

@@ -56,6 +56,11 @@ def explanations(found: Localization, record: SearchRecord | None) -> tuple[Show
     return tuple(shown)
 
 
+def probability_of(log_odds: float) -> float:
+    """Return the probability of the first of two explanations whose log odds against the second are given."""
+    return 1 / (1 + math.exp(-max(-500.0, min(500.0, log_odds))))
+
+
 def _of_camera(posterior: Posterior) -> list[ShownExplanation]:
     weighed = list(zip(posterior.explanations, posterior.probabilities, strict=True))
     question = "whose camera"
@@ -80,7 +85,7 @@ def _name(each: Explanation) -> str:
 
 
 def _two(question: str, reason: str, log_odds: float, other: SE3 | None) -> list[ShownExplanation]:
-    p = 1 / (1 + math.exp(-max(-500.0, min(500.0, log_odds))))
+    p = probability_of(log_odds)
     return [
         ShownExplanation(question, "the pose found", p, log_odds >= 0),
         ShownExplanation(question, reason, 1 - p, log_odds < 0, None if other is None else rows_of(other)),

@@ -15,8 +15,10 @@ from bidnerf_core.localization.acceptance import (
 )
 from bidnerf_core.localization.beyond_chance import ACCEPTED, LEAST_EXPLAINED, Support
 from bidnerf_core.localization.confidence import ACCEPTED_ESTIMATED
+from bidnerf_core.localization.landmarks.chance import DECISIVE
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
-from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
+from bidnerf_core.viewer.explanations import probability_of
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ def acceptance_figures(found: Localization, record: SearchRecord | None) -> tupl
         figures += _of_surface(said)
     elif isinstance(said, Support):
         figures += _of_support(said)
+    if record is not None and record.explanations:
+        figures.append(_of_explanations(record.explanations))
     if by_landmarks is not None and not isinstance(said, LandmarkDiagnostics):
         figures += _of_landmarks(landmark_diagnostics(by_landmarks), by_landmarks)
     if found.confidence is not None:
@@ -107,6 +111,15 @@ def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Itera
             "measured points on the surface", f"{said.on_surface:.0%}", "", None, None,
             "share of the measured depth that lies on the map's surface",
         )  # fmt: skip
+
+
+def _of_explanations(compared: list[ComparedExplanation]) -> Figure:
+    nearest = min(compared, key=lambda each: each.log_odds)
+    bound = f"{probability_of(DECISIVE):.2%}"
+    return _least(
+        "likelier than other explanations", nearest.log_odds, DECISIVE, f"{probability_of(nearest.log_odds):.2%}", bound,
+        f"probability beside the closest of them: {nearest.reason}",
+    )  # fmt: skip
 
 
 def _of_surface(said: SurfaceDiagnostics) -> Iterator[Figure]:
