@@ -21,9 +21,9 @@ from bidnerf_core.localization import (
     SurfaceCost,
     rig,
 )
-from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.covariance import finest_cost, position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, PoseAndDepth, ScaledPoints
-from bidnerf_core.localization.fusion import Fit, FusedPose, Measurements, finest_cost, fused_pose
+from bidnerf_core.localization.fusion import Fit, FusedPose, Measurements, fused_pose
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
 

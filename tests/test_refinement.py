@@ -19,7 +19,7 @@ from bidnerf_core.localization import (
     RefinementStage,
     RenderedCostSettings,
 )
-from bidnerf_core.localization.fusion import finest_cost
+from bidnerf_core.localization.covariance import finest_cost
 from bidnerf_core.localization.refinement import refine, take_few_steps
 from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.results.errors import pose_error

@@ -35,8 +35,7 @@ from bidnerf_core.localization import (
     rig,
 )
 from bidnerf_core.localization.costs import images, surface
-from bidnerf_core.localization.covariance import weight
-from bidnerf_core.localization.fusion import finest_cost
+from bidnerf_core.localization.covariance import finest_cost, weight
 from bidnerf_core.localization.search.by_images import IMAGE_STAGES, ImageSearch
 from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.solvers import levenberg_marquardt

@@ -192,6 +192,10 @@ class Intrinsics:
         """Return the camera of an image that is ``factor`` times as large."""
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
+    def at_most(self, largest: int) -> Intrinsics:
+        """Return the camera of the image reduced to at most ``largest`` pixels along its longer side."""
+        return self.resized(*reduced_size(self.width, self.height, largest))
+
     def resized(self, width: int, height: int) -> Intrinsics:
         """Return the camera of the same image resampled to another size."""
         x, y = width / self.width, height / self.height
@@ -302,6 +306,12 @@ def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two sizes (width, height) may be of one image at two resolutions."""
     ratio = size[0] * other[1] / (size[1] * other[0])
     return abs(ratio - 1) <= ASPECT_TOLERANCE
+
+
+def reduced_size(width: int, height: int, largest: int) -> tuple[int, int]:
+    """Return the size (width, height) of an image reduced to at most ``largest`` pixels along its longer side."""
+    factor = min(1.0, largest / max(width, height))
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 CameraGroup = tuple[Intrinsics, ...]

@@ -15,6 +15,7 @@ from bidnerf_core.camera.intrinsics import (
     cameras_at_size,
     centre_crop_cameras,
     median_camera,
+    reduced_size,
     same_aspect,
 )
 from bidnerf_core.camera.lenses import Camera, Lens
@@ -49,18 +50,21 @@ class FoundCamera:
 
     def at_most(self, largest: int | None) -> FoundCamera:
         """Return the camera of the image reduced to ``largest`` pixels along its longer side. Raises ``InputError``."""
-        if largest is not None and not (isinstance(largest, int) and largest >= 1):
-            raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
-        camera = self.camera
-        longer = max(camera.width, camera.height)
-        if largest is None or longer <= largest:
+        camera, side = self.camera, checked_side(largest)
+        if side is None or max(camera.width, camera.height) <= side:
             return self
-        factor = largest / longer
-        size = (max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+        size = reduced_size(camera.width, camera.height, side)
         if self.lens is not None:
             lens = self.lens.resized(*size)
             return replace(self, intrinsics=lens.pinhole, lens=lens)
         return replace(self, intrinsics=self.intrinsics.resized(*size))
+
+
+def checked_side(largest: int | None) -> int | None:
+    """Return ``largest``, the most pixels along an image's longer side. Raises ``InputError`` unless it is a positive integer."""
+    if largest is not None and (isinstance(largest, bool) or not isinstance(largest, int) or largest < 1):
+        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
+    return largest
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.camera.intrinsics import reduced_size
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.robust import mad_deviation
 from bidnerf_core.mapping import TrackedKeypoints
@@ -98,9 +99,8 @@ def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> fl
     Pixels that hidden ones influence do not count, unless no others are left.
     """
     shown: np.ndarray | None = None if hidden is None else (~hidden.cpu().numpy()).astype(np.float32)
-    factor = LARGEST / max(grey.shape)
-    if factor < 1:
-        size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
+    size = reduced_size(grey.shape[1], grey.shape[0], LARGEST)
+    if size != grey.shape[::-1]:
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         shown = None if shown is None else cv2.resize(shown, size, interpolation=cv2.INTER_AREA)
     counted = None if shown is None else _away_from_hidden(shown)

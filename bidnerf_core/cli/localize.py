@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import imageio.v3 as iio
 import tyro
 
-from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.camera_options import (
     CameraFile,
@@ -46,7 +45,7 @@ from bidnerf_core.localization.methods import (
     require_start,
     require_use_of_depth,
 )
-from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.localization.problem import landmark_cameras
 from bidnerf_core.maps.collection import maps_in
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
@@ -188,7 +187,7 @@ def run(arguments: list[str]) -> None:
             return
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
-        assumed = _assumed_cameras(stored.landmarks, method, config)
+        assumed = landmark_cameras(stored) if matches_landmarks(method, config) else ()
         photos = replace(photos, camera=replace(photos.camera, assumed=assumed))
         source = open_queries(query, photos, frames, stored.bounds.background, points)
         if perturb is not None and isinstance(source, Photos):
@@ -208,13 +207,6 @@ def _depth_points(path: Path, stored: Map, choice: SparseChoice) -> DepthPoints:
     sparse = SparsePoints(path, places_of(stored.info), choice)
     say(sparse.summary)
     return DepthPoints(path, sparse)
-
-
-def _assumed_cameras(landmarks: LandmarkMap | None, method: str, config: Any) -> tuple[Intrinsics, ...]:
-    """Return the cameras of a map's images if photos without a focal length can be localized, which takes landmarks."""
-    if landmarks is None or not matches_landmarks(method, config):
-        return ()
-    return landmarks.cameras
 
 
 def _localize(

@@ -139,13 +139,12 @@ def run(arguments: list[str]) -> None:
             settings_of(USUAL_METHOD, {"depth_sensor": depth_sensor, "risk": risk}),
         )
         stored = load_map(map)
-        assumed = () if stored.landmarks is None else stored.landmarks.cameras
         path, began = TrackedPath.of(stored), clocks.perf_counter()
         localizer = Localizer(stored, config=settings)
         try:
             with nullcontext() if video is None else TrackingVideo(video, stored) as drawn:
                 if follow:
-                    given = CameraSource(camera, focal, hfov, assumed)
+                    given = CameraSource(camera, focal, hfov, localizer.assumed_cameras)
                     _follow(
                         str(sequence), Tracker(localizer, config, begin), path, drawn, depth, given, sensor
                     )

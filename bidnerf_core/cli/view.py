@@ -84,8 +84,7 @@ def view(
     rows = () if results is None else rows_of(results)
     scene = load_map(map, device)
     localizer = Localizer(scene, method, warm_up=save is None)
-    assumed = scene.landmarks.cameras if scene.landmarks is not None and localizer.matches_landmarks else ()
-    photos = PhotoOptions(depth, CameraSource(camera, focal, hfov, assumed), depth_unit)
+    photos = PhotoOptions(depth, CameraSource(camera, focal, hfov, localizer.assumed_cameras), depth_unit)
     source = None
     if query:
         source = open_queries(query, photos, FrameOptions(split), scene.bounds.background, None)

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera.lenses import PANORAMA_FACES, Camera, PanoramaFace
+from bidnerf_core.camera.lenses import Camera, PanoramaFace
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.colmap_depth import depth_map_of, read_colmap_depth
 from bidnerf_core.datasets.colmap_files import (
@@ -34,7 +34,7 @@ from bidnerf_core.datasets.colmap_files import (
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import FileNames, posix_name
 from bidnerf_core.datasets.incomplete import present, remark
-from bidnerf_core.datasets.panoramas import panorama_pose
+from bidnerf_core.datasets.panoramas import faces_of
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -85,12 +85,8 @@ class ColmapFrame:
         if not isinstance(self.camera, PanoramaFace):
             return [self]
         return [
-            replace(
-                self,
-                camera=replace(self.camera, face=face),
-                T_world_camera=self.T_world_camera @ panorama_pose(face),
-            )
-            for face in PANORAMA_FACES
+            replace(self, camera=replace(self.camera, face=face), T_world_camera=T)
+            for face, T in faces_of(self.T_world_camera)
         ]
 
     @property

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import torch
 
-from bidnerf_core.camera.lenses import PanoramaFace
+from bidnerf_core.camera.lenses import PANORAMA_FACES, PanoramaFace
 from bidnerf_core.geometry.se3 import SE3
+
+
+def faces_of(T_world_panorama: SE3) -> list[tuple[str, SE3]]:
+    """Return the name and the pose T_world_face of each pinhole view of a panorama."""
+    return [(face, T_world_panorama @ panorama_pose(face)) for face in PANORAMA_FACES]
 
 
 def panorama_pose(face: str) -> SE3:

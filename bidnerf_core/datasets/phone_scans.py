@@ -28,6 +28,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.rgbd import largest_side
+from bidnerf_core.datasets.trajectories import check_unit
 from bidnerf_core.depth.images import DepthImage
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import Frame
@@ -46,8 +47,6 @@ FRAMES_PER_SECOND = 5.0
 """Largest rate of the frames of a dataset."""
 ROUNDING = 0.005
 """Seconds by which the times of frames may be early."""
-UNIT_TO = 0.01
-"""How far the length of a quaternion may be from 1."""
 
 
 class Timed(Protocol):
@@ -119,8 +118,7 @@ def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 |
     length = math.hypot(*numbers[:4])
     if not all(map(math.isfinite, numbers)) or length == 0:
         return None
-    if abs(length - 1) > UNIT_TO:
-        raise InputError(f"{where}: the quaternion has length {length:.3g}, expected 1 (qx qy qz qw)")
+    check_unit(length, where, "qx qy qz qw")
     rotation = torch.from_numpy(Rotation.from_quat(np.array(numbers[:4])).as_matrix())
     if opengl:
         rotation = rotation * rotation.new_tensor([1.0, -1.0, -1.0])

@@ -201,6 +201,12 @@ def _timed_trajectory(path: Path, rows: Sequence[TimedRow], order: str) -> Traje
     return Trajectory(times, rotations, values[:, :3])
 
 
+def check_unit(length: float, where: str, names: str) -> None:
+    """Raise ``InputError``, which begins with ``where``, unless the length of a quaternion is 1."""
+    if abs(length - 1) > UNIT_TO:
+        raise InputError(f"{where}: the quaternion has length {length:.3g}, expected 1 ({names})")
+
+
 def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
     """Return the translation and the quaternion (x, y, z, w) of a row, or None where there is no pose in it."""
     numbers = row.row.plain_numbers(row.words[:7])
@@ -208,9 +214,7 @@ def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
     length = math.hypot(*numbers[3:])
     if length == 0 or not all(map(math.isfinite, numbers)):
         return None
-    if abs(length - 1) > UNIT_TO:
-        names = " ".join(f"q{letter}" for letter in order)
-        raise InputError(f"{row.where}: the quaternion has length {length:.3g}, expected 1 ({names})")
+    check_unit(length, row.where, " ".join(f"q{letter}" for letter in order))
     return [*numbers[:3], *(quaternion[letter] for letter in "xyzw")]
 
 

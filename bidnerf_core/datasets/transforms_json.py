@@ -9,10 +9,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any, get_args
 
 from bidnerf_core.camera.files import CameraRecord, camera_record
-from bidnerf_core.camera.lenses import PANORAMA, PANORAMA_FACES
+from bidnerf_core.camera.lenses import PANORAMA
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.incomplete import remark
-from bidnerf_core.datasets.panoramas import panorama_pose
+from bidnerf_core.datasets.panoramas import faces_of
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError, amount
@@ -65,12 +65,8 @@ class FrameRecord:
                 "an equirectangular image has depth, expected none, or pinhole images with depth"
             )
         return [
-            replace(
-                self,
-                camera=replace(self.camera, face=face),
-                T_world_camera=self.T_world_camera @ panorama_pose(face),
-            )
-            for face in PANORAMA_FACES
+            replace(self, camera=replace(self.camera, face=face), T_world_camera=T)
+            for face, T in faces_of(self.T_world_camera)
         ]
 
     @property

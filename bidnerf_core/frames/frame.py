@@ -284,10 +284,9 @@ class Frame:
         that it covers is.
         """
         camera = self.intrinsics
-        longer = max(camera.width, camera.height)
-        if longer <= largest:
+        if max(camera.width, camera.height) <= largest:
             return self
-        small = camera.scaled(largest / longer)
+        small = camera.at_most(largest)
         size = (small.width, small.height)
         rgb = reduced(self.held_rgb.cpu(), *size)
         depth = None if self.depth is None else resampled(self.depth.cpu(), *size)

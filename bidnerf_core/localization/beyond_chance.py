@@ -8,7 +8,6 @@ the surface: each measurement's cost with the rival, less that with the pose.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.chance import odds
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.solvers.pivots import Pivot
 
@@ -54,7 +54,7 @@ class Support:
     @property
     def confidence(self) -> float:
         """The posterior probability of the pose, with equal prior odds against each rival."""
-        return 1 / (1 + sum(_factor(odds) for odds in (self.plain, self.displaced, self.other)))
+        return 1 / (1 + sum(odds(-against) for against in (self.plain, self.displaced, self.other)))
 
     def rejection(self, least_explained: float = LEAST_EXPLAINED) -> Verdict | None:
         """Return why the measurements do not support the pose, or None."""
@@ -129,7 +129,3 @@ def _apart(T: SE3, others: SE3, about: Pivot, reach: float) -> Bool[Tensor, "h"]
 
 def _repeated(T: SE3, count: int) -> SE3:
     return SE3(T.rotation.expand(count, 3, 3), T.translation.expand(count, 3))
-
-
-def _factor(odds: float) -> float:
-    return math.exp(-max(-500.0, min(500.0, odds)))

@@ -15,8 +15,7 @@ from bidnerf_core.localization.beyond_chance import support
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
-from bidnerf_core.localization.covariance import surface_covariance
-from bidnerf_core.localization.fusion import finest_cost
+from bidnerf_core.localization.covariance import finest_cost, surface_covariance
 from bidnerf_core.localization.point_exposure import cloud_with_exposure_of_map
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps

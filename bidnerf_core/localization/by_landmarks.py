@@ -23,13 +23,12 @@ from bidnerf_core.localization.alternatives import decide, log_odds_by_rendering
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
-from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.covariance import finest_cost, position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints, corrected
 from bidnerf_core.localization.fusion import (
     FusedPose,
     Measurements,
     drawn_rays,
-    finest_cost,
     fused_pose,
     nearby_start,
 )

@@ -14,6 +14,7 @@ from importlib.resources import files
 
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
 from bidnerf_core.localization.beyond_chance import ACCEPTED
+from bidnerf_core.localization.landmarks.chance import probability_of
 from bidnerf_core.localization.result import Outcome, Verdict
 
 ACCEPTED_ESTIMATED = 0.6
@@ -43,8 +44,8 @@ class LogisticModel:
 
     def probability(self, values: dict[str, float]) -> float:
         """Return the probability for features by name."""
-        odds = self.bias + sum(w * values[name] for name, w in zip(self.features, self.weights, strict=True))
-        return 1 / (1 + math.exp(-max(-500.0, min(500.0, odds))))
+        terms = (w * values[name] for name, w in zip(self.features, self.weights, strict=True))
+        return probability_of(self.bias + sum(terms))
 
 
 def judged(
@@ -55,12 +56,16 @@ def judged(
     ``approximate``: whether the focal length was given as approximate, so that it was estimated in any case.
     """
     value = confidence(diagnostics)
-    estimated = isinstance(diagnostics, LandmarkDiagnostics) and diagnostics.estimated_calibration
-    least = ACCEPTED_ESTIMATED if estimated and not approximate else ACCEPTED
-    if value is not None and verdict.accepted and value < least:
+    if value is not None and verdict.accepted and value < least_confidence(diagnostics, approximate):
         percent = math.floor(100 * value)
         verdict = Verdict(Outcome.UNCERTAIN, f"only {percent}% likely to be right; {verdict.reason}")
     return Judgement(verdict, value)
+
+
+def least_confidence(diagnostics: object, approximate: bool = False) -> float:
+    """Return the least confidence with which a pose is accepted; ``approximate`` is as for ``judged``."""
+    estimated = isinstance(diagnostics, LandmarkDiagnostics) and diagnostics.estimated_calibration
+    return ACCEPTED_ESTIMATED if estimated and not approximate else ACCEPTED
 
 
 def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float | None:

@@ -12,6 +12,7 @@ from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
 from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
+from bidnerf_core.mapping import SurfaceMap
 
 LEAST_VARIANCE = 1e-9
 """Lower limit of the variance of residuals, in units of their scale; below it there are only rounding errors."""
@@ -49,6 +50,11 @@ def sandwich_covariance(
     return torch.where(sound[:, None, None], (found + found.mT) / 2, torch.inf)
 
 
+def finest_cost(surface: SurfaceMap, cloud: PointCloud) -> SurfaceCost:
+    """Return the cost of measured points at the finest scale of distances that the surface's cells allow."""
+    return SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
+
+
 def surface_covariance(
     cost: SurfaceCost,
     T: SE3,
@@ -63,8 +69,7 @@ def surface_covariance(
     such as the way along a bare wall, have the size of the scene or half a turn as standard deviation. The uncertainties
     of the sensor's scale and offset are added, which all its points share.
     """
-    finest = PointScales(FINEST * cost.surface.cell)
-    cost = SurfaceCost(cost.surface, cost.cloud, finest)
+    cost = finest_cost(cost.surface, cost.cloud)
     variance = cost.residual_variance(T[None])[0].clamp(min=LEAST_VARIANCE) / (points * views)
     prior = torch.tensor([cost.surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
     information = cost(T[None]).hessian[0] / variance + torch.diag(prior**-2)

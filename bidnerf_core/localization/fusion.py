@@ -12,8 +12,7 @@ from bidnerf_core.geometry.robust import RobustName
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings, Residuals
-from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import FINEST, position_deviation, weight
+from bidnerf_core.localization.covariance import position_deviation, weight
 from bidnerf_core.localization.depth_scale import (
     UNKNOWNS,
     PoseAndDepth,
@@ -31,7 +30,6 @@ from bidnerf_core.localization.settings import (
     rendered_depth_scale,
 )
 from bidnerf_core.localization.solvers.pivots import Pivot
-from bidnerf_core.mapping import SurfaceMap
 
 LEAST_DECREASE = 0.1
 """Predicted decrease of the sum, which is a squared Mahalanobis distance, below which a step is the last."""
@@ -41,11 +39,6 @@ UNSURE = 2.0
 """Factor on the deviation of the prior, with which rays are weighed first."""
 FIRST_DAMPING = 1e-3
 """Damping of the first step."""
-
-
-def finest_cost(surface: SurfaceMap, cloud: PointCloud) -> SurfaceCost:
-    """Return the cost of measured points at the finest scale of distances that the surface's cells allow."""
-    return SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
 
 
 def drawn_rays(

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import DepthSensorModel, find_depth_sensor
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
@@ -24,7 +25,7 @@ from bidnerf_core.io.json import LARGEST_INTEGER
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
-from bidnerf_core.localization.problem import Problem, SceneMap, on_device, rig, unit_of
+from bidnerf_core.localization.problem import Problem, SceneMap, landmark_cameras, on_device, rig, unit_of
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.settings import ByColourConfig
 
@@ -131,6 +132,11 @@ class Localizer:
     def rays(self) -> int:
         """The number of rays that may be rendered to tell explanations of an image apart; 0 where nothing is rendered."""
         return self._method.rays(self.config)
+
+    @property
+    def assumed_cameras(self) -> tuple[Intrinsics, ...]:
+        """The cameras that photos without a focal length may have, which takes landmarks: those of the map's images."""
+        return landmark_cameras(self.map) if self.matches_landmarks else ()
 
     @property
     def matches_landmarks(self) -> bool:

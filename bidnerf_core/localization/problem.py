@@ -10,6 +10,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import torch
 from torch import nn
 
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import InputError
@@ -155,6 +156,11 @@ class Problem:
         """Return the problem without measured depth."""
         views = tuple(replace(view, frame=replace(view.frame, depth=None)) for view in self.views)
         return replace(self, views=views, depth_rays=None)
+
+
+def landmark_cameras(scene: SceneMap) -> tuple[Intrinsics, ...]:
+    """Return the cameras of the images from which the landmarks of a map were built; photos without a focal length may share them."""
+    return () if scene.landmarks is None else scene.landmarks.cameras
 
 
 def rig(

@@ -29,12 +29,10 @@ from bidnerf_core.localization.settings import (
 )
 from bidnerf_core.settings import EXPERT, NotNegative, Range, Settings
 
-Poses = Annotated[int, Range(1, 10**5), EXPERT]
 Steps = Annotated[int, Range(1, 10**5)]
-ExpertSteps = Annotated[int, Range(1, 10**5), EXPERT]
+ExpertCount = Annotated[int, Range(1, 10**5), EXPERT]
 RayCount = Annotated[int, Range(7, 10**7)]
 ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
-StepCount = Annotated[int, Range(1, 10**5), EXPERT]
 
 
 @dataclass(frozen=True)
@@ -42,11 +40,11 @@ class BidLmStages(Settings):
     """Settings of the stages, from many poses and few rays at the coarsest level to one pose and many rays."""
 
     search_rays: ExpertRays = 128  # number of rays that rank each of the poses about the start
-    coarse_poses: Poses = 6  # number of best poses that take steps at the coarsest level
-    coarse_steps: ExpertSteps = 4  # steps of each of the coarse poses
+    coarse_poses: ExpertCount = 6  # number of best poses that take steps at the coarsest level
+    coarse_steps: ExpertCount = 4  # steps of each of the coarse poses
     coarse_rays: ExpertRays = 128  # number of rays for each of the coarse poses
-    middle_poses: Poses = 2  # number of best coarse poses that take further steps
-    middle_steps: ExpertSteps = 4  # steps of each of the middle poses
+    middle_poses: ExpertCount = 2  # number of best coarse poses that take further steps
+    middle_steps: ExpertCount = 4  # steps of each of the middle poses
     middle_rays: ExpertRays = 256  # number of rays for each of the middle poses
     fine_steps: Steps = 6  # steps of the best pose, in full detail
     fine_rays: RayCount = 1024  # number of rays rendered for each of the fine steps
@@ -119,11 +117,11 @@ BID_LM = Method(
 class ImageSearchSettings(Settings):
     """Settings of the search with small renderings, which become larger as poses become fewer."""
 
-    search_poses: StepCount = 24  # number of best poses that take steps on small renderings
-    search_steps: StepCount = 8  # steps of each of the search poses
-    middle_poses: StepCount = 6  # number of best search poses that take steps on larger renderings
-    middle_steps: StepCount = 6  # steps of each of the middle poses
-    last_steps: StepCount = 4  # steps of the best two poses, on the largest renderings
+    search_poses: ExpertCount = 24  # number of best poses that take steps on small renderings
+    search_steps: ExpertCount = 8  # steps of each of the search poses
+    middle_poses: ExpertCount = 6  # number of best search poses that take steps on larger renderings
+    middle_steps: ExpertCount = 6  # steps of each of the middle poses
+    last_steps: ExpertCount = 4  # steps of the best two poses, on the largest renderings
     # longer side of the first renderings, pixels; the last ones are 3 times as large
     width: Annotated[int, Range(4, 1000)] = 16
 

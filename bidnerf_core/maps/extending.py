@@ -35,6 +35,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import locked
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.localization import Localizer
+from bidnerf_core.localization.problem import landmark_cameras
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     BakeConfig,
@@ -112,7 +113,7 @@ def extend(
         load_info(folder)  # raises where there is no map
     with contextlib.nullcontext() if folder is None else locked(folder):
         scene = scene if isinstance(scene, Map) else load_map(scene)
-        where = str(scene.folder or scene.info.data or "map in memory")
+        where = scene.name
         if scene.info.interruption is not None:
             raise InputError(f"{where}: cannot be extended: {scene.info.interruption}")
         frames, unread = _frames(photos, scene, split)
@@ -197,7 +198,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
 def _opened(path: Path, scene: Map) -> Dataset | Photos:
     if path.is_dir() and find_reader(path) is not None:
         return open_dataset(path, scene.bounds.background)
-    source = CameraSource(assumed=() if scene.landmarks is None else scene.landmarks.cameras)
+    source = CameraSource(assumed=landmark_cameras(scene))
     return Photos(photo_files([path]), source, background=scene.bounds.background)
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend, load_backend
+from bidnerf_core.camera.source import checked_side
 from bidnerf_core.captures.cameras import at_stored_poses, poses_of
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.captures.up_direction import UpDirection, given_up, up_direction
@@ -45,7 +46,7 @@ from bidnerf_core.maps.files import (
 from bidnerf_core.maps.same_scene import check_same_scene
 from bidnerf_core.maps.scaling import in_map_frame, scaled
 from bidnerf_core.maps.summary import MapSummary, summarized
-from bidnerf_core.maps.views import Images, checked_side, read_views
+from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.maps.weights import checked_weights
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
 from bidnerf_core.training import TrainingState
@@ -74,7 +75,7 @@ class Map:
         trained = f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
         surfels = amount(0 if self.surface is None else len(self.surface.surfels), "surfel")
         landmarks = amount(0 if self.landmarks is None else len(self.landmarks), "landmark")
-        return f"<Map {self._name}: {trained}, {surfels}, {landmarks}>"
+        return f"<Map {self.name}: {trained}, {surfels}, {landmarks}>"
 
     @property
     def bounds(self) -> SceneBounds:
@@ -125,7 +126,8 @@ class Map:
         return self.info.weights or f"memory-{content_digest(self.field, self.surface, self.landmarks)}"
 
     @property
-    def _name(self) -> str:
+    def name(self) -> str:
+        """The map's name in messages: its folder, else its dataset."""
         return str(self.folder or self.info.data or "map in memory")
 
     def to(self, device: torch.device | str) -> Map:
@@ -158,13 +160,13 @@ class Map:
         """
         if not isinstance(view, View):
             raise InputError(
-                f"{self._name}: view is a {type(view).__name__}, expected a View(frame, T_world_camera)"
+                f"{self.name}: view is a {type(view).__name__}, expected a View(frame, T_world_camera)"
             )
         field = self.field
         if level is not None:
             offered = levels(field)
             if not 0 <= level < len(offered):
-                raise InputError(f"{self._name}: no level {level}, expected 0 to {len(offered) - 1}")
+                raise InputError(f"{self.name}: no level {level}, expected 0 to {len(offered) - 1}")
             field = offered[level]
         return render_image(field, view.frame.intrinsics, view.T_ref_camera, self.bounds, motion=view.motion)
 
@@ -195,7 +197,7 @@ class Map:
             find_features(features)
             if data is None and not rendered_landmarks and self.info.landmark_source == "photos":
                 raise InputError(
-                    f"{self._name}: its landmarks are of photos and detector {self.info.landmark_features!r}; for"
+                    f"{self.name}: its landmarks are of photos and detector {self.info.landmark_features!r}; for"
                     f" {features!r} give the photos again (--data), or take --rendered-landmarks"
                 )
             return replace(self, info=replace(self.info, landmark_features=features)).bake(
@@ -210,7 +212,7 @@ class Map:
                     largest=checked_side(largest), folder=self.folder,
                 )  # fmt: skip
                 views = at_stored_poses(found.views, self.info.cameras)
-                check_same_scene(self.info, self.field, views, self._name)
+                check_same_scene(self.info, self.field, views, self.name)
             settings = BakeConfig() if config is None else config
             return self.with_baked_parts(views, settings, rendered_landmarks, None, progress, cancel)
 
@@ -227,15 +229,13 @@ class Map:
         ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if it is known.
         """
         check_cancelled(cancel, "baking")
-        surface = surface or bake_surface(self.info, self.field, views, config, self._name, progress, cancel)
+        surface = surface or bake_surface(self.info, self.field, views, config, self.name, progress, cancel)
         scene = self._with_surface(surface)
         if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
-            log.info(
-                f"{self._name}: the landmarks of its photos are kept; --rendered-landmarks replaces them"
-            )
+            log.info(f"{self.name}: the landmarks of its photos are kept; --rendered-landmarks replaces them")
             return replace(scene, landmarks=kept)
         check_cancelled(cancel, "baking")
-        found = bake_landmarks(self.info, self.field, views, self._name, tracked, progress, cancel, scene.up)
+        found = bake_landmarks(self.info, self.field, views, self.name, tracked, progress, cancel, scene.up)
         return scene._with_landmarks(found)
 
     def _photo_landmarks(self) -> LandmarkMap | None:
@@ -256,7 +256,7 @@ class Map:
     ) -> Map:  # fmt: skip
         """Bake the surface alone, if it is not known, while the caller holds the lock of the folder."""
         if surface is None:
-            surface = bake_surface(self.info, self.field, [], config, self._name, progress, cancel)
+            surface = bake_surface(self.info, self.field, [], config, self.name, progress, cancel)
         return self._with_surface(surface)
 
     def _with_surface(self, surface: SurfaceMap) -> Map:

@@ -55,7 +55,7 @@ def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
     """
     if isinstance(factor, bool) or not (isinstance(factor, int | float) and 0 < factor < math.inf):
         raise InputError(f"factor is {factor!r}, expected a positive number")
-    where = str(scene.folder or scene.info.data or "map in memory")
+    where = scene.name
     if scene.info.interruption is not None:
         raise InputError(f"{where}: cannot be scaled: {scene.info.interruption}")
     whole = scene.whole()

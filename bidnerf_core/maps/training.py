@@ -14,6 +14,7 @@ from torch import nn
 
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import checked_side
 from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_cameras
 from bidnerf_core.captures.training_views import RefinementChoice, located, prepared
 from bidnerf_core.carving import estimate_bounds
@@ -31,7 +32,7 @@ from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.files import load_state, map_folder
 from bidnerf_core.maps.map import Map, build_field, frozen_field, load_map
 from bidnerf_core.maps.photos import posed_images
-from bidnerf_core.maps.views import Images, ReadViews, checked_side, read_views
+from bidnerf_core.maps.views import Images, ReadViews, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
 from bidnerf_core.registry import PluginError
 from bidnerf_core.training import TrainingStopped
@@ -289,5 +290,5 @@ def _baked(
     except PluginError:  # nothing that other images would mend
         raise
     except InputError as error:  # the map itself is sound
-        log.info(f"{scene.folder or 'map in memory'}: no surface baked: {error}")
+        log.info(f"{scene.name}: no surface baked: {error}")
         return scene if scene.folder is None else load_map(scene.folder, work.device)

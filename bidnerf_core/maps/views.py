@@ -140,13 +140,6 @@ def _one(data: Dataset, split: str, name: str, limit: int | None, asked: bool) -
         return []
 
 
-def checked_side(largest: int | None) -> int | None:
-    """Return ``largest``, the columns or rows of the largest image. Raises ``InputError`` where it is no such number."""
-    if largest is not None and (isinstance(largest, bool) or not isinstance(largest, int) or largest < 1):
-        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
-    return largest
-
-
 USEFUL_SIDE, LEAST_SIDE = 1600, 800
 """Pixels along the longer side: more are of little use to a map, whose keypoints are found at the latter; fewer harm it."""
 MOST_BYTES = 2_000_000_000

@@ -49,11 +49,9 @@ def export_map(scene: Map, out: str | Path, to: ExportFormat, overwrite: bool = 
         for number, camera in enumerate(scene.info.cameras)
     ]
     if to != "ply" and not images:
-        raise InputError(
-            f"{scene.folder or 'map in memory'}: has no cameras, expected some for {to}; ply has the surface alone"
-        )
+        raise InputError(f"{scene.name}: has no cameras, but {to} needs some; ply does not")
     if to == "ply" and not images and scene.surface is None and scene.landmarks is None:
-        raise InputError(f"{scene.folder or 'map in memory'}: has no surface, landmarks or cameras to export")
+        raise InputError(f"{scene.name}: has no surface, landmarks or cameras to export")
     with output_folder(out, overwrite):
         if to == "colmap":
             write_colmap_poses(out / "images.txt", images)

@@ -23,6 +23,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.localization import Localization, Localizer, SceneMap, Tracker, TrackerConfig
 from bidnerf_core.localization.localizer import Start
+from bidnerf_core.localization.problem import landmark_cameras
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
@@ -90,9 +91,7 @@ def track(
 
 def opened_for(scene: SceneMap, path: str | Path, **options: Any) -> FrameSequence:
     """Open a sequence as ``open_sequence`` does, with the map's background and its cameras for images that have none."""
-    landmarks = getattr(scene, "landmarks", None)
-    assumed = () if landmarks is None else landmarks.cameras
-    return open_sequence(path, assumed=assumed, background=scene.bounds.background, **options)
+    return open_sequence(path, assumed=landmark_cameras(scene), background=scene.bounds.background, **options)
 
 
 def _every(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:

@@ -44,11 +44,11 @@ class Upload:
                 "depth_unit was given without depth, expected the depth image that it belongs to"
             )
         scene = localizer.map
-        assumed = (
-            scene.landmarks.cameras if scene.landmarks is not None and localizer.matches_landmarks else ()
-        )
         camera = CameraSource(
-            self._file(folder, "camera"), self.parameters.get("focal"), self.parameters.get("hfov"), assumed
+            self._file(folder, "camera"),
+            self.parameters.get("focal"),
+            self.parameters.get("hfov"),
+            localizer.assumed_cameras,
         )
         photos = Photos(
             [photo], camera, {} if depth is None else {photo: depth}, unit, background=scene.bounds.background

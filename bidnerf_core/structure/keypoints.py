@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.camera.exif import Exif, read_exif
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics, reduced_size
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.camera.source import CameraSource, Raster, camera_from_exif
 from bidnerf_core.errors import InputError
@@ -69,9 +69,7 @@ def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | No
             unusable[image.name] = _without_file(error, image)
             continue
         size = (header.width, header.height)
-        factor = min(1.0, LARGEST / max(size))
-        reduced = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
-        photos.append(Photo(image, number, size, reduced, exif))
+        photos.append(Photo(image, number, size, reduced_size(*size, LARGEST), exif))
     numbers: dict[Any, int] = {}
     cameras, known = dict[int, Intrinsics](), dict[int, bool]()
     for place, photo in enumerate(photos):

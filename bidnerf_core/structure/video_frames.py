@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from bidnerf_core.camera.intrinsics import reduced_size
 from bidnerf_core.captures.photos import sharpness
 from bidnerf_core.datasets.video import frame_count, pictures
 from bidnerf_core.structure.sources import SourceImage
@@ -132,8 +133,5 @@ class _Motion:
 
 
 def _small(grey: np.ndarray) -> np.ndarray:
-    factor = WIDTH / max(grey.shape)
-    if factor >= 1:
-        return grey
-    size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
-    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    size = reduced_size(grey.shape[1], grey.shape[0], WIDTH)
+    return grey if size == grey.shape[::-1] else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)

@@ -24,7 +24,7 @@ from bidnerf_core.viewer.explanations import ShownExplanation, explanations
 from bidnerf_core.viewer.figures import Figure, acceptance_figures
 from bidnerf_core.viewer.packing import Packed, Picture, drawing, packed, photograph
 from bidnerf_core.viewer.rendering import quick_image
-from bidnerf_core.viewer.scene import CameraShape, at_most, rows_of
+from bidnerf_core.viewer.scene import CameraShape, rows_of
 
 PICTURE_SIDE, RUNNER_UP_SIDE = 320, 240
 """Pixels of the longer side of a photo beside its rendering, and beside that of the runner-up: each rendered pixel takes time."""
@@ -129,7 +129,7 @@ def shown_answer(
     given, frame = frame, None if frame is None else found.frame_as_taken(frame)
     observed = rendered = depth = None
     if frame is not None:
-        camera = at_most(frame.intrinsics, side)
+        camera = frame.intrinsics.at_most(side)
         observed = photograph(reduced(frame.rgb, camera.width, camera.height))
         if finite:
             rendered, depth = _compared(scene, camera, T, frame, quick)
@@ -157,7 +157,7 @@ def shown_answer(
         steps=_steps(found, record),
         path=_path(found.poses),
         matches=None if frame is None or record is None or not finite else _matches(frame, record),
-        figures=acceptance_figures(found, record),
+        figures=acceptance_figures(found, record, given is not None and given.focal_is_approximate),
         explanations=explanations(found, record),
         runner_up=other,
     )
@@ -308,6 +308,6 @@ def _runner_up(
 def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: bool) -> RunnerUp:
     picture = None
     if frame is not None:
-        camera = at_most(frame.intrinsics, RUNNER_UP_SIDE)
+        camera = frame.intrinsics.at_most(RUNNER_UP_SIDE)
         picture, _ = _compared(scene, camera, T, frame, quick)
     return RunnerUp(reason, rows_of(T), picture)

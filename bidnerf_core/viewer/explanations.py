@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localization
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics
-from bidnerf_core.localization.beyond_chance import NO_RIVAL, Support
-from bidnerf_core.localization.landmarks.hypotheses import Explanation, Motion, Posterior, Whose
+from bidnerf_core.localization.beyond_chance import DISPLACEMENT, NO_RIVAL, Support
+from bidnerf_core.localization.landmarks.chance import odds, probability_of
+from bidnerf_core.localization.landmarks.hypotheses import (
+    APPROXIMATE,
+    CROPPED_IMAGE,
+    INEXACT,
+    STATED,
+    WRONG_CAMERA,
+    WRONG_FOCAL,
+    Explanation,
+    Motion,
+    Posterior,
+    Whose,
+)
 from bidnerf_core.localization.recording import SearchRecord
 from bidnerf_core.viewer.scene import rows_of
 
 LEAST_SHOWN = 0.001
 """Least probability of an explanation that is listed."""
 CAMERA_NAMES = {
-    "stated": "the camera as given",
-    "inexact": "the camera as given, nearly",
-    "mistaken focal length": "another focal length",
-    "mistaken": "another camera",
-    "cropped": "a cropped image",
+    STATED: "the camera as given",
+    INEXACT: "the camera as given, nearly",
+    WRONG_FOCAL: "another focal length",
+    WRONG_CAMERA: "another camera",
+    APPROXIMATE: "the camera as given, approximately",
+    CROPPED_IMAGE: "a cropped image",
 }
 MOTIONS = {
     Motion.STILL: "",
@@ -56,11 +68,6 @@ def explanations(found: Localization, record: SearchRecord | None) -> tuple[Show
     return tuple(shown)
 
 
-def probability_of(log_odds: float) -> float:
-    """Return the probability of the first of two explanations whose log odds against the second are given."""
-    return 1 / (1 + math.exp(-max(-500.0, min(500.0, log_odds))))
-
-
 def _of_camera(posterior: Posterior) -> list[ShownExplanation]:
     weighed = list(zip(posterior.explanations, posterior.probabilities, strict=True))
     question = "whose camera"
@@ -94,11 +101,11 @@ def _two(question: str, reason: str, log_odds: float, other: SE3 | None) -> list
 
 def _of_support(said: Support) -> list[ShownExplanation]:
     rivals = [
-        ("a pose displaced by a tenth of the distance", said.displaced),
+        (f"a pose displaced by {DISPLACEMENT:.0%} of the distance", said.displaced),
         ("another pose of the search", said.other),
         ("any image of a single colour", said.plain),
     ]
-    weights = [(name, math.exp(-max(-500.0, min(500.0, odds)))) for name, odds in rivals if odds < NO_RIVAL]
+    weights = [(name, odds(-against)) for name, against in rivals if against < NO_RIVAL]
     total = 1 + sum(weight for _, weight in weights)
     shown = [ShownExplanation("which pose", "the pose found", 1 / total, True)]
     return shown + [ShownExplanation("which pose", name, w / total, False) for name, w in weights]

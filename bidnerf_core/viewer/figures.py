@@ -14,11 +14,10 @@ from bidnerf_core.localization.acceptance import (
     landmark_diagnostics,
 )
 from bidnerf_core.localization.beyond_chance import ACCEPTED, LEAST_EXPLAINED, Support
-from bidnerf_core.localization.confidence import ACCEPTED_ESTIMATED
-from bidnerf_core.localization.landmarks.chance import DECISIVE
+from bidnerf_core.localization.confidence import least_confidence
+from bidnerf_core.localization.landmarks.chance import DECISIVE, probability_of
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
-from bidnerf_core.viewer.explanations import probability_of
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,13 @@ class Figure:
     meaning: str
 
 
-def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
-    """Return the figures of an answer; those of landmarks that were matched in vain too, where a record has them."""
+def acceptance_figures(
+    found: Localization, record: SearchRecord | None, approximate: bool = False
+) -> tuple[Figure, ...]:
+    """Return the figures of an answer; those of landmarks that were matched in vain too, where a record has them.
+
+    ``approximate``: whether the focal length was given as approximate.
+    """
     by_landmarks = None if record is None or not record.landmarks else record.landmarks[-1]
     said, figures = found.diagnostics, list[Figure]()
     if isinstance(said, LandmarkDiagnostics):
@@ -48,8 +52,7 @@ def acceptance_figures(found: Localization, record: SearchRecord | None) -> tupl
     if by_landmarks is not None and not isinstance(said, LandmarkDiagnostics):
         figures += _of_landmarks(landmark_diagnostics(by_landmarks), by_landmarks)
     if found.confidence is not None:
-        estimated = isinstance(said, LandmarkDiagnostics) and said.estimated_calibration
-        least = ACCEPTED_ESTIMATED if estimated else ACCEPTED
+        least = least_confidence(said, approximate)
         meaning = "probability that the pose is right, from all figures together"
         figures.insert(
             0,

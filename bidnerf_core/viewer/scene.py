@@ -125,13 +125,7 @@ def thumbnail_jpeg(scene: Map, camera: StoredCamera) -> bytes:
 
 
 def _small_image(scene: Map, camera: StoredCamera) -> Float[Tensor, "h w 3"]:
-    return quick_image(scene, at_most(camera.intrinsics, THUMBNAIL), camera.pose)
-
-
-def at_most(camera: Intrinsics, side: int) -> Intrinsics:
-    """Return a camera with at most ``side`` pixels along its longer side."""
-    scale = side / max(camera.width, camera.height)
-    return camera if scale >= 1 else camera.scaled(scale)
+    return quick_image(scene, camera.intrinsics.at_most(THUMBNAIL), camera.pose)
 
 
 def rows_of(T: SE3) -> tuple[float, ...]:

@@ -30,6 +30,16 @@ def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) 
     return log / math.log(10)
 
 
+def odds(log_odds: float) -> float:
+    """Return the odds of given logarithm, limited to what floating-point numbers can hold."""
+    return math.exp(max(-500.0, min(500.0, log_odds)))
+
+
+def probability_of(log_odds: float) -> float:
+    """Return the probability of the first of two explanations whose log odds against the second are given."""
+    return 1 / (1 + odds(-log_odds))
+
+
 def log_odds_of_share(share: float) -> float:
     """Return the log odds of a pose against an explanation that has this share of its evidence by landmarks."""
     return -BY_SHARE * math.log(share) if share > 0 else math.inf

@@ -144,9 +144,7 @@ def _visible(
     inside = (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1) & (local[:, 2] > 0)
     inside &= landmarks.sizes[index] >= size * local[:, 2]
     index, local = index[inside], local[inside]
-    towards = T_world_camera.translation.float() - landmarks.positions[index]
-    cosine = (towards * landmarks.directions[index]).sum(-1) / torch.linalg.vector_norm(local, dim=-1)
-    seen = cosine >= (landmarks.cones[index] + OBLIQUE).clamp(max=torch.pi).cos()
+    seen = landmarks.facing(T_world_camera.translation, OBLIQUE, index)
     if image.hidden is not None:
         seen &= ~_hidden(image.hidden, local, camera)
     return index[seen], local[seen]

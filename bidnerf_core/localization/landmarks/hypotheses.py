@@ -63,6 +63,13 @@ A larger one more probably makes up for another camera. It is not taken, and the
 MIN_POINTS = 20
 """Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""
 
+APPROXIMATE, CROPPED_IMAGE, WRONG_FOCAL, WRONG_CAMERA = (
+    "approximate",
+    "cropped",
+    "mistaken focal length",
+    "mistaken",
+)
+"""Names of the hypotheses under which intrinsics are estimated."""
 STATED, INEXACT, ESTIMATED = "stated", "inexact", "estimated"
 """Names of the hypotheses that the stated intrinsics are right, exactly and as far as devices usually state them, and of the group of
 those that they are wrong or unknown.
@@ -127,10 +134,10 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         )
 
     if prior != FIXED:
-        own = [about("approximate", 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
+        own = [about(APPROXIMATE, 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
         if prior.shift < ANY.shift:
             cropped = replace(prior, shift=ANY.shift)
-            own.append(about("cropped", CROPS_BESIDE_APPROXIMATE, cropped, cropped))
+            own.append(about(CROPPED_IMAGE, CROPS_BESIDE_APPROXIMATE, cropped, cropped))
         of_map = [(camera, SAME_LOG_ODDS) for camera in cameras]
     else:
         # If the stated intrinsics are those of the map, they are wrong only where the image is from another camera.
@@ -143,13 +150,13 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
             about(INEXACT, USUALLY, USUAL),
             # What is wrong may be so by any amount: it is estimated without its prior.
             about(
-                "mistaken focal length",
+                WRONG_FOCAL,
                 0.6 * MISTAKES * share,
                 other_focal,
                 replace(other_focal, log_focal=ANY.log_focal),
             ),
-            about("mistaken", 0.4 * MISTAKES * share, MISTAKEN, NOMINAL),
-            about("cropped", CROPS * share, CROPPED, CROPPED),
+            about(WRONG_CAMERA, 0.4 * MISTAKES * share, MISTAKEN, NOMINAL),
+            about(CROPPED_IMAGE, CROPS * share, CROPPED, CROPPED),
         ]
         of_map = [(camera, camera.log_odds) for camera in cameras if bool(camera.differs.any())]
     found = [

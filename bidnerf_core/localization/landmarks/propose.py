@@ -33,8 +33,6 @@ STRONGEST = 700
 """Number of keypoints, the strongest of an image, that are matched first; all are matched only if these do not suffice."""
 CONVINCING = -20.0
 """Logarithm of the number of false alarms below which the matches of the strongest keypoints suffice."""
-APPROXIMATE = 0.05
-"""Relative standard deviation of the focal length above which it is sought together with the first pose."""
 LEAST_INLIERS = 6
 """Least number of inliers for a pose to be refined at all."""
 MANY_VISIBLE, CONTRADICTED = 200, 1.5
@@ -163,7 +161,7 @@ def _first_pose(
 def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Candidate | None:
     data = query.observed(matches)
     found = sample_consensus(data, matches.view, query.threshold, seed)
-    if query.prior.log_focal > APPROXIMATE:
+    if query.prior != FIXED:  # the focal length is sought together with the first pose
         free = focal_consensus(data, query.threshold, seed)
         hypotheses = [h for h in (found, free, *_map_camera_consensus(query, matches, seed)) if h is not None]
         found = max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)

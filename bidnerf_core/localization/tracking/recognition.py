@@ -147,10 +147,7 @@ class LandmarkDetector:
         half = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
         middle = torch.tensor([0.5 - camera.cx / camera.width, 0.5 - camera.cy / camera.height]) * 2 * half
         inside = ((local[:, :2] - middle * local[:, 2:]).abs() <= 1.3 * half * local[:, 2:]).all(-1)
-        towards = T_world_camera.translation.float() - landmarks.positions
-        cosine = (towards * landmarks.directions).sum(-1) / towards.norm(dim=-1).clamp(min=1e-12)
-        facing = cosine >= (landmarks.cones + OBLIQUE).clamp(max=torch.pi).cos()
-        index = (inside & facing).nonzero()[:, 0]
+        index = (inside & landmarks.facing(T_world_camera.translation, OBLIQUE)).nonzero()[:, 0]
         if len(index) <= NEARBY:
             return index
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:NEARBY].sort().values]

@@ -24,7 +24,13 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE, surface_covariance, weight
+from bidnerf_core.localization.covariance import (
+    FINEST,
+    LEAST_VARIANCE,
+    finest_cost,
+    surface_covariance,
+    weight,
+)
 from bidnerf_core.localization.normal_equations import Scaled, Sum
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.by_points import JUDGED
@@ -75,7 +81,7 @@ def fused_with_surface(
 
     A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
     """
-    cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
+    cost = finest_cost(surface, cloud)
     unmoved = torch.zeros(6, dtype=torch.float64)
     T, _, information, _ = _descended(cost, pose, pose.T_world_camera, unmoved, steps, whole=True)
     return fused_with_points(T, pose, information)

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from bidnerf_core.camera.intrinsics import reduced_size
 from bidnerf_core.errors import enumeration
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings
@@ -262,9 +263,8 @@ def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
 def _reduced(grey: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the image with at most ``largest`` pixels along its longer side, and its scale (x, y)."""
     height, width = grey.shape
-    factor = largest / max(height, width)
-    if factor >= 1:
+    size = reduced_size(width, height, largest)
+    if size == (width, height):
         return grey, np.ones(2, dtype=np.float32)
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
     scale = np.array([size[0] / width, size[1] / height], dtype=np.float32)
     return cv2.resize(grey, size, interpolation=cv2.INTER_AREA), scale

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
@@ -108,6 +108,18 @@ class LandmarkMap:
         if self.cells is None:
             return torch.arange(len(self))
         return self.cells.seen_from(T_world_camera, slopes, oblique, size)
+
+    def facing(
+        self, position: Float[Tensor, "3"], margin: float, index: Int[Tensor, "m"] | None = None
+    ) -> Bool[Tensor, "m"]:
+        """Return which landmarks were seen from the direction of a ``position``, or from at most ``margin`` radians beyond.
+
+        ``index``: the numbers of the landmarks in question, by default all.
+        """
+        chosen = slice(None) if index is None else index
+        towards = position.float() - self.positions[chosen]
+        cosine = (towards * self.directions[chosen]).sum(-1) / towards.norm(dim=-1).clamp(min=1e-12)
+        return cosine >= (self.cones[chosen] + margin).clamp(max=torch.pi).cos()
 
     @property
     def megabytes(self) -> float:

@@ -103,6 +103,4 @@ def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> 
     pose = T_world_camera.to(torch.float32)
     x, y, z = pose.inverse().apply(landmarks.positions).unbind(-1)
     inside = (x.abs() * camera.fx <= z * camera.width / 2) & (y.abs() * camera.fy <= z * camera.height / 2)
-    towards = normalize(pose.translation - landmarks.positions, dim=-1)
-    angle = (towards * landmarks.directions).sum(-1).clamp(-1, 1).acos()
-    return inside & (z > 0) & (angle <= landmarks.cones + math.radians(OBLIQUE_DEG))
+    return inside & (z > 0) & landmarks.facing(pose.translation, math.radians(OBLIQUE_DEG))
