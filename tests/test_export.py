@@ -80,7 +80,7 @@ def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
 
 def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:
     bare = replace(scene, info=replace(scene.info, cameras=()), surface=None, landmarks=None)
-    with pytest.raises(InputError, match="no cameras, but \w+ needs some"):
+    with pytest.raises(InputError, match=r"no cameras, but \w+ needs some"):
         bn.export_map(bare, tmp_path / "out", "colmap")
     with pytest.raises(InputError, match="no surface, landmarks or cameras"):
         bn.export_map(bare, tmp_path / "out", "ply")

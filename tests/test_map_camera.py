@@ -15,7 +15,7 @@ from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_ve
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.hypotheses import STATED, Whose
 from bidnerf_core.localization.landmarks.map_camera import (
-    SAME_CAMERA,
+    SHARE_SAME_CAMERA,
     MapCamera,
     correction_between,
     map_cameras,
@@ -290,7 +290,7 @@ def test_intrinsics_that_are_also_the_maps_are_mistaken_less_often(landmarks: La
         localized(part, PINHOLE, apparent).doubt.wrong for part in (landmarks, replace(landmarks, cameras=()))
     )
     odds = [p / (1 - p) for p in (known, unknown)]
-    assert odds[0] == pytest.approx((1 - SAME_CAMERA) * odds[1], rel=0.1)
+    assert odds[0] == pytest.approx((1 - SHARE_SAME_CAMERA) * odds[1], rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from bidnerf_core.io.rows import read_rows
 INFO = ("info.txt", "_info.txt")
 COLOUR = re.compile(r"frame-(\d+)\.color\.(?:png|jpe?g)", re.IGNORECASE)
 RANGE = re.compile(r"start\s*=\s*(\d+)\s*;\s*end\s*=\s*(\d+)")
-SAME_CAMERA = 1e-3
+FOCAL_TOLERANCE = 1e-3
 """Relative difference of two focal lengths below which depth needs no registration."""
 
 
@@ -114,7 +114,7 @@ def _cameras(info: Path) -> tuple[Intrinsics, DepthCamera | None]:
         raise InputError(
             f"{info}: no m_calibrationColorIntrinsic, expected 16 numbers, with m_colorWidth and m_colorHeight"
         )
-    if depth is None or abs(depth.resized(colour.width, colour.height).fx / colour.fx - 1) < SAME_CAMERA:
+    if depth is None or abs(depth.resized(colour.width, colour.height).fx / colour.fx - 1) < FOCAL_TOLERANCE:
         return colour, None
     return colour, DepthCamera(depth, SE3.identity())
 

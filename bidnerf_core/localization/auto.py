@@ -77,7 +77,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
 
 def _found_behind_occluders(problem: Problem, config: AutoConfig, seed: int) -> Localization:
-    found = _judged(problem, config, seed)
+    found = _localized(problem, config, seed)
     if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
         return found
     occluder = nearest_piece(problem)
@@ -85,7 +85,7 @@ def _found_behind_occluders(problem: Problem, config: AutoConfig, seed: int) -> 
         return found
     if found.converged and occluder.share_in_front(problem.surface, found.T_world_camera) < IN_FRONT:
         return found
-    rest = _judged(occluder.rest, config, seed)
+    rest = _localized(occluder.rest, config, seed)
     seconds = found.seconds + rest.seconds
     if not rest.converged or occluder.share_in_front(problem.surface, rest.T_world_camera) < IN_FRONT:
         return replace(found, seconds=seconds)
@@ -104,7 +104,7 @@ class _Proposal:
     decided: bool = False  # whether it was compared with other explanations
 
 
-def _judged(problem: Problem, config: AutoConfig, seed: int) -> Localization:
+def _localized(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     """Return the best pose, rejected if another explanation of the images may be right."""
     began, rays = time.perf_counter(), config.fused_rays
     proposal = _proposed(problem, config, seed, began)

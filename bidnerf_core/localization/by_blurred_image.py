@@ -47,7 +47,7 @@ ROUNDS, STEPS = 3, 4
 """Number of times that the blur is estimated, and number of steps after each estimate."""
 HALF_AN_INLIER = 0.1
 """Norm of a colour difference at which a pixel's inlier weight is one half."""
-LEAST_EXPLAINED = 0.75
+LEAST_EXPLAINED_BLURRED = 0.75
 """Least share of the image's contrast that an accepted pose explains."""
 PRECISE = 0.01
 """Largest standard deviation of an accepted position, as a share of the distance of what is seen."""
@@ -143,9 +143,11 @@ def _covariance(done: Descent, views: int) -> Float[Tensor, "6 6"]:
 def _verdict(found: Support, precision: float) -> Verdict:
     """Judge a pose by its support, and by its deviation as a share of the distance of what is seen."""
     share = f"{max(found.explained, 0):.0%} of the contrast of the blurred image agrees with renderings blurred to match"
-    rejection = found.rejection(LEAST_EXPLAINED)
+    rejection = found.rejection(LEAST_EXPLAINED_BLURRED)
     if rejection is not None:
-        return replace(rejection, reason=f"{rejection.reason}: only {share}, expected {LEAST_EXPLAINED:.0%}")
+        return replace(
+            rejection, reason=f"{rejection.reason}: only {share}, expected {LEAST_EXPLAINED_BLURRED:.0%}"
+        )
     if not precision <= PRECISE:
         why = f"the image is blurred, so the position is uncertain by {precision:.1%} of the distance of what is seen"
         return Verdict(Outcome.IMPRECISE, f"{why}, expected at most {PRECISE:.0%}")

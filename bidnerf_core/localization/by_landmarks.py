@@ -52,7 +52,7 @@ BASIN = 1.0
 """Deviation of a pose by landmarks, in pixels, beyond which rays may lead from there to a wrong pose."""
 THOROUGHLY = 4
 """Factor on the number of rays from there."""
-COMPARED_RAYS = 512
+FUSED_RAYS = 512
 """Largest number of rays by which they are compared."""
 STARTS = 64
 """Number of poses, drawn from the landmarks' prior, from which the best one is refined then."""
@@ -150,18 +150,20 @@ def fused_answer(
     if not may_be_fused or found.estimates_calibration:
         if problem.has_depth and found.estimates_calibration:
             answer = replace(answer, left_out="depth, which needs known intrinsics")
-        return _judged(answer, approximate)  # rendering would need intrinsics as exact as the landmarks' too
+        return _with_confidence(
+            answer, approximate
+        )  # rendering would need intrinsics as exact as the landmarks' too
     problem = corrected(problem, found)
     points = None
     if problem.surface is not None and problem.has_depth:
         points = _cost_of_points(problem, problem.surface, Generator().manual_seed(seed))
         diagnostics = landmark_diagnostics(found, searched, points, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
-    answer = _judged(answer, approximate)
+    answer = _with_confidence(answer, approximate)
     return _fused(problem, answer, points, rays, seed)
 
 
-def _judged(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
+def _with_confidence(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
     """Return the answer with its confidence, which can turn its verdict into a rejection."""
     judgement = judged(answer.verdict, answer.diagnostics, approximate)
     return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
@@ -221,7 +223,7 @@ def _vague_start(
         drawn_rays(
             problem, count, measurements.prior.pivot, Generator().manual_seed(seed), by_depth, loss="huber"
         )
-        for count in (min(rays, COMPARED_RAYS), rays // 2)
+        for count in (min(rays, FUSED_RAYS), rays // 2)
     )
     near = nearby_start(measurements, few, STARTS, Generator().manual_seed(seed))
     return fused_pose(replace(measurements, rays=many), STEPS, near)

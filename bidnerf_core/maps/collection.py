@@ -25,7 +25,7 @@ from bidnerf_core.localization.methods import USUAL_METHOD
 from bidnerf_core.localization.problem import unit_of
 from bidnerf_core.mapping import LandmarkMap, find_features
 from bidnerf_core.mapping.landmarks.features import detected
-from bidnerf_core.mapping.landmarks.vocabulary import Vocabulary, viewpoints
+from bidnerf_core.mapping.landmarks.vocabulary import Vocabulary, pooled_views
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of, load_info
 from bidnerf_core.maps.files import load_landmarks
 from bidnerf_core.maps.map import Map, load_map
@@ -40,7 +40,7 @@ KEPT = 6
 
 
 @dataclass(frozen=True)
-class Similarity:
+class MapSimilarity:
     """How similar an image is to what the cameras of a map see: the cosine between pooled descriptors, -1 where it has none."""
 
     map: str
@@ -54,7 +54,7 @@ class Placement:
     map: str  # the best answer's, though it may be rejected like all others
     found: Localization
     runner_up: tuple[str, Localization] | None  # the next best answer; None where one map was asked
-    ranking: tuple[Similarity, ...]  # all maps, the most similar first
+    ranking: tuple[MapSimilarity, ...]  # all maps, the most similar first
     asked: tuple[str, ...]  # maps that were asked for a pose, in this order
 
     @property
@@ -124,7 +124,7 @@ class MapCollection:
         self._localizers.move_to_end(name)
         return self._localizers[name]
 
-    def ranked(self, frame: Frame) -> list[Similarity]:
+    def ranked(self, frame: Frame) -> list[MapSimilarity]:
         """Return all maps by their similarity to an image, the most similar first; maps without landmarks come last."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
@@ -137,7 +137,7 @@ class MapCollection:
             cosine = -1.0
             if own is not None and own in vectors:
                 cosine = float((self._pooled[name] @ vectors[own]).max())
-            found.append(Similarity(name, cosine))
+            found.append(MapSimilarity(name, cosine))
         return sorted(found, key=lambda similarity: -similarity.cosine)
 
     def __call__(self, frame: Frame, seed: int = 0) -> Placement:
@@ -190,7 +190,7 @@ class MapCollection:
             self._vocabularies[key] = Vocabulary.of(same)
         for name, found in landmarks.items():
             cameras = cameras_of(self._infos[name])
-            self._pooled[name] = viewpoints(self._vocabularies[self._key[name]], found, cameras)
+            self._pooled[name] = pooled_views(self._vocabularies[self._key[name]], found, cameras)
         if bare := [name for name in self._maps if name not in landmarks]:
             log.info(f"{amount(len(bare), 'map')} without landmarks, asked last: {', '.join(bare)}")
 

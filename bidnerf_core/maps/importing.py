@@ -43,7 +43,7 @@ log = logging.getLogger("bidnerf")
 
 SMALLEST, LARGEST = 0.05, 500.0
 """Metres: longest sides of a scene beyond which its lengths are hardly metres."""
-COMPARED_RAYS = 4096
+RAYS_WITH_DEPTH = 4096
 SAME_LENGTH = 0.03
 """Relative difference between rendered and measured depth that is not worth a word."""
 FEWEST_COMPARED = 200
@@ -172,7 +172,7 @@ def _tell_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
 def _check_photos(scene: Map, views: Sequence[View], where: str) -> None:
     """Raise ``InputError`` for photos that do not show the field, and warn where their depth has another unit."""
     check_alike(scene.info, scene.field, views, where)
-    ratio = depth_ratio(scene.field, scene.bounds, views)
+    ratio = ratio_to_measured_depth(scene.field, scene.bounds, views)
     if ratio is not None and abs(ratio - 1) > SAME_LENGTH:
         warnings.warn(
             f"{where}: the depth that the photos measured is {ratio:.3g} times what the field shows; is its scale another one? The"
@@ -183,13 +183,13 @@ def _check_photos(scene: Map, views: Sequence[View], where: str) -> None:
 
 
 @torch.no_grad()
-def depth_ratio(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float | None:
+def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float | None:
     """Return the median ratio of measured to rendered depth, or None where too few rays have both."""
     measured = [view for view in views if view.frame.has_depth]
     if not measured:
         return None
     generator = torch.Generator().manual_seed(0)
-    count = max(COMPARED_RAYS, len(measured))
+    count = max(RAYS_WITH_DEPTH, len(measured))
     pixels = draw(measured, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
     both = (pixels.distance > 0) & (seen.opacity > OPAQUE)

@@ -34,7 +34,7 @@ HALF = 0.5
 
 
 @dataclass(frozen=True)
-class Photo:
+class ListedPhoto:
     """A photo that can be read: its size as stored, that at which its keypoints are found, and its number of a camera."""
 
     image: SourceImage
@@ -53,7 +53,7 @@ class Photo:
 class Described:
     """The photos that can be read, and why the others cannot."""
 
-    photos: list[Photo]
+    photos: list[ListedPhoto]
     cameras: dict[int, Intrinsics]  # of reduced photos, by number
     known_focal: dict[int, bool]  # whether EXIF or the user states the focal length
     unusable: dict[str, str]  # reasons by name
@@ -61,7 +61,7 @@ class Described:
 
 def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> Described:
     """Read the headers of photos, and group the photos by camera. Raises ``InputError`` for a ``given`` camera that does not fit."""
-    photos, unusable = list[Photo](), dict[str, str]()
+    photos, unusable = list[ListedPhoto](), dict[str, str]()
     for number, image in enumerate(images, start=1):
         try:
             header, exif = read_header(image.file), read_exif(image.file)
@@ -69,7 +69,7 @@ def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | No
             unusable[image.name] = _without_file(error, image)
             continue
         size = (header.width, header.height)
-        photos.append(Photo(image, number, size, reduced_size(*size, LARGEST), exif))
+        photos.append(ListedPhoto(image, number, size, reduced_size(*size, LARGEST), exif))
     numbers: dict[Any, int] = {}
     cameras, known = dict[int, Intrinsics](), dict[int, bool]()
     for place, photo in enumerate(photos):
@@ -81,7 +81,7 @@ def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | No
     return Described(photos, cameras, known, unusable)
 
 
-def _first_guess(photo: Photo, given: Intrinsics | str | Path | None) -> tuple[Intrinsics, bool]:
+def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> tuple[Intrinsics, bool]:
     raster = Raster(*photo.size)
     if given is not None:
         return CameraSource(given).find(photo.image.file, raster).intrinsics, True
@@ -147,7 +147,7 @@ def write_keypoints(
     return unusable
 
 
-def _detected(photos: Sequence[Photo]) -> Iterator[tuple[Photo, Keypoints | InputError]]:
+def _detected(photos: Sequence[ListedPhoto]) -> Iterator[tuple[ListedPhoto, Keypoints | InputError]]:
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         try:
             yield from zip(photos, pool.map(_keypoints, photos), strict=True)
@@ -155,7 +155,7 @@ def _detected(photos: Sequence[Photo]) -> Iterator[tuple[Photo, Keypoints | Inpu
             pool.shutdown(cancel_futures=True)
 
 
-def _keypoints(photo: Photo) -> Keypoints | InputError:
+def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
     """Return the keypoints of the reduced photo, without those on its background."""
     try:
         rgb, alpha = read_image(photo.image.file, size=photo.reduced)

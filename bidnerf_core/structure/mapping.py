@@ -13,7 +13,7 @@ import torch
 from bidnerf_core.captures.up_direction import up_direction
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.structure.keypoints import Described, Photo
+from bidnerf_core.structure.keypoints import Described, ListedPhoto
 from bidnerf_core.structure.matching import Overlaps
 
 LEAST_PHOTOS = 3
@@ -86,7 +86,7 @@ def reconstructed(
     return Models(sorted(good, key=lambda model: (-model.num_reg_images(), -model.num_points3D())))
 
 
-def turn_upright(model: Any, photos: Mapping[int, Photo], pycolmap: Any) -> None:
+def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -> None:
     """Turn the world of a model so that z points up, and move its origin to the middle of the cameras."""
     rotations, centres = [], []
     for number in model.reg_image_ids():
@@ -102,7 +102,7 @@ def turn_upright(model: Any, photos: Mapping[int, Photo], pycolmap: Any) -> None
     model.transform(pycolmap.Sim3d(np.concatenate([R, -(R @ centre)[:, None]], axis=1)))
 
 
-def _upright_axes(photo: Photo) -> tuple[np.ndarray, np.ndarray]:
+def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes to the right and up of the upright photo, in the camera of the photo as stored (x right, y down)."""
     turned = photo.orientation
     x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
@@ -121,7 +121,7 @@ def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
     return found
 
 
-def full_size(model: Any, photos: Mapping[int, Photo]) -> None:
+def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
     """Scale the cameras and keypoints of a model from reduced photos to photos as stored."""
     sizes = {photo.camera: photo for photo in photos.values()}
     for number, photo in sizes.items():
@@ -154,7 +154,7 @@ def left_out(
     return reasons
 
 
-def _reason(photo: Photo, model: int | None, overlaps: Overlaps, keypoints: Mapping[int, int]) -> str:
+def _reason(photo: ListedPhoto, model: int | None, overlaps: Overlaps, keypoints: Mapping[int, int]) -> str:
     count, partners = keypoints.get(photo.number, 0), overlaps.partners[photo.number]
     if model is not None:
         return f"belongs to another model, of {amount(model, 'photo')}, that the largest has no connection to"

@@ -26,7 +26,7 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import converted, from_plain, read_json, to_plain
-from bidnerf_core.structure.keypoints import DETECTOR, Photo
+from bidnerf_core.structure.keypoints import DETECTOR, ListedPhoto
 from bidnerf_core.structure.library import from_colmap
 
 log = logging.getLogger("bidnerf")
@@ -201,7 +201,9 @@ def _has_frames(folder: Path) -> bool:
     return any(isinstance(part, dict) and part.get("video") is True for part in (record, _begun(folder)))
 
 
-def write_dataset(folder: Path, photos: Mapping[int, Photo], model: Any, names: Mapping[int, str]) -> None:
+def write_dataset(
+    folder: Path, photos: Mapping[int, ListedPhoto], model: Any, names: Mapping[int, str]
+) -> None:
     """Write a model, whose cameras are those of the photos as stored, and a ``transforms.json`` of it.
 
     ``photos`` and ``names`` (for the model) are by the number of an image.

@@ -50,11 +50,11 @@ def sample_consensus(
     found = [_single(data, (view == v).nonzero()[:, 0], threshold, seed) for v in views]
     if len(views) > 1:
         found.append(_generalized(data, [(view == v).nonzero()[:, 0] for v in views], threshold, seed))
-    hypotheses = [_judged(data, T, threshold, draws) for T, draws in filter(None, found)]
+    hypotheses = [_scored(data, T, threshold, draws) for T, draws in filter(None, found)]
     return max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)
 
 
-def _judged(data: ObservedPoints, T: SE3, threshold: float, draws: int) -> Candidate:
+def _scored(data: ObservedPoints, T: SE3, threshold: float, draws: int) -> Candidate:
     within = torch.linalg.vector_norm(data.residuals(T), dim=-1) <= threshold
     return Candidate(T, within, draws)
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import MotionPrior
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.map_camera import SAME_CAMERA, SAME_LOG_ODDS, MapCamera
+from bidnerf_core.localization.landmarks.map_camera import SAME_LOG_ODDS, SHARE_SAME_CAMERA, MapCamera
 from bidnerf_core.mapping.geometry.calibration import (
     ANY,
     CALIBRATED,
@@ -142,7 +142,7 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
     else:
         # If the stated intrinsics are those of the map, they are wrong only where the image is from another camera.
         as_map = any(camera.is_near(CALIBRATED) and not bool(camera.differs.any()) for camera in cameras)
-        share = 1 - SAME_CAMERA if as_map else 1.0
+        share = 1 - SHARE_SAME_CAMERA if as_map else 1.0
         wrong = (MISTAKES + CROPS) * share
         other_focal = replace(USUAL, log_focal=MISTAKEN.log_focal)
         own = [

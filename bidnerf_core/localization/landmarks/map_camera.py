@@ -38,9 +38,9 @@ GRID = 7
 """Rows and columns of pixels at which cameras are compared."""
 DISTINGUISHABLE_DEVIATIONS = 2.0
 """Standard deviations of a good calibration by which cameras must differ to be told apart."""
-SAME_CAMERA = 0.9
+SHARE_SAME_CAMERA = 0.9
 """Share of queries with nearly the map's intrinsics that are from the map's camera."""
-SAME_LOG_ODDS = math.log(SAME_CAMERA / (1 - SAME_CAMERA))
+SAME_LOG_ODDS = math.log(SHARE_SAME_CAMERA / (1 - SHARE_SAME_CAMERA))
 OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1, stretch=STRETCH_TOLERANCE / 1.5)
 """Standard deviations of the differences between the intrinsics of different cameras with images of the same shape."""
 RESIZED = 0.05

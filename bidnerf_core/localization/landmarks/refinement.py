@@ -118,7 +118,7 @@ def _refined(
 ) -> GuidedPose:
     """Refine a pose on guided matches, first as the query states its intrinsics, then with the most probable ones."""
     fit, found = _guided(query, query.prior, fit, found, max_distance, RADII)
-    judged = _judged(query, fit, found, fit.calibration)
+    judged = _posterior(query, fit, found, fit.calibration)
     return _explained(GuidedPose(query, matches, fit, found, max_distance, judged, judged.stated), {})
 
 
@@ -140,7 +140,7 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
         data, correlation = seen.observed(inliers), _correlation(seen, inliers)
         fit = resect(data, T, pose.posterior.noise, prior, start, correlation, motion)
         fit, found = _guided(seen, prior, fit, inliers, most, RADII[1:], motion)
-        judged = _judged(pose.query, fit, found, best.calibration).updated(log_odds)
+        judged = _posterior(pose.query, fit, found, best.calibration).updated(log_odds)
         pose = replace(pose, fit=fit, correspondences=found, max_distance=most, posterior=judged, best=best)
     # Of intrinsics that make each other more probable in turn, the last stay.
     return replace(pose, posterior=pose.posterior.with_best(pose.best, pose.fit.T_world_rig))
@@ -154,7 +154,7 @@ def agreeing_with(
     return torch.linalg.vector_norm(off, dim=-1) <= query.threshold
 
 
-def _judged(
+def _posterior(
     query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, calibration: Calibration
 ) -> Posterior:
     landmarks = query.landmarks

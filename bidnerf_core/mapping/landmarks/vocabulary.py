@@ -32,7 +32,7 @@ BLOCK = 2**20
 """Number of distances to centres of cells that are computed at a time, which bounds the memory."""
 VIEWPOINTS = 48
 """Largest number of cameras of a map that are pooled; of more, evenly spaced ones."""
-OBLIQUE_DEG = 10.0
+VISIBLE_BEYOND_DEG = 10.0
 """Angle beyond the cone of directions from which a landmark was seen within which it still counts as visible."""
 FEWEST = 8
 """Number of landmarks below which what a camera sees is not pooled."""
@@ -85,7 +85,7 @@ class Vocabulary:
         return nearest_centre(descriptors, self.words)
 
 
-def viewpoints(
+def pooled_views(
     vocabulary: Vocabulary, landmarks: LandmarkMap, cameras: Sequence[tuple[Intrinsics, SE3]]
 ) -> Float[Tensor, "v p"]:
     """Return the VLAD vectors of what cameras of a map (T_world_camera) see of its landmarks, and of all of them as the last."""
@@ -103,4 +103,4 @@ def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> 
     pose = T_world_camera.to(torch.float32)
     x, y, z = pose.inverse().apply(landmarks.positions).unbind(-1)
     inside = (x.abs() * camera.fx <= z * camera.width / 2) & (y.abs() * camera.fy <= z * camera.height / 2)
-    return inside & (z > 0) & landmarks.facing(pose.translation, math.radians(OBLIQUE_DEG))
+    return inside & (z > 0) & landmarks.facing(pose.translation, math.radians(VISIBLE_BEYOND_DEG))
