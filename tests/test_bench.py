@@ -349,7 +349,7 @@ def test_results_of_other_images_are_refused(
                 iio.imwrite(image, iio.imread(image)[::-1])
         status, err = run(changed)
         assert (status, err.count("\n")) == (1, 1), err
-        assert "made with other images, depth or cameras" in err
+        assert "made with other images, depth, masks or cameras" in err
     assert (tmp_path / "r.jsonl").read_bytes() == before
 
 

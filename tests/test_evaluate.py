@@ -9,6 +9,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 import torch
 
@@ -17,7 +19,7 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation import trials
-from bidnerf_core.evaluation.results import read_results
+from bidnerf_core.evaluation.results import ResultTable, read_results
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.localization.methods import find_method
@@ -152,6 +154,42 @@ def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPa
     bn.evaluate(elsewhere, tiny.views(2), trials=1, **QUICK)
     bn.compare([elsewhere, BLOBS], tiny.views(2), trials=1, method="bid", protocol="bid")
     assert [found.device for found in seen] == ["meta", "meta", "cpu"]
+
+
+def test_masks_hide_parts_of_the_images_in_every_trial(folder: Path, tmp_path: Path) -> None:
+    scene, data, masks = folder / "map", folder / "data", tmp_path / "masks"
+    masks.mkdir()
+    for name in open_dataset(data).frame_names("test"):
+        mask = np.full((tiny.SIZE, tiny.SIZE), 255, np.uint8)
+        mask[:, : tiny.SIZE // 2] = 0
+        iio.imwrite(masks / f"{name}.png", mask)
+    words = [str(scene), str(data), *WORDS, "--trials", "2", "--seed", "5"]
+    for number, more in enumerate(
+        ([], ["--masks", str(masks)], ["--masks", str(masks), "--mask-hides", "white"])
+    ):
+        assert main(["evaluate", *words, *more, "--out", str(tmp_path / f"{number}.jsonl")]) == 0
+    whole, black, white = (read_results([tmp_path / f"{number}.jsonl"]) for number in range(3))
+    assert len({result[0].loss for result in (whole, black, white)}) == 3
+    given = bn.load_map(scene), open_dataset(data, masks=masks)
+    in_memory = bn.evaluate(*given, **QUICK, trials=2, seed=5)
+    again = bn.evaluate(scene, data, **QUICK, trials=2, seed=5, masks=masks)
+    assert [r.T_world_camera for r in in_memory.rows] == [r.T_world_camera for r in black]
+    assert timeless(again.rows) == timeless(black)
+    assert black[0].trial.masks == "masks"
+    labels = {group.label for group in ResultTable((*whole, *black, *white)).groups}
+    assert labels == {"bid, nothing hidden", "bid, black of masks hidden", "bid, white of masks hidden"}
+    compared = bn.compare([scene], data, method="bid", config=QUICK["config"], protocol="bid", size=0.3, trials=2,
+                          seed=5, masks=masks)  # fmt: skip
+    assert timeless(compared.results[0]) == timeless(black)
+
+
+def test_folders_without_masks_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(folder / "map"), str(folder / "data"), "--masks", str(tmp_path)]
+    assert main(["evaluate", *words, "--out", str(tmp_path / "r.jsonl")]) == 1
+    assert "expected masks" in capsys.readouterr().err
+    assert main(["compare", str(folder / "map"), str(folder / "data"), "--mask-hides", "white"]) == 2
 
 
 def test_frames_of_one_name_are_refused() -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from bidnerf_core.cli.camera_options import MaskHides, Masks, mask_folder
 from bidnerf_core.cli.evaluate import read_sizes
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.method_options import Preset, chosen_settings
@@ -49,6 +50,8 @@ def run(arguments: list[str]) -> None:
         ] = None,
         trials: Annotated[int | None, option("N", "number of starts", "the protocol's")] = None,
         method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = "bid",
+        masks: Masks = None,
+        mask_hides: MaskHides = "black",
         seed: Annotated[int | None, option("N", "seed of every random choice", "the protocol's")] = None,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
@@ -65,11 +68,13 @@ def run(arguments: list[str]) -> None:
                 "expected the folders of one or more maps, then that of a dataset"
             )
         *maps, data = folders
+        mask_folder(masks, mask_hides)  # refuses what is no folder of masks
         with wrong_usage():
             plan = Plan(
                 maps[0], data, protocol, read_sizes([] if size is None else [size]) or find_protocol(protocol).sizes[:1],
                 method, changed_settings(method, config), trials, seed, split,
                 tuple(name for group in frame for name in group) or None,
+                masks=None if masks is None else str(masks), mask_hides=mask_hides,
             )  # fmt: skip
         if out is None:
             found = run_comparison(plan, maps, progress=_say)

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from bidnerf_core.cli.camera_options import MaskHides, Masks, mask_folder
 from bidnerf_core.cli.folders import require_outside_maps
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import Device, Names, option, parse, require, wrong_usage
@@ -67,6 +68,8 @@ def run(arguments: list[str]) -> None:
                 "MODEL", "COLMAP sparse model whose points, where frames observe them, are used as depth", ""
             ),
         ] = None,
+        masks: Masks = None,
+        mask_hides: MaskHides = "black",
         fault: Annotated[
             Names,
             option(
@@ -93,11 +96,13 @@ def run(arguments: list[str]) -> None:
         Finished trials are kept whatever happens: the same command resumes where it stopped. 'bidnerf report' makes tables
         and figures of the results.
         """
+        mask_folder(masks, mask_hides)  # refuses what is no folder of masks
         with wrong_usage():
             plan = Plan(
                 map, data or _own_data(map), protocol, read_sizes(size) or None, method, changed_settings(method, config),
                 trials, seed, split, tuple(name for group in frame for name in group) or None, images, angle, device,
-                depth, None if depth_points is None else str(depth_points), tuple(f for group in fault for f in group),
+                depth, None if depth_points is None else str(depth_points), None if masks is None else str(masks), mask_hides,
+                tuple(f for group in fault for f in group),
             )  # fmt: skip
             require("--workers", 1 if workers is None else workers, 1, 10_000)
             require("--shards", shards, 1)

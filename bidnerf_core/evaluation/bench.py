@@ -20,13 +20,14 @@ from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import (
     Opened,
     input_digests,
-    opened,
+    opened_for,
     opened_points,
     parse_settings,
     registered_for,
     run_trial,
     trial_views,
 )
+from bidnerf_core.frames.masks import HiddenColour
 from bidnerf_core.geometry.arcs import arc
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import find_method
@@ -38,7 +39,7 @@ from bidnerf_core.settings import Range, WholeNumbers, to_flat
 log = logging.getLogger("bidnerf")
 
 CHANGED = {
-    "views": "images, depth or cameras than {trial.data} has now",
+    "views": "images, depth, masks or cameras than {trial.data} has now",
     "points": "depth points than {trial.depth_points} has now",
     "surface": "surface than map {trial.map} has now, which was baked anew",
 }
@@ -73,6 +74,8 @@ class Plan:
     device: str = "cpu"
     depth: bool = True  # whether the method gets the measured depth
     depth_points: str | None = None  # see Trial
+    masks: str | None = None  # see Trial
+    mask_hides: HiddenColour = "black"
     faults: tuple[str, ...] = (NO_FAULT,)  # see Trial; each is tried on the same frames from the same starts
 
     def __post_init__(self) -> None:
@@ -94,7 +97,7 @@ def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
 
     ``dataset`` is the one that the plan names; by default it is opened, and the map with it.
     """
-    dataset = dataset or opened(plan.map, plan.data, plan.device)[1]
+    dataset = dataset or opened_for(plan)[1]
     protocol = find_protocol(plan.protocol)
     parse_settings(plan.method, plan.config)
     names = dataset.frame_names(plan.split)
@@ -124,6 +127,8 @@ def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
             device=plan.device,
             depth=plan.depth,
             depth_points=plan.depth_points,
+            masks=plan.masks,
+            mask_hides=plan.mask_hides,
             fault=fault,
         )
         for fault in plan.faults
@@ -214,7 +219,7 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None
     digests: dict[Any, dict[str, Any]] = {}
     for trial in trials:
         known = file.results[key_of(trial)]
-        stored, dataset = scene or opened(trial.map, trial.data, trial.device)
+        stored, dataset = scene or opened_for(trial)
         advice = "name another --out, or remove the file to begin anew"
         if known.weights != stored.training:
             raise InputError(
@@ -258,7 +263,7 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
         return [(name,) for name in kept]
     if isinstance(dataset, ClosedFormData):
         return [dataset.sequence(name, plan.images, plan.angle) for name in kept]
-    rigs = list(_found_sequences(plan, dataset, names, kept))
+    rigs = list(_found_sequences(plan, dataset, kept))
     if not rigs:
         raise InputError(
             f"{plan.data}: no frame of split {plan.split!r} ends a sequence of {plan.images} frames "
@@ -282,11 +287,12 @@ def check_points(plan: Plan, trials: Sequence[Trial], scene: Opened) -> None:
         )
 
 
-def _found_sequences(
-    plan: Plan, dataset: Dataset, names: list[str], kept: list[str]
-) -> Iterator[tuple[str, ...]]:
-    poses = [view.T_ref_camera for view in dataset.views(plan.split)]
+def _found_sequences(plan: Plan, dataset: Dataset, kept: list[str]) -> Iterator[tuple[str, ...]]:
+    poses = {view.frame.name: view.T_ref_camera for view in dataset.views(plan.split)}
+    names = list(poses)  # without those that masks hide altogether
     for name in kept:
-        places = arc(poses, names.index(name), plan.images, plan.angle)
+        places = (
+            arc(list(poses.values()), names.index(name), plan.images, plan.angle) if name in poses else None
+        )
         if places is not None:
             yield tuple(names[place] for place in places)

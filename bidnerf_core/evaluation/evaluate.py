@@ -28,10 +28,11 @@ from bidnerf_core.evaluation.protocols import Size, find_protocol
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
 from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
 from bidnerf_core.evaluation.trial import Trial
-from bidnerf_core.evaluation.trials import Opened, open_data, open_map
+from bidnerf_core.evaluation.trials import Opened, open_data, open_map, with_masks
 from bidnerf_core.evaluation.workers import workers_for
 from bidnerf_core.fields.contract import device_of
 from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.masks import HiddenColour
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.map import Map
@@ -59,6 +60,8 @@ def evaluate(
     split: str = "test",
     frames: Sequence[str] | None = None,
     depth: bool = True,
+    masks: str | Path | None = None,
+    mask_hides: HiddenColour = "black",
     faults: Sequence[str] = (),
     device: str = "cpu",
     workers: int | None = 1,
@@ -71,7 +74,8 @@ def evaluate(
     ``protocol`` chooses frames, seeds and starts; ``sizes`` are the errors of the start in its units, ``trials`` is the number
     of trials of each size, and None stands for the protocol's own. ``config`` holds the method's settings: an instance of its
     type, or a dictionary of those that differ from the defaults. ``faults`` are applied to the images, such as
-    ``"depth-scale:1.02"``. ``device`` is that of a map that is read from a folder.
+    ``"depth-scale:1.02"``. ``masks`` is a folder of masks of the images, in which ``mask_hides`` is the colour of what is not
+    used. ``device`` is that of a map that is read from a folder.
 
     ``out`` is a file of results: a trial that it holds is not run again, and each result is on disk before the next trial
     begins, so that an evaluation that was interrupted or cancelled goes on with the same call. ``workers`` is the number of
@@ -87,14 +91,14 @@ def evaluate(
         map=_name(scene), data=_name(data), protocol=protocol, sizes=_sizes(sizes), method=method,
         config=_config(method, config), trials=trials, seed=seed, split=split,
         frames=None if frames is None else tuple(frames), device=_device(scene, device), depth=depth,
-        faults=tuple(faults),
+        masks=None if masks is None else str(masks), mask_hides=mask_hides, faults=tuple(faults),
     )  # fmt: skip
     in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
     if in_memory and workers not in (1, None):
         raise InputError(
             f"workers is {workers}, expected 1: other processes read the map and the data from folders, and these are in memory"
         )
-    opened = _opened(scene, data, device) if in_memory else None
+    opened = _opened(scene, data, plan) if in_memory else None
     return run_plan(
         plan, opened, workers=1 if in_memory else workers, out=out, progress=progress, cancel=cancel
     )
@@ -120,7 +124,7 @@ def run_plan(
     """
     if dask is not None and workers not in (1, None):
         raise InputError("workers and dask contradict each other: a cluster has its own workers")
-    opened = scene or _opened(plan.map, plan.data, plan.device)
+    opened = scene or _opened(plan.map, plan.data, plan)
     every = planned(plan, opened[1])
     check_points(plan, every, opened)
     if repeated := repeated_frames(every):
@@ -160,6 +164,8 @@ def compare(
     split: str = "test",
     frames: Sequence[str] | None = None,
     depth: bool = True,
+    masks: str | Path | None = None,
+    mask_hides: HiddenColour = "black",
     device: str = "cpu",
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
@@ -176,6 +182,7 @@ def compare(
         sizes=find_protocol(protocol).sizes[:1] if size is None else _sizes([size]), method=method,
         config=_config(method, config), trials=trials, seed=seed, split=split,
         frames=None if frames is None else tuple(frames), device=device, depth=depth,
+        masks=None if masks is None else str(masks), mask_hides=mask_hides,
     )  # fmt: skip
     return run_comparison(plan, scenes, data, progress=progress, cancel=cancel)
 
@@ -201,10 +208,10 @@ def run_comparison(
         raise InputError("no maps to compare, expected at least one")
     data = plan.data if data is None else data
     opened = {
-        name: _opened(scene, data, plan.device) if isinstance(scene, Map) or not isinstance(data, str | Path) else None
+        name: _opened(scene, data, plan) if isinstance(scene, Map) or not isinstance(data, str | Path) else None
         for name, scene in named.items()
     }  # fmt: skip
-    dataset = next((known[1] for known in opened.values() if known is not None), None) or _dataset(data)
+    dataset = next((known[1] for known in opened.values() if known is not None), None) or _dataset(data, plan)
     places = [name if opened[name] is not None else str(scene) for name, scene in named.items()]
     devices = [_device(scene, plan.device) for scene in named.values()]
     starts = [
@@ -267,15 +274,19 @@ def _where(file: ResultsFile) -> str:
     return "" if file.path is None else f" in {file.path}"
 
 
-def _opened(scene: Scene, data: Data, device: str) -> Opened:
+def _opened(scene: Scene, data: Data, plan: Plan) -> Opened:
     """Return the map and the dataset, each read from its folder unless it is in memory."""
-    stored = scene if isinstance(scene, Map) else open_map(str(scene), device)
-    return stored, _dataset(data, stored)
+    stored = scene if isinstance(scene, Map) else open_map(str(scene), plan.device)
+    return stored, _dataset(data, plan, stored)
 
 
-def _dataset(data: Data, stored: Map | None = None) -> Dataset:
+def _dataset(data: Data, plan: Plan, stored: Map | None = None) -> Dataset:
     if isinstance(data, str | Path):
-        return open_data(str(data), stored)
+        return open_data(str(data), stored, plan.masks, plan.mask_hides)
+    return with_masks(_in_memory(data), plan.masks, plan.mask_hides)
+
+
+def _in_memory(data: Dataset | Sequence[View]) -> Dataset:
     if isinstance(data, Dataset):
         return data
     views = tuple(view for view in data if isinstance(view, View)) if isinstance(data, Sequence) else ()

@@ -46,10 +46,16 @@ class Condition:
     device: str
     depth: bool
     depth_points: str | None = None
+    hidden: str | None = None  # the colour of masks, and their folder
 
     def facts(self) -> dict[str, Any]:
         """Return all properties that distinguish conditions, by name."""
-        own = {"images": self.images, "depth": self.depth, "depth_points": self.depth_points}
+        own = {
+            "images": self.images,
+            "depth": self.depth,
+            "depth_points": self.depth_points,
+            "hidden": self.hidden,
+        }
         own |= {"backend": self.backend, "device": self.device}
         return {"method": self.method, **own, **parse_json(self.settings, "settings", "an object")}
 
@@ -107,8 +113,9 @@ def condition_of(result: TrialResult) -> Condition:
     trial, settings = result.trial, json.dumps(result.settings, sort_keys=True)
     images = len(trial.frames)
     return Condition(
-        result.method, settings, images, result.backend, trial.device, trial.depth, trial.depth_points
-    )
+        result.method, settings, images, result.backend, trial.device, trial.depth, trial.depth_points,
+        None if trial.masks is None else f"{trial.mask_hides} of {trial.masks}",
+    )  # fmt: skip
 
 
 def condition_labels(conditions: Sequence[Condition]) -> dict[Condition, str]:
@@ -161,6 +168,8 @@ def _said(name: str, value: Any) -> str:
         return "RGB-D" if value else "RGB"
     if name == "depth_points":
         return "no points" if value is None else f"points of {value}"
+    if name == "hidden":
+        return "nothing hidden" if value is None else f"{value} hidden"
     if name in ("backend", "device"):
         return str(value)
     shown = f"{value:g}" if isinstance(value, float) else "none" if value is None else str(value).lower()

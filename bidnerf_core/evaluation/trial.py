@@ -18,6 +18,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.masks import HiddenColour
 from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import PoseError
@@ -45,10 +46,12 @@ class Trial:
     device: str = "cpu"  # the map's device
     depth: bool = True  # whether the method gets the measured depth
     depth_points: str | None = None  # folder of a COLMAP model whose points the method gets as depth rays
+    masks: str | None = None  # folder of masks of the images, see ``MaskFolder``
+    mask_hides: HiddenColour = "black"
     fault: str = "none"  # faults of the images and their sizes, such as depth-scale:1.02+exposure:0.7
 
     def __post_init__(self) -> None:
-        for name in ("map", "data", "depth_points"):
+        for name in ("map", "data", "depth_points", "masks"):
             if "\0" in (getattr(self, name) or ""):
                 raise InputError(f"{name} holds a NUL character, expected the name of a folder")
 
@@ -61,7 +64,8 @@ class Trial:
     def portable(self) -> Trial:
         """This trial with the names of folders instead of their paths, which differ from machine to machine."""
         points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
-        return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points)
+        masks = None if self.masks is None else _name(self.masks)
+        return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points, masks=masks)
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 from torch import Tensor
 
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Dataset, MaskFolder, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.datasets.masked import MaskedDataset
 from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty, parse_faults
@@ -33,6 +34,7 @@ from bidnerf_core.evaluation.trial import (
     views_digest,
 )
 from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.masks import HiddenColour
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import from_plain, parse_record, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
@@ -43,6 +45,9 @@ from bidnerf_core.results.answers import plain_localization
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
+
+if TYPE_CHECKING:
+    from bidnerf_core.evaluation.bench import Plan
 
 Opened: TypeAlias = tuple[Map, Dataset]
 """A map, and a dataset of the same scene."""
@@ -60,7 +65,7 @@ def run_trial(
     """
     require_registered(registered)
     with one_thread():
-        stored, dataset = scene or opened(trial.map, trial.data, trial.device)
+        stored, dataset = scene or opened_for(trial)
         views = trial_views(trial, dataset)
         truth, start = views[-1].T_ref_camera, start_of(trial, views, dataset)
         settings = parse_settings(trial.method, trial.config)
@@ -128,26 +133,51 @@ def open_map(name: str, device: str = "cpu") -> Map:
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
 
-def open_data(name: str, stored: Map | None = None) -> Dataset:
-    """Return the dataset of a folder, or of a closed-form scene; a map gives the colour behind its images."""
+def open_data(
+    name: str, stored: Map | None = None, masks: str | None = None, hides: HiddenColour = "black"
+) -> Dataset:
+    """Return the dataset of a folder, or of a closed-form scene; a map gives the colour behind its images.
+
+    Masks of the folder ``masks`` hide parts of the images.
+    """
     if is_closed_form(name):
-        return closed_form_data(name)
-    return open_dataset(name, None if stored is None else stored.bounds.background)
+        return with_masks(closed_form_data(name), masks, hides)
+    found = open_dataset(name, None if stored is None else stored.bounds.background)
+    return with_masks(found, masks, hides)
 
 
-def opened(map_name: str, data_name: str, device: str = "cpu") -> Opened:
+def with_masks(dataset: Dataset, masks: str | None, hides: HiddenColour = "black") -> Dataset:
+    """Return the dataset, whose images hide what the masks of a folder hide if one is given."""
+    return dataset if masks is None else MaskedDataset(dataset, MaskFolder(masks, hides))
+
+
+def opened(
+    map_name: str,
+    data_name: str,
+    device: str = "cpu",
+    masks: str | None = None,
+    hides: HiddenColour = "black",
+) -> Opened:
     """Return the map and the dataset of these names, which are read once per process unless the map has changed since."""
     try:
         file = os.stat(Path(map_name) / DESCRIPTION)
     except OSError:  # a closed-form scene, or no map, which is found out below
-        return _opened(map_name, data_name, device, None)
-    return _opened(map_name, data_name, device, (file.st_ino, file.st_mtime_ns))
+        return _opened(map_name, data_name, device, masks, hides, None)
+    return _opened(map_name, data_name, device, masks, hides, (file.st_ino, file.st_mtime_ns))
+
+
+def opened_for(work: Trial | Plan) -> Opened:
+    """Return the map and the dataset that a trial or a plan names, as ``opened`` does."""
+    return opened(work.map, work.data, work.device, work.masks, work.mask_hides)
 
 
 @lru_cache(maxsize=4)
-def _opened(map_name: str, data_name: str, device: str, version: tuple[int, int] | None) -> Opened:
+def _opened(
+    map_name: str, data_name: str, device: str, masks: str | None, hides: HiddenColour,
+    version: tuple[int, int] | None,
+) -> Opened:  # fmt: skip
     stored = open_map(map_name, device)
-    return stored, open_data(data_name, stored)
+    return stored, open_data(data_name, stored, masks, hides)
 
 
 @lru_cache(maxsize=4)

@@ -19,7 +19,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trials import Opened, opened, parse_settings, registered_for, run_trial
+from bidnerf_core.evaluation.trials import Opened, opened_for, parse_settings, registered_for, run_trial
 from bidnerf_core.fields.contract import device_of, levels
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import draw, uniform
@@ -144,7 +144,7 @@ def measured(
 
 def samples_per_ray(trial: Trial, scene: Opened | None = None) -> float:
     """Return the mean number of valid samples on uniformly drawn rays."""
-    stored, dataset = scene or opened(trial.map, trial.data, trial.device)
+    stored, dataset = scene or opened_for(trial)
     (view,) = dataset.views(trial.split, trial.frames[-1:])
     number = to_flat(parse_settings(trial.method, trial.config)).get("level")
     level = stored.field if number is None else levels(stored.field)[number]
