@@ -52,7 +52,7 @@ BASIN = 1.0
 """Deviation of a pose by landmarks, in pixels, beyond which rays may lead from there to a wrong pose."""
 THOROUGHLY = 4
 """Factor on the number of rays from there."""
-FUSED_RAYS = 512
+COMPARED_RAYS = 512
 """Largest number of rays by which they are compared."""
 STARTS = 64
 """Number of poses, drawn from the landmarks' prior, from which the best one is refined then."""
@@ -223,7 +223,7 @@ def _vague_start(
         drawn_rays(
             problem, count, measurements.prior.pivot, Generator().manual_seed(seed), by_depth, loss="huber"
         )
-        for count in (min(rays, FUSED_RAYS), rays // 2)
+        for count in (min(rays, COMPARED_RAYS), rays // 2)
     )
     near = nearby_start(measurements, few, STARTS, Generator().manual_seed(seed))
     return fused_pose(replace(measurements, rays=many), STEPS, near)
