@@ -217,7 +217,8 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
     if taken and _is_cropped(raster, taken):
         size = f"{raster.width}x{raster.height}"
         raise InputError(
-            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}"
+            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}, "
+            "or assumed= with a map's cameras"
         )
     return _by_exif(where, raster, exif, raster.size)
 

@@ -46,9 +46,7 @@ OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1, stretch=
 RESIZED = 0.05
 """Share of resized images among those whose pixels have another aspect ratio than the map's images at their size would have."""
 MAX_DEVIATIONS = 1.5
-"""Intrinsics that differ by more than this multiple of ``OTHER_CAMERA``, or of ``NOMINAL`` where the focal length is
-approximate, are certainly those of another camera.
-"""
+"""Multiple of the standard deviations of a prior beyond which a difference of intrinsics does not agree with it."""
 
 
 @dataclass(frozen=True, eq=False)
