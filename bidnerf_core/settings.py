@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import math
 import typing
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import Annotated, Any, TypeVar, cast
@@ -71,15 +71,21 @@ def _written(limit: float) -> str:
 # Compared and hashed by identity, since the command line's parser hashes it and a table is not hashable.
 @dataclass(frozen=True, eq=False)
 class OneOf:
-    """The names that a setting accepts: the keys of a table, which users may extend."""
+    """The names or numbers that a setting accepts: the keys of a table, which users may extend."""
 
-    table: Mapping[str, Any]
+    table: Mapping[Any, Any]
 
     def __contains__(self, value: object) -> bool:
-        return isinstance(value, Hashable) and value in self.table
+        return any(
+            isinstance(value, type(known))
+            and value == known
+            and isinstance(value, bool)
+            == isinstance(known, bool)  # True is 1, but not where a number is expected
+            for known in self.table
+        )
 
     def __str__(self) -> str:
-        return f"one of {', '.join(self.table)}"
+        return f"one of {', '.join(map(str, self.table))}"
 
 
 @dataclass(frozen=True)

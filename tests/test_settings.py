@@ -80,6 +80,25 @@ def test_names_are_those_of_a_literal_or_of_a_table_that_may_grow(monkeypatch: p
     assert Outer(entry="second").entry == "second"
 
 
+@dataclass(frozen=True)
+class Numbers(Settings):
+    degree: Literal[0, 1, 2, "auto"] = 2
+    shift: Literal[-1, 1] | None = None
+
+
+def test_literals_may_be_numbers_or_mixed() -> None:
+    assert Numbers(degree="auto", shift=-1) == from_flat(Numbers, {"degree": "auto", "shift": -1}, "here")
+    for wrong in (3, "1", True, [1], 1.0):
+        with pytest.raises(
+            InputError, match=rf"^degree is {re.escape(repr(wrong))}, expected one of 0, 1, 2, auto$"
+        ):
+            Numbers(degree=wrong)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match=r"^here: degree: found .*, expected 0 or 1 or 2 or 'auto'$"):
+            from_flat(Numbers, {"degree": wrong}, "here")
+    with pytest.raises(InputError, match=r"^shift is 0, expected one of -1, 1$"):
+        Numbers(shift=0)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     "values",
     [{"rays": "8"}, {"rays": None}, {"entry": None}, {"entry": ["first"]}, {"name": {}}, {"some": "3"}],

@@ -190,7 +190,9 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 def converted(kind: Any, value: Any, where: str) -> Any:
     """Convert ``value``, as read from JSON, to the type ``kind``. Errors begin with ``where``."""
     origin, arguments, is_dataclass = _form(kind)
-    if kind is Any or (origin is typing.Literal and value in arguments):
+    if kind is Any:
+        return value
+    if origin is typing.Literal and any(type(value) is type(known) and value == known for known in arguments):
         return value
     if is_dataclass:
         return from_plain(typing.cast(type, kind), value, where)
