@@ -7,8 +7,7 @@ import functools
 import itertools
 import json
 import math
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from bidnerf_core.maps.map import load_map
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
+from interruptions import FULL, Stopped, outcomes, striking
 
 BOUNDS = SceneBounds((-0.1, -1 / 3, -1.0), (1.0, 2 / 3, 1e-17), 0.1, 5.0, (1.0, 0.5, 0.0))
 
@@ -145,45 +145,6 @@ def test_old_files_are_removed_and_others_are_left_alone(tmp_path: Path) -> None
 
 # Whenever the writing stops, the folder holds one whole map.
 
-FULL = OSError(errno.ENOSPC, "No space left on device")
-
-
-class Stopped(BaseException):
-    """An interruption such as Ctrl-C, which is no ``Exception``."""
-
-
-def outcomes(attempt: Callable[[], object], error: BaseException) -> Iterator[BaseException | None]:
-    """What ``attempt`` raises when ``error`` strikes in its first system call that writes, in its second ..., until
-    there is no such call left.
-    """
-    for number in itertools.count():
-        calls: list[object] = []
-        with pytest.MonkeyPatch.context() as patch:
-            for owner, name in ((Path, "open"), (Path, "replace"), (os, "fsync")):
-                patch.setattr(owner, name, _striking(getattr(owner, name), calls, number, error))
-            try:
-                attempt()
-                raised = None
-            except (OSError, Stopped) as caught:
-                raised = caught
-        yield raised
-        if len(calls) <= number:
-            return
-
-
-def _striking(
-    call: Callable[..., Any], calls: list[object], number: int, error: BaseException
-) -> Callable[..., Any]:
-    def wrapper(*arguments: Any, **options: Any) -> Any:
-        if call.__name__ == "open" and "wb" not in arguments:
-            return call(*arguments, **options)
-        calls.append(call)
-        if len(calls) == number + 1:
-            raise error
-        return call(*arguments, **options)
-
-    return wrapper
-
 
 @pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
 @pytest.mark.parametrize("complete", [True, False], ids=["complete", "checkpoint"])
@@ -259,7 +220,7 @@ def test_a_damaged_description_makes_no_save_remove_anything(
     (tmp_path / "map.json").write_text("{")
     before = names(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", _striking(Path.replace, [], 0, FULL))
+        patch.setattr(Path, "replace", striking(Path.replace, [], 0, FULL))
         with pytest.raises(OSError, match="No space left"):
             save_map(tmp_path, info(step=6), state(6))
     assert names(tmp_path) == before

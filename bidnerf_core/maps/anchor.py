@@ -8,8 +8,10 @@ axis) say how well the anchor itself is known.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +28,8 @@ from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, read_json, to_plain
 
 ANCHOR = "anchor.json"
+NEWER = re.compile(r"anchor-\d{8,}-[0-9a-f]{8}\.json")
+"""Names of anchors that are about to take the place of ``anchor.json``, see ``MapInfo.anchor``."""
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -87,20 +91,46 @@ class Anchor:
         return SE3(inside.rotation, inside.translation / self.metres_per_unit)
 
 
-def load_anchor(folder: Path) -> Anchor | None:
-    """Return the anchor in the folder of a map, or None where there is none. Raises ``InputError`` for a damaged one."""
-    path = folder / ANCHOR
+def load_anchor(folder: Path, newer: str | None = None) -> Anchor | None:
+    """Return the anchor in the folder of a map, or None where there is none. Raises ``InputError`` for a damaged one.
+
+    ``newer`` is the name of the file that counts in place of ``anchor.json`` if it exists, see ``MapInfo.anchor``.
+    """
+    path = folder / ANCHOR if newer is None or not (folder / newer).exists() else folder / newer
     if not path.exists():
         return None
     try:
-        return from_plain(Anchor, read_json(path, "the anchor of a map"), str(path))
+        found = read_json(path, "the anchor of a map")
+        return None if found is None and path.name == newer else from_plain(Anchor, found, str(path))
     except InputError as error:
         raise InputError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
 
 
 def save_anchor(folder: Path, anchor: Anchor) -> None:
     """Write an anchor into the folder of a map, replacing an earlier one."""
-    write_file(folder / ANCHOR, (json.dumps(anchor.plain(), indent=1, allow_nan=False) + "\n").encode())
+    write_file(folder / ANCHOR, anchor_bytes(anchor))
+    for file in folder.iterdir():
+        if NEWER.fullmatch(file.name):
+            file.unlink()
+
+
+def anchor_bytes(anchor: Anchor | None) -> bytes:
+    """Return the content of a file with an anchor; None says that there is none."""
+    plain = None if anchor is None else anchor.plain()
+    return (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode()
+
+
+def put_in_place(folder: Path, newer: str) -> None:
+    """Let the anchor in file ``newer``, which ``map.json`` names, take the place of ``anchor.json``.
+
+    Where this stops in between, ``newer`` still exists and counts.
+    """
+    with contextlib.suppress(OSError, InputError):
+        if read_json(folder / newer, "the anchor of a map") is not None:
+            (folder / newer).replace(folder / ANCHOR)
+            return
+        (folder / ANCHOR).unlink(missing_ok=True)
+        (folder / newer).unlink()
 
 
 def scaled_anchor(anchor: Anchor, factor: float) -> Anchor:

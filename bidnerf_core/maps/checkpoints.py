@@ -58,7 +58,9 @@ class Checkpoints:
     def save(self, state: TrainingState) -> None:
         seconds = self._earlier + time.monotonic() - self._began
         info = replace(self.info, step=state.step, complete=state.step >= self._total, seconds=seconds)
-        self.info = info if self.folder is None else save_map(self.folder, info, state)
+        if self.folder is not None:  # the first save may replace another map, whose anchor does not count
+            info = save_map(self.folder, info, state, anchor="kept" if info.weights else None)
+        self.info = info
         self._saved = time.monotonic()
 
     def finish(self, field: RadianceField) -> None:

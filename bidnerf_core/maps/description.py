@@ -66,6 +66,7 @@ class MapInfo:
     landmark_source: LandmarkSource | None = None  # the images they were built from, where that is recorded
     landmark_features: str = USUAL_FEATURES  # name of the detector whose keypoints they are
     capture: str | None = None  # record of the photos that gave the landmarks
+    anchor: str | None = None  # takes the place of ``anchor.json`` while a file of this name exists
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
@@ -105,7 +106,7 @@ def load_info(folder: Path) -> MapInfo:
         advice = "it was written by a newer bidnerf, update yours" if newer else "train the map anew"
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
     info = from_plain(MapInfo, found, str(path))
-    for name in (info.weights, info.training, info.surface, info.landmarks, info.capture):
+    for name in (info.weights, info.training, info.surface, info.landmarks, info.capture, info.anchor):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
     for name in with_wrong_pose(info.cameras):

@@ -299,7 +299,7 @@ def _extended(
     check_cancelled(cancel, "extending")
     state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
     here = grown.to("cpu")
-    stored = save_map(scene.folder, info, state, here.surface, here.landmarks, record)
+    stored = save_map(scene.folder, info, state, here.surface, here.landmarks, record, "kept")
     return replace(grown, info=stored, folder=scene.folder)
 
 

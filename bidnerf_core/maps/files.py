@@ -1,7 +1,8 @@
 """The files of a map: JSON and safetensors, which cannot run code when they are read.
 
 ``map.json`` describes the map and names the files of its tensors. Files are written under new names first and
-``map.json`` is replaced atomically at the end: whenever writing stops, the folder holds one complete map.
+``map.json`` is replaced atomically at the end: whenever writing stops, the folder holds one complete map. Only ``anchor.json``
+has a fixed name, since users write it: a new one counts from its own file, which ``map.json`` names, until it is renamed.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors.torch import save as tensors_to_bytes
@@ -37,14 +38,13 @@ from bidnerf_core.mapping import (
     surface_from_tensors,
     surface_tensors,
 )
+from bidnerf_core.maps.anchor import ANCHOR, NEWER, Anchor, anchor_bytes, put_in_place
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, LandmarkSource, MapInfo, load_info
 from bidnerf_core.maps.weights import checked_weights
 from bidnerf_core.training import TrainingState
 
-PART_NAMES = ("weights", "training", "surface", "landmarks", "capture")
-PARTS = (
-    r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
-)
+PART_NAMES = ("weights", "training", "surface", "landmarks", "capture", "anchor")
+PARTS = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
 BAKED = "a safetensors file, which 'bidnerf bake' writes anew"
 OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind; other files in the folder are never removed."""
@@ -53,10 +53,12 @@ OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 def save_map(
     folder: Path, info: MapInfo, state: TrainingState, surface: SurfaceMap | None = None,
     landmarks: LandmarkMap | None = None, capture: CaptureReport | None = None,
+    anchor: Anchor | Literal["kept"] | None = None,
 ) -> MapInfo:  # fmt: skip
     """Write a map, and remove the files of an earlier one once the new one is completely written.
 
-    Parts that are not given, such as a surface that was baked from earlier weights, are dropped from the description.
+    Parts that are not given, such as a surface that was baked from earlier weights, are dropped from the description, and so is
+    the anchor, which is that of the earlier map unless it is "kept".
     """
     parts: dict[str, Callable[[], bytes]] = {"weights": lambda: tensors_to_bytes(packed(state.field))}
     if not info.complete:
@@ -70,11 +72,14 @@ def save_map(
         info = replace(info, landmark_source=None, colour_noise=None)
     if capture is not None:
         parts["capture"] = lambda: _json(capture)
+    if not isinstance(anchor, str) and (anchor is not None or (folder / ANCHOR).exists()):
+        parts["anchor"] = lambda: anchor_bytes(anchor)
     names = {part: _file_name(part, state.step) for part in parts}
     named: dict[str, Any] = dict.fromkeys(PART_NAMES) | names
     info = replace(info, **named)
     description = _json(info)
     folder.mkdir(parents=True, exist_ok=True)
+    _finish_anchor(folder)  # of a save that was stopped: the new description will no longer name it
     try:
         for part, content in parts.items():
             write_file(folder / names[part], content())
@@ -200,7 +205,7 @@ def _described(folder: Path) -> str | None:
 
 def _file_name(part: str, step: int) -> str:
     """Return a new name for a file of a map; ``OURS`` recognises it."""
-    ending = "json" if part == "capture" else "safetensors"
+    ending = "json" if part in ("capture", "anchor") else "safetensors"
     return f"{part}-{step:08d}-{secrets.token_hex(4)}.{ending}"
 
 
@@ -208,13 +213,24 @@ def _json(value: Any) -> bytes:
     return json.dumps(to_plain(value), indent=1, allow_nan=False).encode()
 
 
-def _sweep(folder: Path) -> None:
-    """Remove the files of earlier and of interrupted saves that ``map.json`` does not name."""
+def _finish_anchor(folder: Path) -> set[str] | None:
+    """Put the anchor in place that ``map.json`` names, and return all files that it names; None where it is damaged."""
     exists = os.path.lexists(folder / DESCRIPTION)
     try:
         found = read_json(folder / DESCRIPTION, "the description of a map") if exists else {}
-        kept = {found.get(name) for name in PART_NAMES}
-    except (InputError, AttributeError):  # damaged: which files are in use is unknown
+        named = {name: found.get(name) for name in PART_NAMES}
+    except (InputError, AttributeError):
+        return None
+    newer = named["anchor"]
+    if isinstance(newer, str) and NEWER.fullmatch(newer):
+        put_in_place(folder, newer)
+    return {name for name in named.values() if isinstance(name, str)}
+
+
+def _sweep(folder: Path) -> None:
+    """Remove the files of earlier and of interrupted saves that ``map.json`` does not name."""
+    kept = _finish_anchor(folder)
+    if kept is None:
         return
     for file in list(folder.iterdir()):
         if OURS.fullmatch(file.name) and file.name not in kept:

@@ -28,7 +28,7 @@ from bidnerf_core.io.json import from_plain
 from bidnerf_core.io.tensors import read_tensors
 from bidnerf_core.localization.problem import on_device
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedViews, find_features
-from bidnerf_core.maps.anchor import Anchor, load_anchor, save_anchor
+from bidnerf_core.maps.anchor import Anchor, load_anchor
 from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
 from bidnerf_core.maps.files import (
@@ -298,13 +298,11 @@ class Map:
             state = load_state(self.folder, self.info, self.field)
         whole = self.whole()
         here = whole.to("cpu")
-        info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture)
-        if self.anchor is not None:
-            save_anchor(folder, self.anchor)
+        info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture, whole.anchor)
         return replace(whole, info=info, folder=folder, record=self.capture)
 
     def whole(self) -> Map:
-        """Return the map with the baked parts of its folder that were left unread."""
+        """Return the map with the parts of its folder that were left unread, or added since."""
         if self.folder is None:
             return self
         surface, landmarks = self.surface, self.landmarks
@@ -312,7 +310,8 @@ class Map:
             surface = load_surface(self.folder / self.info.surface)
         if landmarks is None and self.info.landmarks is not None:
             landmarks = _with_cameras(load_landmarks(self.folder / self.info.landmarks), self.info)
-        return replace(self, surface=surface, landmarks=landmarks)
+        anchor = self.anchor or load_anchor(self.folder, self.info.anchor)
+        return replace(self, surface=surface, landmarks=landmarks, anchor=anchor)
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
@@ -322,13 +321,13 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     or a damaged one.
     """
     folder = Path(folder)
-    info, tensors, surface, landmarks = _read(folder, baked)
+    info, tensors, surface, landmarks, anchor = _read(folder, baked)
     if info.interruption is not None:
         log.info(f"{folder}: {info.interruption}")
     field = frozen_field(info, tensors, folder)
     if landmarks is not None:
         landmarks = _with_cameras(landmarks, info)
-    return Map(info, field, surface, landmarks, folder, anchor=load_anchor(folder)).to(device)
+    return Map(info, field, surface, landmarks, folder, anchor=anchor).to(device)
 
 
 def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
@@ -384,15 +383,19 @@ def _outline(backend: Backend, info: MapInfo, where: str) -> RadianceField | Non
 
 def _read(
     folder: Path, baked: bool
-) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None]:
+) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None, Anchor | None]:
     """Return parts that belong to the same map, even while a training replaces them."""
     info = load_info(folder)
     while True:
         try:
+            anchor = load_anchor(folder, info.anchor)
+            if anchor is not None and (now := load_info(folder)) != info:  # which had another anchor
+                info = now
+                continue
             weights = read_tensors(folder / info.weights, EXPECTED_PART)
             surface = load_surface(folder / info.surface) if baked and info.surface else None
             landmarks = load_landmarks(folder / info.landmarks) if baked and info.landmarks else None
-            return info, weights, surface, landmarks
+            return info, weights, surface, landmarks, anchor
         except InputError:
             before, info = info, load_info(folder)
             if replace(before, bidnerf="") == replace(info, bidnerf=""):
