@@ -186,6 +186,27 @@ def test_a_folder_of_masks_serves_datasets_and_sequences(tmp_path: Path) -> None
         open_dataset(data, masks=tmp_path / "others")
 
 
+@pytest.mark.parametrize("code", CODES)
+@pytest.mark.parametrize("size", [SIZE, (8, 8)])
+def test_masks_of_turned_photos_serve_sequences_as_they_serve_photos(
+    tmp_path: Path, code: int, size: tuple[int, int]
+) -> None:
+    photo = write_photo(tmp_path / "photos" / "p.png", np.zeros((*size[::-1], 3), np.uint8), code)
+    mask = left(*size)
+    mask[0] = 0
+    path = saved(tmp_path / "masks" / "p.png", mask)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        alone = Frame.open(photo, focal=10.0, mask=path).hidden
+        (timed,) = open_sequence(tmp_path / "photos", focal=10.0, masks=tmp_path / "masks")
+        upright = Frame.open(photo, focal=10.0).rgb.shape[:2]
+    assert alone is not None
+    assert timed.frame.hidden is not None
+    assert torch.equal(alone, Orientation(*CODES[code]).upright(torch.from_numpy(mask == 0)))
+    assert torch.equal(timed.frame.hidden, alone)
+    assert alone.shape == upright
+
+
 def test_frames_take_masks_of_photos_and_arrays(tmp_path: Path) -> None:
     rgb = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     photo, mask = write_photo(tmp_path / "p.png", rgb), saved(tmp_path / "m.png", left())

@@ -77,14 +77,14 @@ def mask_folder(masks: str | Path | MaskFolder) -> MaskFolder:
 
 def masked(frame: Frame, masks: MaskFolder) -> Frame:
     """Return the frame with what its mask hides, by its name. Raises ``InputError`` as ``MaskFolder.hidden`` does."""
-    if not isinstance(frame.lens, CentralLens):
-        size = (frame.intrinsics.width, frame.intrinsics.height)
-        return frame.with_hidden(masks.hidden(frame.name, Raster(*size), size))
-    size = (frame.lens.width, frame.lens.height)  # the mask is of the image before it was undistorted
-    hidden = masks.hidden(frame.name, Raster(*size), size)
-    if hidden is None:
-        return frame
-    return frame.with_hidden(torch.from_numpy(frame.lens.resampled(hidden.byte().numpy(), nearest=True)) > 0)
+    lens = frame.lens if isinstance(frame.lens, CentralLens) else None
+    camera = frame.intrinsics if lens is None else lens  # the mask is of the image before it was undistorted
+    size, orientation = (camera.width, camera.height), frame.orientation
+    stored = orientation.upright_size(*size)  # which exchanges the sides back
+    hidden = masks.hidden(frame.name, Raster(*stored, orientation), size)
+    if hidden is None or lens is None:
+        return frame.with_hidden(hidden)
+    return frame.with_hidden(torch.from_numpy(lens.resampled(hidden.byte().numpy(), nearest=True)) > 0)
 
 
 def masked_sequence(frames: FrameSequence, masks: MaskFolder) -> FrameSequence:

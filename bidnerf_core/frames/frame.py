@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.lenses import Camera, Lens
+from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.depth.images import depth_image
 from bidnerf_core.depth.registration import DepthCamera
@@ -72,6 +73,9 @@ class Frame:
 
     lens: Lens | None = None
     """The lens from whose image those of the frame were resampled on reading, where that was no pinhole camera."""
+
+    orientation: Orientation = UPRIGHT
+    """How the image in its file was turned upright on reading."""
 
     def __post_init__(self) -> None:
         where, camera = f"frame {self.name}", self.intrinsics
@@ -178,6 +182,7 @@ class Frame:
             images,
             camera_source=found.description,
             focal_is_approximate=found.approximate,
+            orientation=photo.raster.orientation,
         )
 
     @staticmethod
