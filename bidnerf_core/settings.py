@@ -21,6 +21,9 @@ from bidnerf_core.io.json import LARGEST_NUMBER, converted, to_plain
 
 S = TypeVar("S")
 
+LARGEST_SEED = 2**31 - 1
+"""Largest seed of programs and requests, which every language holds exactly; Python takes larger ones."""
+
 
 @dataclass(frozen=True)
 class Range:

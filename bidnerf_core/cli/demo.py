@@ -15,7 +15,7 @@ from rich.table import Table
 
 from bidnerf_core.backend import Backend, load_backend, quick_config
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, option, parse, require
+from bidnerf_core.cli.options import DEFAULT_BACKEND, Flag, option, parse, require
 from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c, timed
 from bidnerf_core.errors import InputError, UsageError
@@ -34,6 +34,7 @@ from bidnerf_core.results.overlays import Painter, save_gif
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.settings import LARGEST_SEED
 
 PHOTO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5

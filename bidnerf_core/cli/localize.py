@@ -24,7 +24,7 @@ from bidnerf_core.cli.camera_options import (
 from bidnerf_core.cli.folders import check_output, check_pose_file, make_folder
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.method_options import Preset, chosen_settings
-from bidnerf_core.cli.options import LARGEST_SEED, Flag, MapFolder, Names, option, parse, require
+from bidnerf_core.cli.options import Flag, MapFolder, Names, option, parse, require
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
@@ -52,6 +52,7 @@ from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
 from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations
 from bidnerf_core.results.overlays import overlay
 from bidnerf_core.results.pose_files import OPENCV_AXES, pose_format, read_poses
+from bidnerf_core.settings import LARGEST_SEED
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
 

@@ -23,7 +23,6 @@ from bidnerf_core.errors import InputError, UsageError, printable
 _T = TypeVar("_T")
 
 DEFAULT_BACKEND = "hashgrid"
-LARGEST_SEED = 2**31 - 1
 LEAST_WIDTH = 40
 """Characters in a line of help, even where the terminal has fewer."""
 

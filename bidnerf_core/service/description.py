@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-from bidnerf_core.service.requests import LARGEST_SEED, LONGEST_NAME
+from bidnerf_core.service.requests import LONGEST_NAME
 from bidnerf_core.service.settings import ServiceConfig
+from bidnerf_core.settings import LARGEST_SEED
 
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}
 MATRIX = {"type": "array", "items": {"type": "array", "items": NUMBER}}

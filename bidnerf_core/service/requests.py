@@ -17,10 +17,10 @@ from starlette.requests import ClientDisconnect, Request
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.json import parse_json
 from bidnerf_core.service.settings import MEBIBYTE, ServiceConfig
+from bidnerf_core.settings import LARGEST_SEED
 
 LONGEST_NAME = 200
 """Characters of a name in an answer."""
-LARGEST_SEED = 2**31 - 1
 FIELDS = 16
 """Parts of a form."""
 FILES = ("photo", "depth", "camera", "start")
