@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.torch_files import check_sizes, read_saved
+from bidnerf_core.io.torch_files import check_sizes, outline_of, read_saved
+from bidnerf_core.service.metrics import resident_bytes
 
 Saved = Callable[[Any], Path]
 
@@ -42,7 +43,31 @@ def test_numbers_of_numpy_do_not_prevent_reading(saved: Saved) -> None:
     assert not isinstance(found["schedulers"]["rate"], float)
 
 
+def test_the_outline_of_a_file_leaves_its_numbers_there(saved: Saved) -> None:
+    path = saved({"weights": torch.rand(16 * 2**20), "step": 3, "rate": np.float64(0.1)})
+
+    def taken(read: Callable[[Path, str], Any]) -> tuple[int, Any]:
+        before = resident_bytes(os.getpid())
+        found = read(path, "a checkpoint")
+        return resident_bytes(os.getpid()) - before, found
+
+    small, outline = taken(outline_of)
+    large, whole = taken(read_saved)
+    assert small < 8 * 2**20 < 32 * 2**20 < large
+    assert outline["step"] == 3
+    assert torch.equal(outline["weights"], whole["weights"])
+
+
+@pytest.mark.parametrize("read", [read_saved, outline_of])
+def test_both_formats_of_torch_are_read(read: Callable[[Path, str], Any], tmp_path: Path) -> None:
+    for zipped in (True, False):
+        torch.save({"a": torch.arange(3.0)}, tmp_path / "a.pt", _use_new_zipfile_serialization=zipped)
+        assert torch.equal(read(tmp_path / "a.pt", "a checkpoint")["a"], torch.arange(3.0))
+
+
 def test_code_is_refused_and_not_run(saved: Saved, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="would run code"):
+        outline_of(saved({"a": Code(f"touch {tmp_path}/mark")}), "a checkpoint")
     with pytest.raises(InputError, match=r"would run code \(posix.system\).*expected a checkpoint"):
         read_saved(saved({"a": Code(f"touch {tmp_path}/mark")}), "a checkpoint")
     assert not (tmp_path / "mark").exists()
@@ -52,8 +77,9 @@ def test_damage_and_absence_are_told_in_one_line(saved: Saved, tmp_path: Path) -
     path = saved({"a": torch.zeros(100)})
     path.write_bytes(path.read_bytes()[:-200])
     for file, said in ((path, "damaged"), (tmp_path / "none", "no such file"), (tmp_path, "no such file")):
-        with pytest.raises(InputError, match=said):
-            read_saved(file, "a checkpoint")
+        for read in (read_saved, outline_of):
+            with pytest.raises(InputError, match=said):
+                read(file, "a checkpoint")
 
 
 def test_a_number_that_stands_for_many(saved: Saved) -> None:

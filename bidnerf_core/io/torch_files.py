@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -40,12 +41,24 @@ def read_saved(path: Path, expected: str) -> Any:
     ``expected`` says in a few words what the file should be. Raises ``InputError``, in one line, where there is no such file,
     it is damaged, or it would run code. A tensor may be larger than what is stored of it, see ``check_sizes``.
     """
+    return _read(path, expected, mapped=False)
+
+
+def outline_of(path: Path, expected: str) -> Any:
+    """Return what ``read_saved`` does, for recognising a file of any size: the numbers of its tensors stay in the file until they are used.
+
+    Only those of files in the format that torch had before version 1.6, which is no zip archive, are read.
+    """
+    return _read(path, expected, mapped=zipfile.is_zipfile(path))
+
+
+def _read(path: Path, expected: str, mapped: bool) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file, expected {expected}")
     path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
     try:
         with torch.serialization.safe_globals([(_Ignored, name) for name in STAND_INS]):
-            found = torch.load(path, map_location="cpu", weights_only=True)
+            found = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except Exception as error:  # each kind of damage raises another exception
         code = CODE.search(str(error))
         if isinstance(error, pickle.UnpicklingError) and code:

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.torch_files import check_sizes, read_saved
+from bidnerf_core.io.torch_files import check_sizes, outline_of, read_saved
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 
 EXPECTED = "a checkpoint of nerf-pytorch"
@@ -25,6 +25,12 @@ class Checkpoint:
     network: NetworkConfig
     tensors: dict[str, Tensor]  # as the field's state_dict names them
     steps: int  # of training
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Return whether a file that ``torch.save`` wrote holds both networks. Raises ``InputError`` for another kind of file."""
+    found = outline_of(path, EXPECTED)
+    return isinstance(found, dict) and all(isinstance(found.get(key), dict) for key in NETWORKS.values())
 
 
 def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:

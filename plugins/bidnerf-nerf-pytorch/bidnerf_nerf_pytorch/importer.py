@@ -12,7 +12,7 @@ from bidnerf_core.geometry.similarity import Similarity
 from bidnerf_core.io.images import background_colour
 from bidnerf_core.maps.importers import ImportedField
 from bidnerf_core.settings import Count, Settings
-from bidnerf_nerf_pytorch.checkpoint import read_checkpoint
+from bidnerf_nerf_pytorch.checkpoint import is_checkpoint, read_checkpoint
 from bidnerf_nerf_pytorch.field import NerfPytorchField
 from bidnerf_nerf_pytorch.recipe import NerfPytorchConfig
 
@@ -46,10 +46,9 @@ class NerfPytorchImporter:
         if path.suffix.lower() not in ENDINGS or not path.is_file():
             return False
         try:
-            read_checkpoint(path)
+            return is_checkpoint(path)
         except (InputError, OSError):
             return False
-        return True
 
     def read(self, path: Path, config: ImportSettings, placement: Similarity) -> ImportedField:
         """Return the field of both networks, see ``Importer``. It stays in the world that it was trained in."""

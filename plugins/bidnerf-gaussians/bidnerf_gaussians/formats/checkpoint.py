@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.torch_files import check_sizes, read_saved
+from bidnerf_core.io.torch_files import check_sizes, outline_of, read_saved
 from bidnerf_gaussians.gaussians import Gaussians
 
 EXPECTED = "a checkpoint of gsplat or splatfacto"
@@ -29,14 +29,14 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() not in ENDINGS or not path.is_file():
         return False
     try:
-        return {"means", "log_scales"} <= set(_parameters(path))
+        return {"means", "log_scales"} <= set(_parameters(outline_of(path, EXPECTED)))
     except InputError:
         return False
 
 
 def read(path: Path) -> Gaussians:
     """Return the Gaussians of a checkpoint. Raises ``InputError`` where it would run code, or holds something else."""
-    found = _parameters(path)
+    found = _parameters(read_saved(path, EXPECTED))
     missing = [name for name in ("means", "log_scales", "quaternions", "logits", "sh0") if name not in found]
     if missing:
         raise InputError(f"{path}: has no {', '.join(missing)}, expected {EXPECTED}")
@@ -54,8 +54,8 @@ def read(path: Path) -> Gaussians:
         raise InputError(f"{path}: tensors of different counts ({error}), expected {EXPECTED}") from error
 
 
-def _parameters(path: Path) -> dict[str, Tensor]:
-    tensors = _inside(read_saved(path, EXPECTED))
+def _parameters(saved: Any) -> dict[str, Tensor]:
+    tensors = _inside(saved)
     return {
         ours: tensors[theirs] for theirs, ours in NAMES.items() if isinstance(tensors.get(theirs), Tensor)
     }
