@@ -124,7 +124,7 @@ WRONG: dict[str, Change] = {
         T.inverse(), 3, 0, 1, 2
     ).inverse(),
     "each of the next image": lambda T: shifted(T, 1),
-    "each of the second image before": lambda T: shifted(T, -2),
+    "each of the image before the previous one": lambda T: shifted(T, -2),
     "reverse order": lambda T: T[list(range(len(T.translation)))[::-1]],
     "order of numbers as text": text_order,
     "random order": shuffled,

@@ -72,7 +72,7 @@ def colmap_camera(intrinsics: Intrinsics, number: int = 1) -> Any:
         parameters += [k1, k2, p1, p2, k3, *rational]
     if any(intrinsics.distortion[8:]):
         raise InputError(
-            "a camera with thin prism distortion or a tilted sensor, expected one that COLMAP has a model of"
+            "a camera with thin prism distortion or a tilted sensor, expected one that a COLMAP model describes"
         )
     return pycolmap.Camera(
         camera_id=number, model=model, width=intrinsics.width, height=intrinsics.height, params=parameters

@@ -1,4 +1,4 @@
-"""bidnerf: the 6-DoF pose of RGB-D images against a radiance field, whatever field that is."""
+"""bidnerf: estimate the 6-DoF pose of RGB-D images in a radiance field of any kind."""
 
 from __future__ import annotations
 
@@ -193,8 +193,9 @@ HOMES = {
     "write_poses": "results.pose_files",
     "write_transforms": "datasets",
 }
-"""The module that defines each public name. It is imported when the name is first used (PEP 562): importing torch takes seconds,
-and ``bidnerf --help`` does not need it. A new name takes a line here and one above, for tools that do not run the code."""
+"""Module that defines each public name. Modules are imported on first use (PEP 562): importing torch takes
+seconds, and ``bidnerf --help`` does not need it. A new name needs a line here and one above, for tools that
+do not run the code."""
 
 __all__ = sorted(HOMES)
 

@@ -18,31 +18,35 @@ from bidnerf_core.training import Report
 
 @runtime_checkable
 class Backend(Protocol):
-    """A kind of field: how it is configured, built and trained."""
+    """A kind of radiance field: how it is configured, built and trained."""
 
     @property
     def summary(self) -> str:
-        """One line for ``bidnerf backends``."""
+        """One-line description for ``bidnerf backends``."""
         ...
 
     @property
     def config_type(self) -> type:
-        """A frozen dataclass of values that JSON can hold, with a default for every field.
+        """A frozen dataclass of JSON-serializable values, with a default for every field.
 
-        One of its fields is ``steps``, an int above 0: the length of a training. A map is complete when its field was
-        trained for that many steps, and the command line shows progress as a share of them.
+        One of its fields is ``steps``, an int above 0: the number of training steps. A map is complete once
+        its field has been trained for that many steps, and the command line shows progress as a fraction of
+        them.
         """
         ...
 
     def build(self, config: Any, bounds: SceneBounds) -> RadianceField:
-        """Return an untrained field: an ``nn.Module`` with ``query`` and ``sampler``. Its ``state_dict`` is saved."""
+        """Return an untrained field: an ``nn.Module`` with ``query`` and ``sampler``, whose ``state_dict`` is
+        saved.
+        """
         ...
 
     def train(self, field: RadianceField, views: Sequence[View], config: Any, report: Report) -> None:
-        """Fit the field to views whose reference frame is the world, and pass each step's progress to ``report``.
+        """Fit the field to views whose reference frame is the world, and report each step's progress to
+        ``report``.
 
-        Photos of one place differ in exposure, some are blurred, and landmarks give depth where no sensor did:
-        ``training.Supervision`` takes account of all of it.
+        Photos of one place differ in exposure, some are blurred, and landmarks provide depth where no sensor
+        did; ``training.Supervision`` handles all of this.
         """
         ...
 
@@ -59,7 +63,7 @@ BACKENDS: Plugins[Backend] = Plugins("backends", _defects)
 def load_backend(name: str, wanted_by: str = "") -> Backend:
     """Return the backend of that name, imported and checked.
 
-    Raises ``PluginError``, an ``InputError`` that names the entry point and, where it is given, the map that needs it
+    Raises ``PluginError``, an ``InputError`` that names the entry point and, if given, the map that needs it
     (``wanted_by``).
     """
     return BACKENDS.load(name, wanted_by)
@@ -67,7 +71,7 @@ def load_backend(name: str, wanted_by: str = "") -> Backend:
 
 @runtime_checkable
 class QuickConfig(Protocol):
-    """An optional part of a backend: settings for small and simple scenes, with which ``bidnerf demo`` trains."""
+    """Optional part of a backend: settings for small and simple scenes, which ``bidnerf demo`` trains with."""
 
     def quick_config(self) -> Any:
         """Return a config of the backend's ``config_type`` that trains such a scene in about a minute."""
@@ -76,15 +80,15 @@ class QuickConfig(Protocol):
 
 @runtime_checkable
 class UpgradingField(Protocol):
-    """An optional part of a field, which accepts states that earlier versions of its backend stored."""
+    """Optional part of a field that accepts states stored by earlier versions of its backend."""
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a stored state, of this version or of an earlier one, with the tensors that the field has now."""
+        """Convert a stored state, of this or an earlier version, to the field's present tensors."""
         ...
 
 
 def quick_config(backend: Backend) -> Any:
-    """Return the backend's config for small scenes, or its default config where it offers none."""
+    """Return the backend's config for small scenes, or its default config if it has none."""
     return backend.quick_config() if isinstance(backend, QuickConfig) else backend.config_type()
 
 
@@ -100,12 +104,14 @@ Config = TypeVar("Config", bound=Seeded)
 Field = TypeVar("Field", bound=nn.Module)
 
 _seeding = Lock()
-"""Held while torch's global generator has another seed: fields may be built in several threads."""
+"""Held while torch's global generator has another seed, since fields may be built in several threads."""
 
 
 @dataclass(frozen=True)
 class RecipeBackend(Generic[Config, Field]):
-    """A ``Backend`` that is composed of a config, a field and a training recipe. A seed reproduces the initial weights."""
+    """A ``Backend`` composed of a config, a field and a training recipe. The seed makes the initial weights
+    reproducible.
+    """
 
     summary: str
     config_type: type

@@ -1,4 +1,6 @@
-"""Torch's devices and threads: where tensors lie, when the host may wait for them, and how many threads compute."""
+"""Torch devices and threads: where tensors reside, when the host may wait for them, and how many threads
+compute.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,13 @@ from bidnerf_core.errors import InputError
 T = TypeVar("T")
 
 
-# Constants as tensors. Each is made once per device, since making one copies it there from the host.
+# Constants as tensors. Each is created once per device, since creating one copies it there from the host.
 
 _notes: list[list[Tensor]] = []
 
 
 def constant(values: tuple[float, ...], like: Tensor) -> Shaped[Tensor, "n"]:
-    """Return ``values`` with the dtype and device of ``like``. Do not write into the result: it is shared."""
+    """Return ``values`` with the dtype and device of ``like``. The result is shared: do not modify it."""
     found = _constant(values, like.dtype, like.device)
     for notes in _notes:
         notes.append(found)
@@ -36,7 +38,7 @@ def constant(values: tuple[float, ...], like: Tensor) -> Shaped[Tensor, "n"]:
 
 @contextmanager
 def noted() -> Iterator[list[Tensor]]:
-    """Collect all constants that are requested within the context, in any thread: the list keeps them alive."""
+    """Collect all constants that are requested within the context, in any thread; the list keeps them alive."""
     notes: list[Tensor] = []
     _notes.append(notes)
     try:
@@ -52,14 +54,14 @@ def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.devic
 
 
 def forget() -> None:
-    """Forget all constants, for instance once a device no longer exists."""
+    """Discard all constants, for instance when a device no longer exists."""
     _constant.cache_clear()
 
 
-# Whether code may let the host wait for the device. On a GPU, each number that the host reads from a tensor, and each size
-# that depends on values, makes the host wait until the device has done all its work. Skipping needless computation is worth
-# that wait in training and where whole images are rendered, but not in the steps of a localization, which are short: there,
-# code computes more than it needs, in known shapes.
+# Whether code may make the host wait for the device. On a GPU, each number that the host reads from a tensor,
+# and each size that depends on values, blocks the host until the device has finished all queued work.
+# Skipping needless computation is worth that wait in training and when whole images are rendered, but not in
+# the short steps of a localization: there, code computes more than it needs, in known shapes.
 
 _allowed: ContextVar[bool] = ContextVar("waiting_allowed", default=True)
 
@@ -75,7 +77,9 @@ def without_waiting() -> Iterator[None]:
 
 
 def may_wait(device: torch.device) -> bool:
-    """Return whether code may read from tensors on ``device``; always True on the CPU, where there is nothing to wait for."""
+    """Return whether code may read values from tensors on ``device``; always True on the CPU, where nothing
+    is queued.
+    """
     return device.type == "cpu" or _allowed.get()
 
 
@@ -83,28 +87,29 @@ def may_wait(device: torch.device) -> bool:
 
 
 def working_device(device: torch.device | str) -> torch.device:
-    """Return a device after a test computation on it: its name alone does not show whether it works on this machine.
+    """Return a device after a test computation on it; a valid name does not mean that the device works on
+    this machine.
 
-    Raises ``InputError`` for one that does not work.
+    Raises ``InputError`` if it does not work.
     """
     try:
         found = torch.device(device)
         if found.type == "cpu" and found.index:  # torch ignores the number
-            raise RuntimeError("there is one CPU")
+            raise RuntimeError("there is only one CPU")
         torch.ones((), device=found).item()
-    except (RuntimeError, AssertionError, TypeError) as error:  # which one depends on the build of torch
+    except (RuntimeError, AssertionError, TypeError) as error:  # depends on the build of torch
         raise InputError(
-            f"device {str(device)!r} does not work here, expected one that does, such as cpu"
+            f"device {str(device)!r} does not work here, expected a working device such as cpu"
         ) from error
     return found
 
 
 def moved(value: T, device: torch.device | str) -> T:
-    """Return ``value`` with every tensor in it on ``device``; ``value`` itself is left as it is.
+    """Return ``value`` with every tensor in it on ``device``; ``value`` itself is not modified.
 
-    Tensors are found in modules, in the fields of dataclasses, and in lists, tuples and dictionaries of these; anything else
-    stays the same object, and so does ``value`` as a whole if it is on ``device`` already. Values that a dataclass has cached
-    are computed anew on the device.
+    Tensors are found in modules, in the fields of dataclasses, and in lists, tuples and dictionaries of
+    these. Anything else stays the same object, as does ``value`` itself if it is already on ``device``.
+    Values cached by a dataclass are recomputed on the device.
     """
     found: Any = _moved(value, torch.device(device))
     return found
@@ -139,21 +144,23 @@ def _with_fields(value: Any, parts: dict[str, Any]) -> Any:
 
 
 def _is_on(tensor: Tensor, device: torch.device) -> bool:
-    """Return whether a tensor is on ``device``; a device without an index matches any of its type."""
+    """Return whether a tensor is on ``device``; a device without an index matches any device of its type."""
     here = tensor.device
     return here.type == device.type and device.index in (None, here.index)
 
 
-# Threads of torch's own operators on a CPU.
+# Threads of torch's operators on a CPU.
 
 _setting = Lock()
 
 
 @contextmanager
 def one_thread() -> Iterator[int]:
-    """Within the block, torch's operators that this Python thread calls use one thread; the usual number is yielded.
+    """Run torch operators called from this Python thread on one thread within the block; yields the usual
+    number.
 
-    Sums are then the same on any machine. Other Python threads are not affected, and may be in such blocks too.
+    Sums are then the same on any machine. Other Python threads are not affected, and may be in such blocks
+    too.
     """
     usual = torch.get_num_threads()
     set_threads_here(1)
@@ -164,12 +171,13 @@ def one_thread() -> Iterator[int]:
 
 
 def set_threads_here(count: int) -> None:
-    """Set how many threads torch's operators use where this Python thread calls them, and nowhere else.
+    """Set how many threads torch's operators use when called from this Python thread only.
 
-    ``torch.set_num_threads`` also sets the number for Python threads that start later, which is therefore restored.
+    ``torch.set_num_threads`` also sets the number for Python threads that start later, so that number is
+    restored.
     """
     with _setting:
-        torch.get_num_threads()  # on first use, a thread takes the default, which would replace what is set before
+        torch.get_num_threads()  # on first use, a thread takes the default, which would override a value set before
         default = _in_new_thread(torch.get_num_threads)
         torch.set_num_threads(count)
         _in_new_thread(lambda: torch.set_num_threads(default))

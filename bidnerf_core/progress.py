@@ -1,4 +1,4 @@
-"""The progress of long work: what its callers receive, and how they stop it."""
+"""Progress of long-running work: what callers receive, and how they cancel it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from bidnerf_core.errors import Cancelled, InputError
 
 @dataclass(frozen=True)
 class Progress:
-    """How much of one stage of some work is done. ``str()`` of it is a line for people."""
+    """How much of one stage of some work is done. ``str()`` gives a human-readable line."""
 
     stage: str  # such as "training"
     done: int
     total: int
-    unit: str  # of what is counted, plural: "steps"
-    text: str = ""  # present figures, such as the loss
+    unit: str  # what is counted, plural: "steps"
+    text: str = ""  # current figures, such as the loss
 
     def __str__(self) -> str:
         counted = f"{self.stage}: {self.done}/{self.total} {self.unit}"
@@ -25,14 +25,16 @@ class Progress:
 
 
 ProgressCallback: TypeAlias = Callable[[Progress], None]
-"""Receives the progress of long work, in the thread that does the work. An error that it raises stops the work and reaches the
-caller."""
+"""Receives the progress of long-running work, in the thread that does it. An exception raised here stops the
+work and propagates to the caller."""
 Cancel: TypeAlias = Callable[[], bool]
-"""Returns whether work is to stop, such as ``threading.Event().is_set``."""
+"""Returns whether the work should stop, such as ``threading.Event().is_set``."""
 
 
 def check_cancelled(cancel: Cancel | None, stage: str) -> None:
-    """Raise ``Cancelled`` if work is to stop, and ``InputError`` for what cannot be asked, such as an event itself."""
+    """Raise ``Cancelled`` if the work should stop, and ``InputError`` if ``cancel`` is not callable (an event
+    itself, say).
+    """
     if cancel is not None and not callable(cancel):
         raise InputError(
             f"cancel is a {type(cancel).__name__}, expected a function, such as the is_set of an event"
@@ -44,7 +46,7 @@ def check_cancelled(cancel: Cancel | None, stage: str) -> None:
 def counter(
     stage: str, unit: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None
 ) -> Callable[[int, int], None]:
-    """Return a function of the number done and the total, which reports them and raises ``Cancelled`` if asked to stop."""
+    """Return a function of (done, total) that reports progress and raises ``Cancelled`` on request."""
 
     def count(done: int, total: int) -> None:
         if progress is not None:

@@ -1,8 +1,10 @@
-"""What strangers register, by name: backends, readers, methods, features, faults, writers and importers.
+"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers and
+importers.
 
-A distribution offers an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones come the same way. A
-script or a notebook offers one with ``register``. Listing reads only metadata and source text, so that a broken plugin cannot
-break the list: its fault surfaces when that plugin is loaded, in an error that names it, its distribution and the cause.
+A distribution provides an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones are
+provided in the same way. A script or a notebook adds one with ``register``. Listing reads only metadata and
+source text, so a broken plugin cannot break the list: the failure surfaces when that plugin is loaded, in an
+error that names the plugin, its distribution and the cause.
 """
 
 from __future__ import annotations
@@ -35,15 +37,16 @@ GROUPS: Mapping[str, str] = {
     "writers": "writer",
     "importers": "importer",
 }
-"""What can be registered, and the noun for one of it. The entry-point group has the prefix ``bidnerf.``."""
+"""The kinds of object that can be registered, and the noun for each. The entry-point group has the prefix
+``bidnerf.``."""
 
 ONLY_STRANGERS = frozenset({"importers"})
-"""The groups of which nothing is bundled."""
+"""Groups without bundled plugins."""
 
 BUNDLED = "bidnerf"
 """The distribution whose plugins are bundled."""
 UNREADABLE = "?"
-"""Stands for the name of entry points that cannot be read."""
+"""Placeholder for the name of entry points that cannot be read."""
 NAME = re.compile(r"[\w.-]+")
 
 Defects: TypeAlias = Callable[[Any], Iterator[str]]
@@ -55,20 +58,22 @@ return its own classes, which are not subclasses of the standard library's."""
 Plugin = TypeVar("Plugin")
 
 registered: dict[tuple[str, str], Any] = {}
-"""What ``register`` was given, by group and name."""
+"""Objects passed to ``register``, by group and name."""
 
 
 class PluginError(InputError):
-    """A plugin cannot be loaded, or returns what its kind must not; the message names it and the cause."""
+    """A plugin cannot be loaded, or violates the contract of its kind; the message names the plugin and the
+    cause.
+    """
 
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """What is known about a plugin without importing it."""
+    """Information about a plugin that is available without importing it."""
 
     group: str
     name: str
-    value: str  # "module:object", as declared; the object's type where it was registered in this process
+    value: str  # "module:object", as declared; the object's type if it was registered in this process
     distribution: str
     version: str
     summary: str = ""
@@ -84,11 +89,12 @@ class PluginInfo:
 
 
 def register(group: str, name: str, value: Any, replace: bool = False) -> None:
-    """Offer ``value`` under ``name`` in this process, for scripts and notebooks; other processes do not see it.
+    """Make ``value`` available under ``name`` in this process, for scripts and notebooks; other processes do
+    not see it.
 
-    ``group``: one of ``GROUPS``, such as "methods". ``replace``: whether ``value`` may take the place of a plugin of that name,
-    be it registered before, installed or bundled. Raises ``InputError`` for an unknown group, a name that is no name, and one
-    that is taken.
+    ``group``: one of ``GROUPS``, such as "methods". ``replace``: whether ``value`` may replace a plugin of
+    that name, whether registered before, installed or bundled. Raises ``InputError`` for an unknown group, an
+    invalid name, and a name that is taken.
     """
     _check_group(group)
     if not (isinstance(name, str) and NAME.fullmatch(name)):
@@ -96,33 +102,35 @@ def register(group: str, name: str, value: Any, replace: bool = False) -> None:
     taken = [info for info in list_plugins(group) if info.name == name]
     if taken and not replace and registered.get((group, name)) is not value:
         raise InputError(
-            f"register: the name is taken by {taken[0]}; choose another name, or replace it on purpose with replace=True"
+            f"register: the name is taken by {taken[0]}; choose another name, or pass replace=True to"
+            " replace it"
         )
     registered[group, name] = value
 
 
 def registered_names() -> list[tuple[str, str]]:
-    """Return group and name of all that ``register`` was given in this process."""
+    """Return the group and name of every object passed to ``register`` in this process."""
     return list(registered)
 
 
 def require_registered(names: Iterable[tuple[str, str]]) -> None:
     """Raise ``PluginError`` for a group and name that another process registered and this one did not.
 
-    The name may be that of an installed plugin, which is not what the other process means by it.
+    An installed plugin may have the same name, but it is not the one the other process refers to.
     """
     for group, name in names:
         if (group, name) not in registered:
             raise PluginError(
-                f"{GROUPS[group]} {name!r} was registered in one process and is not known in another that needs it; offer it by"
-                " an entry point, register it where the main module is imported, or do everything in one process (workers=1)"
+                f"{GROUPS[group]} {name!r} was registered in one process but is unknown in another that"
+                " needs it; provide it through an entry point, register it where the main module is"
+                " imported, or do everything in one process (workers=1)"
             )
 
 
 def list_plugins(group: str) -> list[PluginInfo]:
     """Return all plugins of a group, sorted by name, without importing any.
 
-    A name that two distributions declare is listed twice, with a fault: neither can be loaded.
+    A name declared by two distributions is listed twice, with a fault: neither can be loaded.
     """
     _check_group(group)
     own = [_registered_info(group, name) for of, name in list(registered) if of == group]
@@ -142,9 +150,9 @@ def plugin_names(group: str, first: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by: str = "") -> Any:
-    """Return the plugin of that name, imported and, where ``defects`` is given, checked by it.
+    """Return the plugin of that name, imported and, if ``defects`` is given, checked with it.
 
-    Raises ``PluginError``, which names the plugin and, where it is given, what needs it (``wanted_by``).
+    Raises ``PluginError``, which names the plugin and, if given, what needs it (``wanted_by``).
     """
     try:
         return _loaded(group, name, defects)
@@ -153,10 +161,10 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
 
 
 class Plugins(Mapping[str, Plugin], Generic[Plugin]):
-    """The plugins of a group by name. Iterating imports nothing; a plugin is imported and checked when it is looked up."""
+    """The plugins of a group by name. Iterating imports nothing; a plugin is imported and checked on look-up."""
 
     def __init__(self, group: str, defects: Defects, first: Sequence[str] = ()) -> None:
-        """``first``: the names that come first in their order; then come the other bundled ones, then the others."""
+        """``first``: names to list first, in this order, before the other bundled ones and the rest."""
         self._group, self._defects, self._first = group, defects, first
 
     def load(self, name: str, wanted_by: str = "") -> Plugin:
@@ -209,7 +217,9 @@ _cache: tuple[object, dict[str, tuple[PluginInfo, ...]]] = (None, {})
 
 
 def _declared(group: str) -> tuple[PluginInfo, ...]:
-    """Return what the installed distributions declare in a group; read again when a folder of ``sys.path`` has changed."""
+    """Return what installed distributions declare in a group; re-read whenever a folder of ``sys.path`` has
+    changed.
+    """
     global _cache
     key = tuple((path, _modified(path)) for path in sys.path)
     if _cache[0] != key:
@@ -226,7 +236,9 @@ def _modified(path: str) -> int:
 
 
 def _installed() -> Iterator[AnyDistribution]:
-    """Yield the distributions that have to do with bidnerf; of several versions the one that ``import`` would use."""
+    """Yield the distributions related to bidnerf; of several versions, only the one that ``import`` would
+    use.
+    """
     seen = set()
     for dist in distributions():
         if "bidnerf." not in _text(dist, "entry_points.txt"):
@@ -263,7 +275,7 @@ def _entries(dist: AnyDistribution) -> Iterator[PluginInfo]:
 
 
 def _with_rivals(infos: list[PluginInfo]) -> Iterator[PluginInfo]:
-    """Yield plugins, with a fault for each name that is declared more than once, and is therefore ambiguous."""
+    """Yield plugins, with a fault for each name that is declared more than once and therefore ambiguous."""
     for info in infos:
         rivals = [x for x in infos if x.name == info.name and x is not info]
         if rivals and info.name != UNREADABLE:
@@ -302,12 +314,12 @@ def _normalized(name: str) -> str:
 
 
 def _described_info(info: PluginInfo, sources: dict[str, ast.Module | None]) -> PluginInfo:
-    """Return what the module of an entry point adds: its summary, or why it leads nowhere."""
+    """Return the information from an entry point's module: its summary, or why it cannot be resolved."""
     if info.name == UNREADABLE:
         return info
     point = EntryPoint(info.name, info.value, "")
     try:
-        module = point.module  # fails where the value is not of the form module:object
+        module = point.module  # fails unless the value has the form module:object
     except Exception:
         return replace(info, fault=info.fault or "expected a value of the form 'module:object'")
     try:
@@ -341,9 +353,10 @@ def _parsed(spec: ModuleSpec) -> ast.Module | None:
 
 
 def _summary(tree: ast.Module | None, attr: str | None) -> str:
-    """Return the first line of the docstring of what an entry point names, else of its module.
+    """Return the first line of the docstring of the object an entry point names, or else of its module.
 
-    The docstring of an assigned object is the text below the assignment, or ``summary="..."`` in the call that makes it.
+    The docstring of an assigned object is the text below the assignment, or ``summary="..."`` in the call
+    that creates it.
     """
     if tree is None:
         return ""
@@ -376,8 +389,10 @@ def _imported(info: PluginInfo) -> Any:
     try:
         module = importlib.import_module(point.module)
     except KeyboardInterrupt:
-        raise  # somebody is tired of waiting for the import
-    except BaseException as error:  # also SystemExit and the like, which must not end the caller's program
+        raise  # the user interrupted the import
+    except (
+        BaseException
+    ) as error:  # including SystemExit and the like, which must not end the caller's program
         raise PluginError(f"{info}: cannot be imported: {_described(error)}") from error
     try:
         return reduce(getattr, filter(None, (point.attr or "").split(".")), module)
@@ -389,7 +404,7 @@ def _checked(info: PluginInfo, plugin: Any, defects: Defects | None) -> Any:
     noun = GROUPS[info.group]
     try:
         wrong = None if defects is None else next(defects(plugin), None)
-    except Exception as error:  # a property may do anything
+    except Exception as error:  # a property may raise anything
         raise PluginError(f"{info}: not a {noun}: {_described(error)}") from error
     if wrong is not None:
         raise PluginError(f"{info}: not a {noun}: {wrong}")
@@ -399,10 +414,11 @@ def _checked(info: PluginInfo, plugin: Any, defects: Defects | None) -> Any:
 def interface_defects(
     plugin: Any, attributes: Sequence[str], methods: Mapping[str, Sequence[str]]
 ) -> Iterator[str]:
-    """Yield why an object lacks an interface: ``attributes`` by name, ``methods`` by name with their parameters.
+    """Yield the reasons why an object lacks an interface: ``attributes`` by name, ``methods`` by name with
+    their parameters.
 
-    ``summary``, if it is one of the attributes, must be text, and ``config_type`` a frozen dataclass with defaults. The method
-    ``__call__`` stands for a plain function.
+    If ``summary`` is one of the attributes, it must be text; ``config_type`` must be a frozen dataclass with
+    defaults. The method ``__call__`` stands for a plain function.
     """
     missing = [name for name in (*attributes, *methods) if not hasattr(plugin, name)]
     if missing:
@@ -410,7 +426,7 @@ def interface_defects(
         yield f"{who} has no {', '.join(missing)}"
         return
     if isinstance(plugin, type):
-        yield f"it is the class {plugin.__name__} itself, expected an object of it"
+        yield f"it is the class {plugin.__name__} itself, expected an instance of it"
     if "summary" in attributes and not isinstance(plugin.summary, str):
         yield f"summary is {plugin.summary!r}, expected text"
     if "config_type" in attributes:
@@ -457,7 +473,9 @@ def _unknown(group: str, name: str) -> str:
     infos, noun = _declared(group), GROUPS[group]
     names = plugin_names(group)
     if group not in ONLY_STRANGERS and not any(info.is_bundled for info in infos):
-        return f"no {noun} {name!r}: the metadata of the installed bidnerf names no {group}; install bidnerf anew"
+        return (
+            f"no {noun} {name!r}: the metadata of the installed bidnerf lists no {group}; reinstall bidnerf"
+        )
     hint = spelling_hint(str(name).lower(), names)
     message = f"no {noun} {name!r}{hint}; installed: {', '.join(sorted(names)) or 'none'}"
     unread = [f"{x.distribution} {x.version}: {x.fault}" for x in infos if x.name == UNREADABLE]

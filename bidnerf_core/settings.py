@@ -1,8 +1,8 @@
-"""Settings as frozen dataclasses, with the range of each next to its field, and the flat names by which users set them.
+"""Settings as frozen dataclasses, each field with its range, and the flat names by which users set them.
 
-A method's settings are composed of small groups that several methods share (`Annotated` fields of nested dataclasses). On
-the command line and in JSON all of them have flat names, ``{"rays": 512, "depth_weight": 3}``: a name is unique within a
-method, whatever group it belongs to.
+A method's settings are composed of small groups shared by several methods (`Annotated` fields of nested
+dataclasses). On the command line and in JSON they all have flat names, ``{"rays": 512, "depth_weight": 3}``:
+a name is unique within a method, whichever group it belongs to.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LARGEST_SEED = 2**31 - 1
 
 @dataclass(frozen=True)
 class Range:
-    """The range of a setting: ``least`` to ``most``, both included."""
+    """The range of a setting, from ``least`` to ``most`` inclusive."""
 
     least: float
     most: float = math.inf
@@ -67,11 +67,11 @@ class WholeNumbers(Range):
 
 
 def _written(limit: float) -> str:
-    """Return a limit as messages show it, the same for 1 and 1.0: ``Annotated`` does not distinguish equal ranges."""
+    """Format a limit for messages, the same for 1 and 1.0: ``Annotated`` does not distinguish equal ranges."""
     return f"{int(limit) if float(limit).is_integer() else limit:,}"
 
 
-# Compared and hashed by identity, since the command line's parser hashes it and a table is not hashable.
+# Compared and hashed by identity: the command-line parser hashes it, and a table is not hashable.
 @dataclass(frozen=True, eq=False)
 class OneOf:
     """The names or numbers that a setting accepts: the keys of a table, which users may extend."""
@@ -101,15 +101,17 @@ EXPERT = Expert()
 Count = Annotated[int, Range(1, 10**7)]
 Layers = Annotated[
     int, Range(1, 100)
-]  # of a network: each takes time and memory even where its tensors have only shapes
+]  # of a network: each takes time and memory even if its tensors have only shapes
 NotNegative = Annotated[float, Range(0.0)]
 Positive = Annotated[float, Above(0.0, 1e6)]
 
 
 class Settings:
-    """Base class of frozen dataclasses whose fields are checked against the ranges or names in their annotations.
+    """Base class of frozen dataclasses whose fields are checked against the ranges or names in their
+    annotations.
 
-    Raises ``InputError``, with the setting's name, its value and what was expected, as soon as an instance is made.
+    Creating an instance with an invalid value raises ``InputError`` with the setting's name, its value and
+    what was expected.
     """
 
     def __post_init__(self) -> None:
@@ -141,7 +143,7 @@ def is_expert(kind: type, name: str) -> bool:
 
 
 def to_flat(settings: Any) -> dict[str, Any]:
-    """Return all settings by their flat names, as values that JSON can hold."""
+    """Return all settings by their flat names, as JSON-serializable values."""
     flat: dict[str, Any] = {}
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
@@ -154,23 +156,24 @@ def to_flat(settings: Any) -> dict[str, Any]:
 def from_flat(
     base: S | type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None
 ) -> S:
-    """Return the settings ``base``, or the defaults of that class, with ``values`` (by flat name) in place of its own.
+    """Return the settings ``base`` (an instance, or a class for its defaults) updated with ``values`` by flat
+    name.
 
-    ``renamed`` maps names of earlier versions to present ones. Raises ``InputError``, whose message begins with ``where``,
-    for an unknown name, a value of a type other than the declared one, and a value out of range.
+    ``renamed`` maps names used by earlier versions to the current ones. Raises ``InputError``, whose message
+    begins with ``where``, for an unknown name, a value of the wrong type, and a value out of range.
     """
     default: S = base() if isinstance(base, type) else base
     known = to_flat(default)
     given = {(renamed or {}).get(name, name): value for name, value in values.items()}
     for name in given:
         if name not in known:
-            hint = spelling_hint(name, known, f", expected some of {', '.join(known)}")
+            hint = spelling_hint(name, known, f", expected any of {', '.join(known)}")
             raise InputError(f"{where}: {type(default).__name__} has no setting {name!r}{hint}")
     return _with_values(default, given, where)
 
 
 def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
-    """Return the settings ``default`` with the values of ``flat``, whichever group declares each of them."""
+    """Return the settings ``default`` with the values of ``flat``, whichever group declares them."""
     kind: Any = type(default)
     hints, values = typing.get_type_hints(kind), dict[str, Any]()
     for field in dataclasses.fields(kind):

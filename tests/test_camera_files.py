@@ -233,7 +233,7 @@ def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
         assert found.fx == 600
     for file in ("list.txt", "splats.json"):
         with pytest.raises(
-            InputError, match=rf"{file}: holds 2 cameras, expected one, or one that is called like"
+            InputError, match=rf"{file}: holds 2 cameras, expected exactly one, or one named after"
         ):
             read_camera(tmp_path / file, SIZE, "c.jpg")
     for name in ("a", "b"):
@@ -246,7 +246,7 @@ def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
     ("content", "said"),
     [
         ("a: [1, 2", "is not YAML"),
-        ("just words", "expected the YAML of ROS"),
+        ("just words", "expected YAML from ROS"),
         ("image_width: 640\n", "no camera matrix"),
         (
             ROS_INFO.replace("plumb_bob", "double_sphere"),

@@ -46,7 +46,7 @@ def test_an_equivalent_focal_length_refers_to_the_diagonal() -> None:
     assert half == pytest.approx(math.atan(math.hypot(36, 24) / 2 / 26))
     assert (camera.cx, camera.cy, camera.fx) == (2016, 1512, camera.fy)
     assert source.description == (
-        "26 mm equivalent in EXIF: fx 3029 px at 4032x3024 (the principal point is assumed in the middle)"
+        "26 mm equivalent in EXIF: fx 3029 px at 4032x3024 (the principal point is assumed to be the image centre)"
     )
 
 
@@ -107,7 +107,7 @@ def test_a_cropped_photo_has_the_focal_length_of_the_whole_one_where_it_is_estim
     source = find_camera(part, whole, assumed=assumed)
     assert source.approximate
     assert source.intrinsics == Intrinsics.from_focal(found(exif).fx, 1200, 3000)
-    assert source.description.endswith("a crop of a photo of 4032x3024")
+    assert source.description.endswith("cropped from a photo of 4032x3024")
     square = find_camera(Raster(1080, 1080, UPRIGHT), whole, assumed=assumed)  # resized as well
     assert square.intrinsics.fx == pytest.approx(found(exif).fx * 1080 / 3024)
     large = find_camera(Raster(8064, 4536, UPRIGHT), whole, assumed=assumed)
@@ -203,7 +203,7 @@ def test_numbers_that_no_camera_has_are_refused(given: dict[str, float]) -> None
         ({"focal": 1e30}, "focal length is 1e[+]30 px .* expected at most 1000 times its longer side"),
         ({"focal": 1001 * max(SIZE)}, "expected at most 1000 times its longer side"),
         ({"focal": 1e-9}, "focal length fx is 1e-09, expected at least 1e-06 pixels"),
-        ({"hfov": 0.0001}, "view is 0.0001, which makes a focal .*, expected at most 1e[+]09 pixels"),
+        ({"hfov": 0.0001}, "view is 0.0001, which gives a focal .*, expected at most 1e[+]09 pixels"),
     ],
 )
 def test_the_limits_of_a_focal_length_are_stated(given: dict[str, float], expected: str) -> None:
@@ -218,7 +218,9 @@ def test_the_focal_length_of_a_telescope_is_taken() -> None:
 def test_a_camera_of_another_resolution_is_scaled() -> None:
     given = Intrinsics(1500.0, 1510.0, 1000.0, 760.0, 2016, 1512, (0.1, 0, 0, 0))
     assert found(camera=given) == Intrinsics(3000.0, 3020.0, 2000.0, 1520.0, *SIZE, (0.1, 0, 0, 0))
-    with pytest.raises(InputError, match="image is 4032x3024, its camera is for 1512x1512; expected one of"):
+    with pytest.raises(
+        InputError, match="image is 4032x3024, but its camera is for 1512x1512, expected one with"
+    ):
         found(camera=Intrinsics(1500.0, 1500.0, 700.0, 700.0, 1512, 1512))
 
 
@@ -289,7 +291,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing": (lambda path: None, "no such file, expected a camera file (JSON, YAML, COLMAP's cameras.txt"),
     "folder": (lambda path: path.mkdir(), "is a folder"),
     "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not text"),
-    "empty": (lambda path: path.write_text("# nothing\n"), "holds 0 cameras, expected one"),
+    "empty": (lambda path: path.write_text("# nothing\n"), "holds 0 cameras, expected exactly one"),
     "short": (lambda path: path.write_text("1 PINHOLE 3 4\n"), "line 1 has 4 entries, expected CAMERA_ID"),
     "fisheye": (
         lambda path: path.write_text("1 THIN_PRISM_FISHEYE 4 3 1 1 2 2 0 0 0 0 0 0 0 0\n"),
@@ -306,7 +308,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "several": (
         lambda path: path.write_text("1 PINHOLE 4 3 1 1 2 2\n2 PINHOLE 4 3 2 1 2 2\n"),
-        "holds 2 cameras, expected one",
+        "holds 2 cameras, expected exactly one",
     ),
     "broken JSON": (lambda path: path.write_text("{,"), "not JSON"),
     "JSON list": (lambda path: path.write_text("[]"), "holds [], expected a JSON object"),

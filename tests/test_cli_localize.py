@@ -69,7 +69,7 @@ def test_a_folder_of_photos_is_localized_in_one_run(bidnerf: Run, shared: Path, 
     found = objects(out)
     assert [each["frame"] for each in found] == ["t_0000", "t_0001", "t_0002"]
     assert all(each["error"] is None and each["method"] == "bid" for each in found)
-    assert err.count("focal length 32 px as given") == 1  # the same camera is reported once
+    assert err.count("focal length 32 px, as given") == 1  # the same camera is reported once
     assert err.count("skipped notes.txt") == 1
     assert "of 3 converged" in err
 

@@ -64,7 +64,7 @@ def test_a_map_holds_refined_and_given_poses(bidnerf: Run, data: Path, tmp_path:
     assert f"{name} most" in outcome.err
     shown = bidnerf("info", tmp_path / "map").out
     assert line in shown
-    assert f"landmarks of the other images place them: {views[1].frame.name} by" in shown
+    assert f"by the landmarks of the other images: {views[1].frame.name} by" in shown
     facts = json.loads(bidnerf("info", tmp_path / "map", "--json").out)
     assert [moved["name"] for moved in facts["moved"]] == [view.frame.name for view in views]
     assert facts["moved"][2]["pixels"] == 1.4
@@ -78,7 +78,9 @@ def test_never_and_images_without_keypoints_keep_the_given_poses(
         words = ["train", data, "--out", tmp_path / when, "--refine-poses", when, *tiny.options(2)]
         found = bidnerf(*words)
         assert found.status == 0
-        assert ("the poses are kept: to refine them takes 8 images" in found.err) == (when == "always")
+        assert ("the poses are kept: refining them takes at least 8 images" in found.err) == (
+            when == "always"
+        )
         info = load_info(tmp_path / when)
         assert info.cameras == stored_cameras(views_of(data))
         assert info.pose_refinement is None

@@ -224,7 +224,7 @@ def test_cameras_that_tell_no_unit_are_refused(model: Path, scene: Known) -> Non
         (one, "1 of the 1 training cameras, expected 2 or more"),
         ([], "0 of the 0 training cameras"),
         ([("x", T) for _, T in places(scene)], "0 of the 6 training cameras.* 6 images .train/"),
-        (here, "at different places"),
+        (here, "distinct ones"),
         (
             [(a, T) for (a, _), (_, T) in zip(other, shuffled, strict=True)],
             "is it a model of these images|no similarity",

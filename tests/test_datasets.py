@@ -524,9 +524,9 @@ BAD_DESCRIPTIONS: dict[str, tuple[Callable[[Json], Any], str]] = {
     "pose no list": (edit_frame(transform_matrix="up"), 'transform_matrix is "up", expected a list'),
     "text in pose": (
         edit_frame(transform_matrix=matrix_with("2")),
-        'a number of transform_matrix is "2", expected a finite number',
+        'an entry of transform_matrix is "2", expected a finite number',
     ),
-    "null in pose": (edit_frame(transform_matrix=matrix_with(None)), "a number of transform_matrix is null"),
+    "null in pose": (edit_frame(transform_matrix=matrix_with(None)), "an entry of transform_matrix is null"),
     "sheared pose": (
         edit_frame(transform_matrix=matrix_with(0.04, row=0, column=1)),
         "frame 1 (images/r_1.png): the rotation of transform_matrix is off orthonormal by 0.04, "

@@ -131,7 +131,7 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
     mine = dataclasses.replace(find_method("bid"), summary="mine")
     bn.register("methods", "bid", mine, replace=True)
     bn.register("methods", "unused", mine)
-    said = "method 'bid' was registered in one process and is not known in another"
+    said = "method 'bid' was registered in one process but is unknown in another"
     with pytest.raises(bn.InputError, match=said):
         bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **QUICK)
     with pytest.raises(bn.InputError, match=said):

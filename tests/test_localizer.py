@@ -104,7 +104,7 @@ MIRRORED[:3, 0] *= -1
 @pytest.mark.parametrize(
     ("query", "start", "message"),
     [
-        (FRAME, COLUMNS, "start has the last row .*, expected .*written by columns: transpose it"),
+        (FRAME, COLUMNS, "start has the last row .*, expected .*column-major: transpose it"),
         (FRAME, COLUMNS.numpy(), "start has the last row .*transpose it"),
         (FRAME, torch.eye(3), r"start has shape \(3, 3\), expected a 4x4 matrix T_world_camera"),
         (FRAME, torch.eye(4)[:3], r"start has shape \(3, 4\), expected a 4x4 matrix"),

@@ -184,7 +184,7 @@ def test_the_motion_is_stored_with_the_pose() -> None:
     noise = found.consistency.noise_before, found.consistency.noise_after
     lines = pose_sentences(cameras, PoseRefinement(*noise, True))
     assert len(lines) == 2
-    assert "exposed one after another" in lines[1]
+    assert "rolling shutter" in lines[1]
     metres, radians = (median(moved[:, part].norm(dim=-1).tolist()) for part in (slice(3), slice(3, 6)))
     assert f"by {metres:.2g} and {degrees(radians):.2g}°" in lines[1]
 

@@ -198,11 +198,11 @@ WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
     "x reversed": (lambda T: positions(T, -1, 1, 1), "x of their positions is reversed"),
     "z doubled": (lambda T: positions(T, 1, 1, 2), "diag(1, 1, 0.5)"),
     "swapped": (lambda T: SE3(T.rotation, T.translation[:, [0, 2, 1]]), "the given ones' x, z, y"),
-    "quaternions": (lambda T: reordered(T, [1, 2, 3, 0]), "x y z w where w x y z"),
+    "quaternions": (lambda T: reordered(T, [1, 2, 3, 0]), "x y z w, but w x y z"),
     "quaternions of COLMAP": (lambda T: reordered(T.inverse(), [1, 2, 3, 0]).inverse(), "quaternions"),
     "Unity": (opengl(lambda T: mirrored(T, [1, 1, -1])), "from both sides by diag(1, 1, -1, 1)"),
     "next image": (lambda T: T[[*range(1, 14), 13]], "that of the next image"),
-    "text order": (lambda T: T[sorted(range(14), key=str)], "numbers as text"),
+    "text order": (lambda T: T[sorted(range(14), key=str)], "text order"),
     "reverse": (lambda T: T[list(range(14))[::-1]], "reverse order"),
 }
 

@@ -230,7 +230,7 @@ def test_a_missing_object_is_told(site: Site) -> None:
         ("def train", "def fit", "Kind has no train"),
         ("backend = Kind()", "backend = None", "NoneType has no summary, config_type, build, train"),
         ("backend = Kind()", "backend = Config", "class Config has no summary, config_type, build, train"),
-        ("backend = Kind()", "backend = Kind", "it is the class Kind itself, expected an object of it"),
+        ("backend = Kind()", "backend = Kind", "it is the class Kind itself, expected an instance of it"),
         ('summary = "a field of fog"', "summary = 3", "summary is 3, expected text"),
         ("config_type = Config", "config_type = dict", "expected a frozen dataclass"),
         ("config_type = Config", "config_type = Config()", "expected a frozen dataclass"),
@@ -509,7 +509,7 @@ def test_summaries_come_from_what_the_entry_point_names(site: Site) -> None:
 
 def test_metadata_without_the_bundled_plugins_is_to_be_renewed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bidnerf_core.registry._declared", lambda group: ())
-    with pytest.raises(PluginError, match="names no methods; install bidnerf anew"):
+    with pytest.raises(PluginError, match="lists no methods; reinstall bidnerf"):
         find_method("auto")
 
 

@@ -128,7 +128,7 @@ def test_flat_names_set_what_is_nested() -> None:
     ("values", "message"),
     [
         ({"shar": 0.1}, "^here: Outer has no setting 'shar', did you mean 'share'[?]$"),
-        ({"zzz": 0.1}, "^here: Outer has no setting 'zzz', expected some of share, scale, .*some$"),
+        ({"zzz": 0.1}, "^here: Outer has no setting 'zzz', expected any of share, scale, .*some$"),
         ({"inner": {}}, "^here: Outer has no setting 'inner'"),
         ({"share": 2.0}, "^here: share is 2.0, expected 0 to 1$"),
         ({"share": "much"}, "^here: share: found 'much', expected float$"),

@@ -64,6 +64,6 @@ def test_points_that_tell_nothing_are_refused() -> None:
         (CLOUD[:4], same),
         (CLOUD[:0], CLOUD[:0]),
     ):
-        with pytest.raises(InputError, match="at different places"):
+        with pytest.raises(InputError, match="distinct ones"):
             fit_similarity(source, target)
     assert spread(same) == 0

@@ -401,7 +401,7 @@ def test_noise_of_poses_that_no_image_has_is_refused(tmp_path: Path) -> None:
     described["pose_refinement"] = {"noise_before": 1e308, "noise_after": 0.3, "refined": False}
     (tmp_path / "map.json").write_text(json.dumps(described))
     with pytest.raises(
-        InputError, match=r"pose_refinement: noise of keypoints is 1e\+308, expected 0 to 1e\+06"
+        InputError, match=r"pose_refinement: the keypoint noise is 1e\+308, expected 0 to 1e\+06"
     ):
         load_info(tmp_path)
 

@@ -161,7 +161,7 @@ def test_an_unknown_sensor_names_the_ways_to_a_camera(folder: Path) -> None:
 
 
 def test_a_camera_of_another_shape_is_refused(folder: Path) -> None:
-    with pytest.raises(InputError, match=r"image is 16x12, its camera is for 20x12"):
+    with pytest.raises(InputError, match=r"image is 16x12, but its camera is for 20x12"):
         next(iter(open_sequence(folder, camera=Intrinsics(20, 20, 10, 6, 20, 12))))
 
 

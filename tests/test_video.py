@@ -137,7 +137,7 @@ def test_a_rotated_video_is_upright(clip: Path, tmp_path: Path, degrees: int) ->
 def test_a_camera_of_another_size_is_scaled(clip: Path) -> None:
     full = Intrinsics(1000.0, 1000.0, 640.0, 480.0, 1280, 960)
     assert next(iter(open_sequence(clip, camera=full))).frame.intrinsics == full.resized(WIDTH, HEIGHT)
-    with pytest.raises(InputError, match=r"clip\.mp4: image is 64x48, its camera is for 100x100"):
+    with pytest.raises(InputError, match=r"clip\.mp4: image is 64x48, but its camera is for 100x100"):
         next(iter(open_sequence(clip, camera=Intrinsics(50, 50, 50, 50, 100, 100))))
 
 

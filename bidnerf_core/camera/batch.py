@@ -18,11 +18,11 @@ class CameraBatch:
     """The intrinsics of several cameras as tensors."""
 
     matrices: Float[Tensor, "c 3 3"]  # float64, pixels
-    distortion: Float[Tensor, "c d"]  # float64, in OpenCV's order; without columns where no lens is distorted
+    distortion: Float[Tensor, "c d"]  # float64, in OpenCV's order; has no columns if no lens is distorted
 
     @staticmethod
     def of(cameras: Sequence[Intrinsics]) -> CameraBatch:
-        """Return the batch of ``cameras``; shorter lists of coefficients are filled up with zeros."""
+        """Build a batch from ``cameras``; shorter coefficient lists are padded with zeros."""
         longest = max((len(camera.distortion) for camera in cameras), default=0)
         rows = [[*camera.distortion, *[0.0] * (longest - len(camera.distortion))] for camera in cameras]
         return CameraBatch(
@@ -30,7 +30,9 @@ class CameraBatch:
         )
 
     def unproject(self, pixels: Float[Tensor, "p 2"], camera: Int[Tensor, "p"]) -> Float[Tensor, "p 3"]:
-        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v), each of the ``camera`` of that number."""
+        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); ``camera`` is the index of
+        each pixel's camera.
+        """
         matrix, exact = self.matrices[camera], pixels.double()
         if self.distortion.shape[1]:
             exact = undistort_points(exact[:, None], matrix, self.distortion[camera], num_iters=20)[:, 0]

@@ -1,6 +1,8 @@
-"""Cameras in the files of calibration programs and robots: YAML of ROS, OpenCV, ORB-SLAM and Kalibr, and JSON of Open3D.
+"""Cameras in the files of calibration tools and robots: YAML from ROS, OpenCV, ORB-SLAM and Kalibr, and JSON
+from Open3D.
 
-All of them follow OpenCV: the centre of the first pixel is (0, 0), so half a pixel is added to principal points.
+All of them follow OpenCV: the centre of the first pixel is (0, 0), so half a pixel is added to principal
+points.
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ FISHEYES = ("equidistant", "fisheye", "kannalabrandt8", "kannala_brandt", "openc
 PERSPECTIVE = (
     "plumb_bob", "rational_polynomial", "radtan", "none", "pinhole", "perspective", "opencv", "thin_prism", "",
 )  # fmt: skip
-EXPECTED = "the YAML of ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
+EXPECTED = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads plain values, and OpenCV's matrices as mappings."""
+    """YAML loader for plain values, with OpenCV's matrices as mappings."""
 
 
 _Loader.add_multi_constructor("", lambda loader, suffix, node: _plain(loader, node))
@@ -47,7 +49,7 @@ def _plain(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
 
 
 def read_yaml_camera(where: str, content: bytes, size: tuple[int, int]) -> Camera:
-    """Read the camera in the content of a YAML file. One without a size describes an image of ``size`` (width, height).
+    """Parse the camera in a YAML file. If the file gives no image size, ``size`` (width, height) is assumed.
 
     Raises ``InputError``, whose message begins with ``where``.
     """
@@ -63,13 +65,17 @@ def read_yaml_camera(where: str, content: bytes, size: tuple[int, int]) -> Camer
 
 
 def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
-    """Return the camera in an object of one of these programs. Raises ``InputError``, whose message begins with ``where``."""
+    """Parse the camera in an object written by one of these tools. Raises ``InputError``, whose message
+    begins with ``where``.
+    """
     inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]
     if len(inner) > 1:
-        raise InputError(f"{where}: holds {len(inner)} cameras, expected one; keep the lines of this photo's")
+        raise InputError(
+            f"{where}: holds {len(inner)} cameras, expected one; keep only the lines of this photo's camera"
+        )
     if inner and isinstance(inner[0], Mapping):
         return _kalibr(where, inner[0], size)
-    if isinstance(values.get("intrinsic"), Mapping):  # a view of Open3D
+    if isinstance(values.get("intrinsic"), Mapping):  # a view in Open3D
         return calibrated_camera(where, values["intrinsic"], size)
     flat = _orb_slam(where, values)
     if flat is not None:
@@ -133,7 +139,9 @@ def _camera(
 
 
 def gaussian_splatting_camera(where: str, values: Mapping[str, Any]) -> Intrinsics:
-    """Return a camera of the ``cameras.json`` of 3D Gaussian Splatting, whose principal point is in the middle."""
+    """Parse one camera of 3D Gaussian Splatting's ``cameras.json``, whose principal point is the image
+    centre.
+    """
     numbers = [float(_array(where, values.get(key, "none"))) for key in ("fx", "fy", "width", "height")]
     fx, fy, width, height = numbers
     try:
@@ -148,10 +156,10 @@ def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> Any:
 
 
 def _array(where: str, given: Any) -> np.ndarray:
-    """Return a list, or the data of a matrix of OpenCV or ROS."""
+    """Return a list, or the data of an OpenCV or ROS matrix."""
     found = given.get("data") if isinstance(given, Mapping) else given
     try:
-        return np.asarray(found, dtype=float)  # YAML takes 1e-05 for text
+        return np.asarray(found, dtype=float)  # YAML reads 1e-05 as text
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: {str(given)[:60]!r}, expected numbers") from error
 

@@ -1,4 +1,4 @@
-"""The camera models of COLMAP (https://colmap.github.io/cameras.html). Its pixel centres are at +0.5 like ours."""
+"""COLMAP's camera models (https://colmap.github.io/cameras.html). Its pixel centres are at +0.5, like ours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from bidnerf_core.camera.lenses import LENS_MODEL_IDS, LENS_MODELS, PANORAMA, Ca
 from bidnerf_core.errors import InputError
 
 COLMAP_MODELS: dict[str, tuple[int, ...]] = {
-    # Indices of fx, fy, cx, cy and the distortion (in OpenCV's order) among the parameters; -1 is a coefficient of 0.
+    # Indices of fx, fy, cx, cy and the distortion (in OpenCV's order) among the parameters; -1 stands for a
+    # coefficient of 0.
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
     "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1, -1, -1),
@@ -28,11 +29,11 @@ COLMAP_MODEL_IDS = {
 }
 """The ids of these models in ``cameras.bin``."""
 MODELS = (*COLMAP_MODELS, *LENS_MODELS, PANORAMA)
-"""The names of all models that are read."""
+"""The names of all supported models."""
 MODEL_IDS = COLMAP_MODEL_IDS | LENS_MODEL_IDS
-"""Their names by the ids in ``cameras.bin``."""
+"""The model names by their ids in ``cameras.bin``."""
 MOST_TERMS = 8
-"""Coefficients of distortion of COLMAP's largest perspective model, in OpenCV's order."""
+"""Number of distortion coefficients in COLMAP's largest perspective model, in OpenCV's order."""
 
 
 def colmap_parameters(model: str) -> int:
@@ -43,7 +44,9 @@ def colmap_parameters(model: str) -> int:
 
 
 def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Camera:
-    """Return a camera of one of ``MODELS``. Raises ``InputError``, whose message begins with ``where``."""
+    """Build a camera from one of ``MODELS`` and its parameters. Raises ``InputError``, whose message begins
+    with ``where``.
+    """
     if len(parameters) != colmap_parameters(model):
         raise InputError(
             f"{where}: {model} has {len(parameters)} parameters, expected {colmap_parameters(model)}"
@@ -58,14 +61,15 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
 
 
 def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
-    """Return the name and the parameters of COLMAP's model of a camera, the simplest that has its lens.
+    """Return the name and parameters of the simplest COLMAP model that describes a camera.
 
-    Raises ``InputError`` for thin prism distortion or a tilted sensor, which none has.
+    Raises ``InputError`` for thin prism distortion or a tilted sensor, which no COLMAP model has.
     """
     k = camera.distortion
     if any(k[MOST_TERMS:]):
         raise InputError(
-            "a camera with thin prism distortion or a tilted sensor, expected one that COLMAP has a model of"
+            "a camera with thin prism distortion or a tilted sensor, expected one that a COLMAP model"
+            " describes"
         )
     model, count = (
         ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", MOST_TERMS)

@@ -1,4 +1,4 @@
-"""A photo's EXIF metadata: orientation, focal length, size of the sensor's pixels (EXIF 2.32, CIPA DC-008)."""
+"""A photo's EXIF metadata: orientation, focal length and pixel size (EXIF 2.32, CIPA DC-008)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 @dataclass(frozen=True)
 class Exif:
-    """The tags that describe the camera; None where a tag is missing or makes no sense."""
+    """The tags that describe the camera; None for a tag that is missing or implausible."""
 
     orientation: Orientation = UPRIGHT
     size: tuple[int, int] | None = None  # width and height of the stored image when the photo was taken
-    equivalent_mm: float | None = None  # focal length that gives the same diagonal view on 35 mm film
+    equivalent_mm: float | None = None  # focal length with the same diagonal field of view on 35 mm film
     focal_mm: float | None = None
     pixels_per_mm: tuple[float, float] | None = (
         None  # on the sensor, along the columns and rows of the stored image
@@ -37,7 +37,9 @@ class Exif:
 
 
 def read_exif(path: Path) -> Exif:
-    """Read the tags of an image file; damaged ones count as missing. Raises ``InputError`` where it is not an image."""
+    """Read the tags of an image file; damaged tags count as missing. Raises ``InputError`` if it is not an
+    image.
+    """
     with open_image(path) as image:
         try:
             tags = image.getexif()

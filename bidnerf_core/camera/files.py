@@ -1,7 +1,8 @@
-"""Files of intrinsics.
+"""Files of camera intrinsics.
 
-Known are the JSON of NeRF, nerfstudio, Open3D and 3D Gaussian Splatting, COLMAP's ``cameras.txt``, hloc's lists of images with
-cameras, and the YAML that ``calibrations`` reads. Pixel centres are at +0.5 where a file does not follow OpenCV.
+Supported formats are the JSON of NeRF, nerfstudio, Open3D and 3D Gaussian Splatting, COLMAP's
+``cameras.txt``, hloc's lists of images with cameras, and the YAML that ``calibrations`` reads. Pixel centres
+are at +0.5 unless the format follows OpenCV.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """Intrinsics before the image's size is known; each axis has a focal length (pixels) or a field of view (radians)."""
+    """Intrinsics before the image size is known; each axis has a focal length (pixels) or a field of view
+    (radians).
+    """
 
     record: Record
     width: int | None
@@ -49,15 +52,13 @@ class CameraRecord:
     cx: float | None
     cy: float | None
     distortion: tuple[float, ...]
-    lens: str | None = (
-        None  # the model of a lens that is not perspective; its coefficients are ``distortion``
-    )
+    lens: str | None = None  # the model of a non-perspective lens; its coefficients are ``distortion``
     face: str | None = None  # of a panorama
 
     def intrinsics(self, width: int, height: int) -> Camera:
-        """Return the camera of an image of this size; a principal point that is not given is in the middle.
+        """Return the camera for an image of this size; the principal point defaults to the image centre.
 
-        Raises ``InputError`` for numbers that no camera has.
+        Raises ``InputError`` for implausible values.
         """
         try:
             if self.lens == PANORAMA:
@@ -69,7 +70,7 @@ class CameraRecord:
     def _central(self, width: int, height: int) -> Camera:
         fx = self.focal_x if self.angle_x is None else focal_length(width, self.angle_x)
         fy = self.focal_y if self.angle_y is None else focal_length(height, self.angle_y)
-        assert fx is not None  # camera_record ensures it
+        assert fx is not None  # ensured by camera_record
         cx = width / 2 if self.cx is None else self.cx
         cy = height / 2 if self.cy is None else self.cy
         fy = fx if fy is None else fy
@@ -87,7 +88,7 @@ class CameraRecord:
 def camera_record(record: Record) -> CameraRecord:
     """Read the intrinsics of a frame or of a whole file.
 
-    Raises ``InputError`` for a camera model that is unknown and for a focal length that is missing or not positive.
+    Raises ``InputError`` for an unknown camera model and for a focal length that is missing or not positive.
     """
     lens = _lens(record)
     width, height = record.size("w"), record.size("h")
@@ -113,7 +114,9 @@ def camera_record(record: Record) -> CameraRecord:
 
 
 def _lens(record: Record) -> str | None:
-    """Return the name of a model that is not perspective, in ``LENS_MODELS`` or ``PANORAMA``; None for perspective ones."""
+    """Return the name of a non-perspective model (from ``LENS_MODELS``, or ``PANORAMA``); None for
+    perspective ones.
+    """
     model = (record.text("camera_model") or "").upper()
     if record.value("is_fisheye") and model in ("", *PERSPECTIVE_MODELS):  # some programs write 1 for true
         return "OPENCV_FISHEYE"
@@ -134,7 +137,9 @@ def _coefficients(record: Record) -> tuple[float, ...]:
 
 
 def _focal(record: Record, axis: str) -> tuple[float | None, float | None]:
-    """Return the focal length or the angle of an axis. A frame's own precedes the file's, and pixels precede radians."""
+    """Return the focal length or angle of an axis. A frame's own value takes precedence over the file's, and
+    pixels over radians.
+    """
     for scope in record.scopes():
         focal, angle = scope.number(f"fl_{axis}"), scope.number(f"camera_angle_{axis}")
         if focal is not None:
@@ -159,10 +164,11 @@ def _distortion(record: Record) -> tuple[float, ...]:
 
 
 def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> Camera:
-    """Read the camera in a file of one of the formats above.
+    """Read the camera from a file in one of the formats above.
 
-    Files without a size describe an image of ``size`` (width, height). Where a file holds different cameras, that of the image
-    called ``photo`` is taken. Raises ``InputError`` for other files, and where it is not known which camera is meant.
+    Files without a size are taken to describe an image of ``size`` (width, height). If a file holds several
+    different cameras, the one of the image named ``photo`` is used. Raises ``InputError`` for other files,
+    and if the camera is ambiguous.
     """
     content = read_file(path, "a camera file (JSON, YAML, COLMAP's cameras.txt or a list of images)")
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
@@ -192,13 +198,13 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
 
 
 def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
-    """Read the ``cameras.json`` of 3D Gaussian Splatting: a list, with the names of the images."""
+    """Read 3D Gaussian Splatting's ``cameras.json``: a list of cameras with image names."""
     entries = parse_json(content, str(path), "a camera, or a list of cameras")
     found: dict[str, Camera] = {}
     for number, entry in enumerate(entries):
         if not isinstance(entry, Mapping):
             raise InputError(
-                f"{path}: entry {number} is no camera, expected img_name, width, height, fx and fy"
+                f"{path}: entry {number} is not a camera, expected img_name, width, height, fx and fy"
             )
         found[str(entry.get("img_name", number))] = gaussian_splatting_camera(
             f"{path}: entry {number}", entry
@@ -207,7 +213,7 @@ def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
 
 
 def _chosen(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Camera:
-    """Return the only camera, or that of a photo by its path, its file name or its stem."""
+    """Return the only camera, or the one that matches a photo's path, file name or stem."""
     if len(set(cameras.values())) == 1:
         return next(iter(cameras.values()))
     asked = None if photo is None else PurePosixPath(photo.replace("\\", "/"))
@@ -216,24 +222,27 @@ def _chosen(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Cam
         if len(fits) == 1:
             return fits.pop()
     raise InputError(
-        f"{path}: holds {len(cameras)} cameras, expected one, or one that is called like the photo; keep the line of this photo's"
+        f"{path}: holds {len(cameras)} cameras, expected exactly one, or one named after the photo; keep"
+        " only this photo's line"
     )
 
 
 def read_text_cameras(path: Path) -> dict[int, Camera]:
-    """Read COLMAP's ``cameras.txt`` and return its cameras by their ids. Raises ``InputError``."""
+    """Read COLMAP's ``cameras.txt`` and return its cameras by id. Raises ``InputError``."""
     content = read_file(path, "COLMAP's cameras.txt")
     return {int(key): camera for key, camera in _text_cameras(path, content, named=False).items()}
 
 
 def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, Camera]:
-    """Read rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's with the name of an image instead of the id."""
-    expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it of cameras.bin)"
+    """Parse rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's rows with an image name instead of
+    the id.
+    """
+    expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it from cameras.bin)"
     found: dict[str, Camera] = {}
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
         key, camera = _text_camera(row, named)
         if found.setdefault(key, camera) != camera:
-            raise InputError(f"{row.where}: camera {key} again, expected each id once")
+            raise InputError(f"{row.where}: camera {key} is repeated, expected each id once")
     return found
 
 

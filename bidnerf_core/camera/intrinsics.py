@@ -23,20 +23,21 @@ from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
 LARGEST_SIZE = 1_000_000
-"""Columns or rows of an image."""
+"""Most columns or rows of an image."""
 SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
-"""Limits of focal lengths and of the distance of the principal point, in pixels. Beyond them, float32 overflows."""
+"""Limits of focal lengths and of the principal point's distance, in pixels. Beyond them, float32 overflows."""
 LARGEST_FOCAL = 1000
-"""Focal length of a telescope, in sizes of the image: a field of view of 0.06 degrees."""
+"""Largest focal length, in image widths or heights: that of a telescope with a field of view of 0.06 degrees."""
 SHORTEST_FOCAL, PHOTO, MILLIMETRE = 0.1, 240, 1.0
-"""Least focal length, in sizes of the image (a view of 157 degrees), of images of at least so many pixels along a side. A shorter one
-of more than a millimetre is that: a phone's lens has 4.2 of them."""
+"""Smallest focal length relative to the image size (a view of 157 degrees), for images of at least ``PHOTO``
+pixels along a side. A shorter one above ``MILLIMETRE`` is probably given in millimetres: a phone's lens has
+about 4.2 mm."""
 SKEW = 1e-6
 """Largest skew of a camera matrix, as a share of its focal length."""
 LARGEST_COEFFICIENT = 1e6
-"""Limit of a distortion coefficient; those of rational models reach some hundreds."""
+"""Largest distortion coefficient; those of rational models reach some hundreds."""
 ASPECT_TOLERANCE = 0.005
-"""Relative difference of two aspect ratios that passes for the rounding of a resized image."""
+"""Relative difference between two aspect ratios that is attributed to rounding when an image was resized."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Intrinsics:
             )
 
     def _check_types(self) -> None:
-        """Raise ``InputError`` for what is no number, and for sizes that are not whole."""
+        """Raise ``InputError`` for values that are not numbers, and for sizes that are not integers."""
         for name in ("fx", "fy", "cx", "cy"):
             _require(name, getattr(self, name), Real, "a number of pixels")
         for name in ("width", "height"):
@@ -87,7 +88,7 @@ class Intrinsics:
 
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
-        """Return a camera without distortion; ``focal`` is in pixels, the principal point in the middle of the image."""
+        """Return an undistorted camera; ``focal`` is in pixels, and the principal point is the image centre."""
         _require_size("width", width)
         _require_size("height", height)
         _require("focal length", focal, Real, "a number of pixels")
@@ -100,7 +101,7 @@ class Intrinsics:
 
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
-        """Return a camera without distortion that sees ``degrees`` from the left edge of the image to the right one."""
+        """Return an undistorted camera with a horizontal field of view of ``degrees``."""
         _require("horizontal field of view", degrees, Real, "degrees between 0 and 180")
         _require_size("width", width)
         if not 0 < degrees < 180:
@@ -109,17 +110,19 @@ class Intrinsics:
             )
         focal = focal_length(width, math.radians(degrees))
         if not SMALLEST_FOCAL <= focal <= LARGEST_PIXELS:
-            found = f"horizontal field of view is {degrees}, which makes a focal length of {focal:.3g} pixels"
+            found = f"horizontal field of view is {degrees}, which gives a focal length of {focal:.3g} pixels"
             raise InputError(f"{found}, {_expected_focal(focal)}")
         return Intrinsics.from_focal(focal, width, height)
 
     @staticmethod
     def from_opencv(K: Any, distortion: Any = None, size: tuple[int, int] | None = None) -> Intrinsics:
-        """Return the camera that OpenCV and ROS describe by a matrix, distortion coefficients and the image's size.
+        """Return the camera that OpenCV and ROS describe by a matrix, distortion coefficients and the image
+        size.
 
-        ``K`` (3 x 3) and ``distortion`` (4, 5, 8, 12 or 14 coefficients in any shape; None for an ideal lens) are arrays, tensors
-        or lists, and ``size`` is (width, height) in pixels. OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5):
-        half a pixel is added to the principal point. Raises ``InputError`` for what is no camera.
+        ``K`` (3 x 3) and ``distortion`` (4, 5, 8, 12 or 14 coefficients in any shape; None for an ideal lens)
+        are arrays, tensors or lists, and ``size`` is (width, height) in pixels. OpenCV's first pixel has its
+        centre at (0, 0), ours at (0.5, 0.5), so half a pixel is added to the principal point. Raises
+        ``InputError`` if they do not describe a camera.
         """
         matrix, lens = (
             _numbers("K", K),
@@ -160,16 +163,17 @@ class Intrinsics:
     def cells(
         self, points: Float[Tensor, "n 3"]
     ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Bool[Tensor, "n"]]:
-        """Return row and column of the pixels into which points (camera frame) fall, and which points fall into the image.
+        """Return the row and column of the pixels that contain the projected points (camera frame), and which
+        points are in the image.
 
-        Row and column are 0 for the others.
+        Row and column are 0 for points outside.
         """
         column, row = self.project(points).nan_to_num(-1.0, -1.0, -1.0).floor().unbind(-1)
         inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
         return torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long(), inside
 
     def project(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 2"]:
-        """Return the pixels (u, v) of points in the camera frame; not finite for points at or behind the camera."""
+        """Project points in the camera frame to pixels (u, v); not finite for points at or behind the camera."""
         z = torch.where(points[..., 2] > 0, points[..., 2], torch.nan)
         u = points[..., 0] / z * self.fx + self.cx
         v = points[..., 1] / z * self.fy + self.cy
@@ -189,7 +193,7 @@ class Intrinsics:
         return torch.stack([u, v], dim=-1)
 
     def scaled(self, factor: float) -> Intrinsics:
-        """Return the camera of an image that is ``factor`` times as large."""
+        """Return the camera of an image scaled by ``factor``."""
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def at_most(self, largest: int) -> Intrinsics:
@@ -204,11 +208,15 @@ class Intrinsics:
         )
 
     def quarter_turns(self) -> tuple[Intrinsics, ...]:
-        """Return this camera turned by a quarter, to one side and to the other; none if its sensor is tilted (14 coefficients)."""
+        """Return this camera rotated by 90 degrees to either side; none if its sensor is tilted (14
+        coefficients).
+        """
         return () if any(self.distortion[TAU_X:]) else tuple(map(self.upright, QUARTER_TURNS))
 
     def centre_crop(self, width: int, height: int) -> Intrinsics:
-        """Return the camera of the largest centred part of the image that has the shape of another size, at that size."""
+        """Return the camera of the largest centred crop with the aspect ratio of the given size, resized to
+        that size.
+        """
         scale = max(width / self.width, height / self.height)
         return replace(
             self, fx=self.fx * scale, fy=self.fy * scale, cx=width / 2 + (self.cx - self.width / 2) * scale,
@@ -216,9 +224,10 @@ class Intrinsics:
         )  # fmt: skip
 
     def upright(self, orientation: Orientation) -> Intrinsics:
-        """Return the camera of the upright image; this one is of the image as it is stored.
+        """Return the camera of the upright image; this one describes the image as stored.
 
-        Raises ``InputError`` where an image with a tilted sensor (14 distortion coefficients) is transposed.
+        Raises ``InputError`` if an image with a tilted sensor (14 distortion coefficients) would be
+        transposed.
         """
         camera = self
         if orientation.mirrors_columns:
@@ -237,13 +246,13 @@ class Intrinsics:
         return Intrinsics(self.fy, self.fx, self.cy, self.cx, self.height, self.width, distortion)
 
     def _distortion_at(self, points: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
-        """Return the camera matrix (3 3) and the distortion coefficients, where ``points`` lie."""
+        """Return the camera matrix (3 3) and the distortion coefficients, on the device of ``points``."""
         rows = (self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0)
         return constant(rows, points).reshape(3, 3), constant(tuple(self.distortion), points)
 
 
 def question_focal(focal: float, width: int, height: int) -> None:
-    """Raise ``InputError`` for a focal length that cannot be in pixels, since such a wide view is that of no lens."""
+    """Raise ``InputError`` for a focal length that cannot be in pixels because no lens has such a wide view."""
     if MILLIMETRE <= focal < SHORTEST_FOCAL * max(width, height) and max(width, height) >= PHOTO:
         angle = 2 * math.degrees(math.atan(max(width, height) / 2 / focal))
         raise InputError(
@@ -289,7 +298,7 @@ def _require_size(name: str, value: object) -> None:
 
 
 P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13
-"""Places of those distortion coefficients that depend on the directions of the axes."""
+"""Indices of the distortion coefficients that depend on the directions of the axes."""
 TRANSPOSED = {P1: P2, P2: P1, S1: S3, S2: S4, S3: S1, S4: S2}
 
 
@@ -303,7 +312,7 @@ def focal_length(pixels: int, angle: float) -> float:
 
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes (width, height) may be of one image at two resolutions."""
+    """Whether two sizes (width, height) may belong to one image at two resolutions."""
     ratio = size[0] * other[1] / (size[1] * other[0])
     return abs(ratio - 1) <= ASPECT_TOLERANCE
 
@@ -315,15 +324,15 @@ def reduced_size(width: int, height: int, largest: int) -> tuple[int, int]:
 
 
 CameraGroup = tuple[Intrinsics, ...]
-"""Cameras that were all turned to the same side, if they were turned at all."""
+"""Cameras that were all rotated to the same side, if at all."""
 
 
 @lru_cache(maxsize=64)
 def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
     """Return the ``cameras`` whose images have the aspect ratio of another size, resized to it.
 
-    If there are none, those whose images have it after a quarter turn are returned, in two groups: turned to one side, and to
-    the other. Empty if there are none of these either.
+    If there are none, cameras that match after a quarter turn are returned, in two groups: turned to one
+    side, and to the other. Empty if there are none of these either.
     """
     size = (width, height)
     same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
@@ -336,9 +345,9 @@ def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[Came
 
 @lru_cache(maxsize=64)
 def centre_crop_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return all ``cameras``, cropped about the centre to the aspect ratio of another size and resized to it.
+    """Return all ``cameras``, centre-cropped to the aspect ratio of another size and resized to it.
 
-    Landscape cameras are turned to either side for a portrait size, and vice versa.
+    Landscape cameras are turned to both sides for a portrait size, and vice versa.
     """
     size = (width, height)
     return tuple(tuple(c.centre_crop(*size) for c in group) for group in _oriented(cameras, *size))
@@ -346,9 +355,9 @@ def centre_crop_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[
 
 @lru_cache(maxsize=64)
 def stretched_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return all ``cameras``, resized to another size whatever their aspect ratio.
+    """Return all ``cameras``, resized to another size regardless of their aspect ratio.
 
-    Landscape cameras are turned to either side for a portrait size, and vice versa.
+    Landscape cameras are turned to both sides for a portrait size, and vice versa.
     """
     return tuple(
         tuple(dict.fromkeys(camera.resized(width, height) for camera in group))
@@ -357,12 +366,14 @@ def stretched_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[Ca
 
 
 def median_camera(group: CameraGroup) -> Intrinsics:
-    """Return the camera with the median focal length, the lower of the two middle ones."""
+    """Return the camera with the (lower) median focal length."""
     return sorted(group, key=lambda camera: camera.fx)[(len(group) - 1) // 2]
 
 
 def _oriented(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return the cameras turned to landscape or portrait like another size: one group, or two if any had to be turned."""
+    """Return the cameras in the landscape or portrait orientation of another size: one group, or two if any
+    had to be turned.
+    """
     ways = [
         (camera,) if (camera.width - camera.height) * (width - height) >= 0 else camera.quarter_turns()
         for camera in cameras

@@ -1,7 +1,9 @@
-"""Lenses that no pinhole camera with a polynomial describes. Their images are resampled to those of pinhole cameras on reading.
+"""Lenses that no pinhole camera with polynomial distortion describes. Their images are resampled to pinhole
+cameras on reading.
 
-Fisheye and division lenses become one pinhole camera each, panoramas (equirectangular images) six, see ``PANORAMA_FACES``. The models are COLMAP's (https://colmap.github.io/cameras.html), whose fisheye model of four coefficients is OpenCV's (Kannala and
-Brandt 2006). Pixel centres are at +0.5.
+Fisheye and division lenses become one pinhole camera each, panoramas (equirectangular images) six, see
+``PANORAMA_FACES``. The models are COLMAP's (https://colmap.github.io/cameras.html), whose four-coefficient
+fisheye model is OpenCV's (Kannala and Brandt 2006). Pixel centres are at +0.5.
 """
 
 from __future__ import annotations
@@ -22,10 +24,12 @@ from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.errors import InputError
 
 WIDEST = math.radians(60)
-"""Largest angle from the optical axis to the middle of a side of an undistorted image: beyond it, pixels are stretched."""
+"""Largest angle between the optical axis and the middle of a side of an undistorted image: beyond it, pixels
+are stretched."""
 FISHEYE, DIVISION, PANORAMA = "OPENCV_FISHEYE", "DIVISION", "EQUIRECTANGULAR"
 LENS_MODELS: dict[str, tuple[str, tuple[int, ...]]] = {
-    # Our model, and the indices of fx, fy, cx, cy and its coefficients among the parameters; -1 is a coefficient of 0.
+    # Our model name, and the indices of fx, fy, cx, cy and its coefficients among the parameters; -1 stands
+    # for a coefficient of 0.
     "OPENCV_FISHEYE": (FISHEYE, (0, 1, 2, 3, 4, 5, 6, 7)),
     "SIMPLE_RADIAL_FISHEYE": (FISHEYE, (0, 0, 1, 2, 3, -1, -1, -1)),
     "RADIAL_FISHEYE": (FISHEYE, (0, 0, 1, 2, 3, 4, -1, -1)),
@@ -51,14 +55,15 @@ LENS_MODEL_IDS = {
 PANORAMA_FACES = {  # name: yaw to the right and pitch upwards, degrees
     "front": (0, 0), "right": (90, 0), "back": (180, 0), "left": (270, 0), "up": (0, 90), "down": (0, -90),
 }  # fmt: skip
-"""The pinhole views, of 90 degrees each, into which a panorama is cut: the faces of a cube."""
+"""The pinhole views, of 90 degrees each, into which a panorama is divided: the faces of a cube."""
 
 
 class Lens(ABC):
-    """A camera whose images are resampled on reading to those of a ``pinhole`` camera at the same pose, or turned from it.
+    """A camera whose images are resampled on reading to a ``pinhole`` camera at the same pose, or rotated
+    from it.
 
-    Images are upright by the time they are resampled: ``orientation`` turns the stored image, which the numbers of the lens
-    are given for, upright.
+    Images are upright by the time they are resampled. The lens parameters refer to the stored image, which
+    ``orientation`` turns upright.
     """
 
     stored_width: int
@@ -67,12 +72,12 @@ class Lens(ABC):
 
     @property
     def width(self) -> int:
-        """Columns of the upright image."""
+        """Width of the upright image in pixels."""
         return self.orientation.upright_size(self.stored_width, self.stored_height)[0]
 
     @property
     def height(self) -> int:
-        """Rows of the upright image."""
+        """Height of the upright image in pixels."""
         return self.orientation.upright_size(self.stored_width, self.stored_height)[1]
 
     @abstractmethod
@@ -81,12 +86,12 @@ class Lens(ABC):
 
     @abstractmethod
     def upright(self, orientation: Orientation) -> Lens:
-        """Return the lens of the upright image; this one is of the image as it is stored."""
+        """Return the lens of the upright image; this one describes the image as stored."""
 
     @property
     @abstractmethod
     def flat(self) -> Intrinsics:
-        """The pinhole camera of the resampled image, before that is turned upright."""
+        """The pinhole camera of the resampled image before that is turned upright."""
 
     @property
     def pinhole(self) -> Intrinsics:
@@ -98,9 +103,10 @@ class Lens(ABC):
         """Return the pixels (u, v) of the stored image that show points of the plane z = 1 of the pinhole camera."""
 
     def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
-        """Return an upright image (h, w) or (h, w, c) as the ``pinhole`` camera sees it.
+        """Resample an upright image (h, w) or (h, w, c) to the ``pinhole`` camera.
 
-        Values are interpolated, and repeated beyond the borders, or they are those of the ``nearest`` pixel, and 0 beyond.
+        Values are interpolated, and replicated beyond the borders; with ``nearest``, they are those of the
+        nearest pixel, and 0 beyond.
         """
         u, v = _lookup(self)
         method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
@@ -116,7 +122,7 @@ class Lens(ABC):
     @property
     @abstractmethod
     def sentence(self) -> str:
-        """What is done with the image, for people."""
+        """Human-readable description of what is done with the image."""
 
 
 Camera: TypeAlias = Intrinsics | Lens
@@ -134,7 +140,7 @@ class CentralLens(Lens):
     stored_width: int
     stored_height: int
     coefficients: tuple[float, ...]
-    name: str  # of the model, as its file has it
+    name: str  # of the model, as in its file
     orientation: Orientation = UPRIGHT
 
     def __post_init__(self) -> None:
@@ -143,11 +149,12 @@ class CentralLens(Lens):
         )  # checks the numbers
         if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.coefficients):
             raise InputError(
-                f"coefficients of {self.name} are {self.coefficients}, expected those of a real lens"
+                f"the coefficients of {self.name} are {self.coefficients}, expected those of a real lens"
             )
         if not all(map(math.isfinite, self._angles)):
             raise InputError(
-                f"{self.name} with coefficients {self.coefficients} maps no ray to a side of its image, expected a real lens's"
+                f"{self.name} with coefficients {self.coefficients} maps no ray to a side of its image,"
+                " expected coefficients of a real lens"
             )
 
     def resized(self, width: int, height: int) -> CentralLens:
@@ -163,8 +170,8 @@ class CentralLens(Lens):
 
     @property
     def flat(self) -> Intrinsics:
-        """A camera of the same focal length that sees as far to each side as the lens does in the middle of that side, but at
-        most 60 degrees from the axis.
+        """A camera of the same focal length. It sees as far to each side as the lens does in the middle of
+        that side, but at most 60 degrees from the axis.
         """
         left, right, top, bottom = (math.tan(min(angle, WIDEST)) for angle in self._angles)
         width, height = (math.ceil(size) for size in (self.fx * (left + right), self.fy * (top + bottom)))
@@ -172,13 +179,17 @@ class CentralLens(Lens):
 
     @property
     def _angles(self) -> tuple[float, ...]:
-        """The angles (radians) from the axis to the left, right, top and bottom sides; NaN where no ray meets a side."""
+        """Angles (radians) from the axis to the left, right, top and bottom sides; NaN if no ray meets a
+        side.
+        """
         w, h = self.stored_width, self.stored_height
         sides = (self.cx / self.fx, (w - self.cx) / self.fx, self.cy / self.fy, (h - self.cy) / self.fy)
         return tuple(self._angle(radius) for radius in sides)
 
     def _angle(self, radius: float) -> float:
-        """Return the angle at which rays meet the image ``radius`` (over the focal length) from the principal point."""
+        """Return the angle at which rays meet the image ``radius`` (over the focal length) from the principal
+        point.
+        """
         if radius <= 0:
             return math.nan
         if self.model == DIVISION:
@@ -216,7 +227,9 @@ class CentralLens(Lens):
 
 @dataclass(frozen=True)
 class PanoramaFace(Lens):
-    """One of ``PANORAMA_FACES`` of an equirectangular image, whose middle shows what is in front of the camera."""
+    """One of ``PANORAMA_FACES`` of an equirectangular image, whose middle shows what is in front of the
+    camera.
+    """
 
     face: str
     stored_width: int
@@ -226,7 +239,7 @@ class PanoramaFace(Lens):
     def __post_init__(self) -> None:
         if not same_aspect((self.stored_width, self.stored_height), (2, 1)):
             size = f"{self.stored_width}x{self.stored_height}"
-            raise InputError(f"equirectangular image is {size}, expected twice as many columns as rows")
+            raise InputError(f"an equirectangular image is {size}, expected twice as many columns as rows")
 
     def resized(self, width: int, height: int) -> PanoramaFace:
         return replace(self, stored_width=width, stored_height=height)
@@ -238,14 +251,14 @@ class PanoramaFace(Lens):
 
     @property
     def flat(self) -> Intrinsics:
-        """A camera of 90 degrees with the resolution of the panorama at its horizon."""
+        """A camera with a 90 degree field of view and the panorama's resolution at the horizon."""
         focal = self.stored_width / (2 * math.pi)
         side = max(1, round(2 * focal))
         return Intrinsics(side / 2, side / 2, side / 2, side / 2, side, side)
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """The axes of the face in the camera of the panorama: R_panorama_face, OpenCV axes."""
+        """The axes of the face in the panorama's camera: R_panorama_face, OpenCV axes."""
         yaw, pitch = map(math.radians, PANORAMA_FACES[self.face])
         turn = np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
         tilt = np.array(
@@ -261,7 +274,7 @@ class PanoramaFace(Lens):
         return np.stack([u * self.stored_width, v * self.stored_height], axis=-1)
 
     def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
-        """Return the face; the left and right edges of the panorama continue each other."""
+        """Resample the face; the left and right edges of the panorama join."""
         u, v = _lookup(self)
         method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         wrapped = cv2.copyMakeBorder(image, 0, 0, 1, 1, cv2.BORDER_WRAP)
@@ -271,12 +284,17 @@ class PanoramaFace(Lens):
     @property
     def sentence(self) -> str:
         flat = self.pinhole
-        return f"the {self.face} of an equirectangular image, as a pinhole camera of {flat.width}x{flat.height}, 90 degrees"
+        return (
+            f"the {self.face} face of an equirectangular image, as a pinhole camera of"
+            f" {flat.width}x{flat.height}, 90 degrees"
+        )
 
 
 @lru_cache(maxsize=2)
 def _lookup(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Return column and row, in OpenCV's pixels, of the upright image that each pixel of the resampled image shows."""
+    """Return the column and row (OpenCV pixel convention) of the upright image that each resampled pixel
+    shows.
+    """
     flat, turn = lens.flat, lens.orientation
     columns, rows = (np.arange(size) + 0.5 for size in (flat.width, flat.height))
     places = np.stack(np.meshgrid((columns - flat.cx) / flat.fx, (rows - flat.cy) / flat.fy), axis=-1)
@@ -292,7 +310,7 @@ def _lookup(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lens_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Lens:
-    """Return a camera of one of ``LENS_MODELS``, or the front of a panorama.
+    """Return a camera of one of ``LENS_MODELS``, or the front face of a panorama.
 
     Raises ``InputError``, whose message begins with ``where``.
     """

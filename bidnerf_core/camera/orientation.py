@@ -1,4 +1,4 @@
-"""The eight orientations of EXIF, which relate an image as stored to the image as it should be shown."""
+"""The eight EXIF orientations, which relate an image as stored to the image as displayed."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Orientation:
         return Orientation(*CODES.get(code, (False, False, False)))
 
     def upright(self, image: Shaped[Tensor, "sh sw *channels"]) -> Shaped[Tensor, "h w *channels"]:
-        """Return the upright image of a stored one."""
+        """Turn a stored image upright."""
         axes = [axis for axis, flips in ((0, self.mirrors_rows), (1, self.mirrors_columns)) if flips]
         turned = image.flip(axes) if axes else image
         return turned.transpose(0, 1).contiguous() if self.transposes else turned
 
     def upright_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return width and height of the upright image of a stored one of this size."""
+        """Return the width and height of the upright image for a stored image of this size."""
         return (height, width) if self.transposes else (width, height)
 
 
@@ -45,4 +45,4 @@ CODES = {
     8: (True, False, True),
 }
 QUARTER_TURNS = tuple(Orientation(*CODES[code]) for code in (6, 8))
-"""The orientations of a camera that was turned by 90 degrees to one side, and to the other."""
+"""The orientations of a camera turned by 90 degrees to one side and to the other."""

@@ -19,8 +19,8 @@ from bidnerf_core.geometry.rotations import cross_matrix
 from bidnerf_core.geometry.se3 import SE3
 
 MOVE, TURN = 0.005, 0.01
-"""Typical motion of a hand-held camera while its rows are exposed (a few hundredths of a second): translation along each axis
-as a share of the distance of what it sees, and rotation about each axis in radians.
+"""Typical motion of a hand-held camera during readout (a few hundredths of a second): translation along each
+axis relative to the viewing distance, and rotation about each axis in radians.
 """
 
 
@@ -37,27 +37,28 @@ class MotionPrior:
 
     @staticmethod
     def usual(distance: float) -> MotionPrior:
-        """Return the prior of a hand-held camera that views things at a ``distance`` (metres)."""
+        """Return the prior of a hand-held camera whose scene is at ``distance`` (metres)."""
         return MotionPrior(MOVE * distance, TURN)
 
 
 AT_REST = torch.zeros(6, dtype=torch.float64)
 """No motion."""
 STILL = MotionPrior()
-"""The prior of a camera that does not move, or whose rows are all exposed at once."""
+"""The prior of a static camera or a global shutter."""
 
 
 def exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return the time at which each pixel was exposed, as a share of the readout time: -0.5 to 0.5, zero at the middle row.
+    """Return each pixel's exposure time as a fraction of the readout time: -0.5 to 0.5, zero at the middle
+    row.
 
-    Sensors are wider than they are high, so the sensor's rows are the columns of a portrait image; square images count as
-    landscape. The direction of the readout does not matter: reversing it reverses the motion.
+    Sensors are wider than they are high, so the sensor's rows are the columns of a portrait image; square
+    images count as landscape. The direction of the readout does not matter: reversing it reverses the motion.
     """
     return _times_along(pixels, camera, 0 if camera.height > camera.width else 1)
 
 
 def transposed_exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return ``exposure_times`` for rows along the other axis, as in a portrait crop of a landscape image."""
+    """Return ``exposure_times`` with rows along the other axis, as in a portrait crop of a landscape image."""
     return _times_along(pixels, camera, 1 if camera.height > camera.width else 0)
 
 
@@ -66,9 +67,9 @@ def _times_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) ->
 
 
 def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "*m 6"]) -> SE3:
-    """Return T_middle_row, the pose of the camera at each moment in the frame of the camera at the middle row.
+    """Return T_middle_row: the camera's pose at each time, relative to the camera at the middle row.
 
-    ``motion`` is that of one image, or of the image of each moment.
+    ``motion`` belongs to a single image, or holds one row per time.
     """
     return SE3.exp(times[:, None] * motion.to(times))
 
@@ -76,7 +77,9 @@ def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "*m 6"]) -> S
 def moved_points(
     points: Float[Tensor, "m 3"], times: Float[Tensor, "m"], motion: Float[Tensor, "6"]
 ) -> Float[Tensor, "m 3"]:
-    """Return points in the frame of the camera at their times of exposure, given in the camera's frame at the middle row."""
+    """Transform points from the camera frame at the middle row to the camera frame at their times of
+    exposure.
+    """
     found = moved_array(points.double().numpy(), times.numpy(), motion.numpy())
     return torch.from_numpy(found).to(points.dtype)
 
@@ -84,7 +87,7 @@ def moved_points(
 def moved_array(
     points: Float[np.ndarray, "m 3"], times: Float[np.ndarray, "m"], motion: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "m 3"]:
-    """Return ``moved_points`` for NumPy arrays, with the inverse of the exponential map to second order."""
+    """Compute ``moved_points`` for NumPy arrays, with the inverse exponential to second order."""
     turning = cross_matrix(motion[3:]).T
     velocity = motion[:3] + points @ turning
     share = times[:, None]

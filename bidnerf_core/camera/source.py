@@ -1,4 +1,4 @@
-"""The sources of a photo's intrinsics: the user, a file, or the photo's own EXIF."""
+"""Where a photo's intrinsics come from: the user, a file, or the photo's EXIF."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from bidnerf_core.errors import InputError
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; 35 mm-equivalent focal lengths refer to it (CIPA DCG-001)."""
 LEAST_CROP = 0.5
-"""Smallest share of the width or of the height at which a cropped photo is assumed to have kept its resolution."""
+"""Smallest fraction of the width or height at which a cropped photo is assumed to have kept its resolution."""
 CAMERA_FILES = ("camera.json", "cameras.txt")
 """Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 NO_EXIF = Exif()
-MIDDLE = "the principal point is assumed in the middle"
+MIDDLE = "the principal point is assumed to be the image centre"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
 
 
@@ -40,12 +40,12 @@ class FoundCamera:
 
     intrinsics: Intrinsics
     description: str
-    approximate: bool = False  # whether the focal length is a nominal one, as in EXIF
-    lens: Lens | None = None  # from whose images those of ``intrinsics`` are resampled
+    approximate: bool = False  # whether the focal length is only nominal, as in EXIF
+    lens: Lens | None = None  # the lens whose images are resampled to ``intrinsics``
 
     @property
     def camera(self) -> Camera:
-        """The camera of the image as it is read: the lens, or the intrinsics."""
+        """The camera of the image as read: the lens, or the intrinsics."""
         return self.lens or self.intrinsics
 
     def at_most(self, largest: int | None) -> FoundCamera:
@@ -86,9 +86,10 @@ class Raster:
         return self.orientation.upright_size(self.width, self.height)
 
     def upright(self, camera: CameraKind) -> CameraKind | None:
-        """Return a given camera for the upright image, or None where its aspect ratio fits neither orientation.
+        """Return a given camera for the upright image, or None if its aspect ratio fits neither orientation.
 
-        A camera that fits the stored image is assumed to describe that (COLMAP ignores EXIF's orientation, too).
+        A camera that fits the stored image is assumed to describe that image (COLMAP ignores the EXIF
+        orientation too).
         """
         given = (camera.width, camera.height)
         if same_aspect(given, self.size):
@@ -98,10 +99,10 @@ class Raster:
 
 @dataclass(frozen=True)
 class CameraSource:
-    """All that is known of the camera of some images, beside their EXIF.
+    """All that is known about the camera of some images, apart from their EXIF.
 
-    At most one of intrinsics or a file that holds them, a focal length and a field of view is given. ``assumed`` are cameras
-    of which one probably took the images whose focal length is unknown.
+    At most one of these is given: intrinsics or a file with them, a focal length, a field of view.
+    ``assumed`` are candidate cameras for images whose focal length is unknown.
     """
 
     camera: Camera | str | Path | None = None
@@ -111,26 +112,27 @@ class CameraSource:
 
     @property
     def is_given(self) -> bool:
-        """Whether the camera is given, rather than to be found in EXIF or assumed."""
+        """Whether the camera is given, as opposed to found in EXIF or assumed."""
         return any(given is not None for given in (self.camera, self.focal, self.hfov))
 
     def require(self, path: Path, why: str) -> None:
-        """Raise ``InputError`` where no camera is given or assumed; ``why`` is the reason why one is needed."""
+        """Raise ``InputError`` if no camera is given or assumed; ``why`` states why one is needed."""
         if not self.is_given and not self.assumed:
             raise InputError(f"{path}: {why}, expected a camera: {WAYS}")
 
     def find(self, where: Path | str, raster: Raster, exif: Exif = NO_EXIF) -> FoundCamera:
-        """Return the camera of an upright image: the given one, else that of EXIF, else one of the ``assumed`` ones.
+        """Return the camera of an upright image: the given one, else the one in EXIF, else one of the
+        ``assumed`` ones.
 
-        Raises ``InputError``, whose message begins with ``where``, if several are given, if none is known, and if the camera
-        belongs to an image of another aspect ratio.
+        Raises ``InputError``, whose message begins with ``where``, if several cameras are given, if none is
+        known, and if the camera has another aspect ratio than the image.
         """
         camera, focal, hfov, size = self.camera, self.focal, self.hfov, raster.upright_size
         if sum(given is not None for given in (camera, focal, hfov)) > 1:
             raise InputError(f"{where}: several cameras are given, expected one of {WAYS}")
         try:
             if focal is not None:
-                return _described(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px as given")
+                return _described(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px, as given")
             if hfov is not None:
                 return _described(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
         except InputError as error:
@@ -144,7 +146,7 @@ class CameraSource:
         return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
     def at(self, image: Path) -> Callable[[int, int], Camera]:
-        """Return the function that finds the camera of the file ``image``, without EXIF, from its width and height."""
+        """Return a function of width and height that finds the camera of the file ``image`` without EXIF."""
         return lambda width, height: self.find(image, Raster(width, height)).camera
 
 
@@ -155,14 +157,14 @@ def folder_camera(
     unknown: str = "",
     ways: str = "a file",
 ) -> CameraSource:
-    """Return the single camera of a recording whose format has none in its files.
+    """Return the single camera of a recording whose format stores none.
 
-    It is the ``given`` one (intrinsics or a file), that of one of ``CAMERA_FILES`` in ``folder``, or the ``published`` one of
-    the format. Raises ``InputError`` where none of them exists, with the reason ``unknown`` and the ``ways`` to give one, and
-    for a given file that does not exist.
+    It is the ``given`` one (intrinsics or a file), the one in ``CAMERA_FILES`` in ``folder``, or the
+    ``published`` one of the format. Raises ``InputError`` if there is none, with the reason ``unknown`` and
+    the ``ways`` to give one, and for a given file that does not exist.
     """
     if isinstance(given, Path) and not given.exists():
-        raise InputError(f"{given}: no such file, expected as the camera of {folder}: {ways}")
+        raise InputError(f"{given}: no such file, expected the camera of {folder}: {ways}")
     beside = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
     found = given or beside or published
     if found is None:
@@ -186,9 +188,11 @@ def _described(camera: Intrinsics, origin: str) -> FoundCamera:
 
 
 def _of_kind(camera: object) -> str:
-    """Return what was given as a camera, and what is expected."""
+    """Describe what was given as a camera, and what is expected."""
     matrix = getattr(camera, "shape", None) == (3, 3)
-    hint = "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them of a matrix" if matrix else ""
+    hint = (
+        "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix" if matrix else ""
+    )
     return f"a {type(camera).__name__}, expected Intrinsics or the path of a camera file{hint}"
 
 
@@ -197,7 +201,8 @@ def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCame
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
         raise InputError(
-            f"{where}: image is {size}, its camera is for {given.width}x{given.height}; expected one of the same aspect ratio"
+            f"{where}: image is {size}, but its camera is for {given.width}x{given.height}, expected one"
+            " with the same aspect ratio"
         )
     if isinstance(fitted, Lens):
         return FoundCamera(fitted.pinhole, f"{origin}: {fitted.sentence}", lens=fitted)
@@ -209,9 +214,9 @@ def _focal(camera: Intrinsics) -> str:
 
 
 def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
-    """Return the camera that EXIF describes, accurate to a few percent; the lens is assumed to be free of distortion.
+    """Return the camera that EXIF describes, accurate to a few percent and assumed to be free of distortion.
 
-    Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken.
+    Raises ``InputError`` if there is no focal length, and if the image was cropped after it was taken.
     """
     taken = exif.size
     if taken and _is_cropped(raster, taken):
@@ -224,16 +229,17 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
 
 
 def _camera_of_crop(where: str, raster: Raster, exif: Exif, taken: tuple[int, int]) -> FoundCamera:
-    """Return the camera of a photo that was cropped after EXIF was written, when its size was ``taken``.
+    """Return the camera of a photo that had the size ``taken`` when EXIF was written, and was cropped later.
 
-    It is assumed to have kept its resolution, unless it is far smaller or larger: then it is taken for a resized centre crop.
+    It is assumed to have kept its resolution unless its size differs greatly; then it is treated as a resized
+    centre crop.
     """
     ratio = max(raster.width / taken[0], raster.height / taken[1])
     fits = raster.width <= taken[0] and raster.height <= taken[1]
     scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
     whole = (round(taken[0] * scale), round(taken[1] * scale))
     found = _by_exif(where, raster, exif, whole)
-    return replace(found, description=f"{found.description}; a crop of a photo of {taken[0]}x{taken[1]}")
+    return replace(found, description=f"{found.description}; cropped from a photo of {taken[0]}x{taken[1]}")
 
 
 def _is_cropped(raster: Raster, taken: tuple[int, int]) -> bool:
@@ -241,7 +247,7 @@ def _is_cropped(raster: Raster, taken: tuple[int, int]) -> bool:
 
 
 def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> FoundCamera:
-    """Return the camera of an image that is, or was cropped from, one of the size ``whole``."""
+    """Return the camera of an image of the size ``whole``, or cropped from one."""
     if exif.equivalent_mm is not None:
         focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
         return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF")
@@ -257,9 +263,10 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
-    """Return the camera with the median focal length among those of the same aspect ratio, or else among centre crops.
+    """Return the camera with the median focal length among those of the same aspect ratio, or else among
+    centre crops.
 
-    Where it is not known to which side the camera was turned, only its focal length is used.
+    If it is unknown to which side the camera was turned, only the focal length is used.
     """
     size = raster.upright_size
     whole = cameras_at_size(tuple(cameras), *size)

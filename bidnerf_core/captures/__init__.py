@@ -1,1 +1,1 @@
-"""Captures: what the images of a map say about its poses, coverage and landmarks."""
+"""Captures: what a map's images reveal about its poses, coverage and landmarks."""

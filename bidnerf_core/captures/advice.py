@@ -1,4 +1,4 @@
-"""The record of a capture in words: what is wrong, and what to photograph next."""
+"""A capture's report in words: what is wrong, and what to photograph next."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from bidnerf_core.captures.report import Arrangement, CaptureReport, Gap, PhotoP
 SUMMARY_LINES = 5
 """Largest number of lines of a summary."""
 MOST_NAMES = 6
-"""Number of photos that a sentence lists before it counts the others."""
+"""Number of photos listed in a sentence; the rest are only counted."""
 SAME_HEIGHT = 10.0
-"""Degrees between the lowest and the highest cameras below which all count as equally high."""
+"""Range of camera elevations (degrees) below which all cameras count as equally high."""
 THIN = 0.6
-"""Share of landmarks in only two photos above which more overlap is advised."""
+"""Fraction of landmarks seen in only two photos above which more overlap is advised."""
 DRIFTING = 1.0
-"""Stops between the darkest and the brightest tenth above which a locked exposure is advised."""
+"""Exposure range (stops) between the darkest and brightest tenth of the photos above which locking it is
+advised."""
 LEAST_PHOTOS = 8
 """Number of photos below which a map is hardly possible."""
 
@@ -24,43 +25,43 @@ ARRANGEMENTS: dict[Arrangement, str] = {
     "inside": "taken from inside the scene",
     "one side": "taken from one side of the scene",
     "one place": "taken from one place",
-    "unknown": "too few to tell how they lie",
+    "unknown": "too few to tell how they are arranged",
 }
 PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
     "mirrored": ("mirrored", "flip the image back, and turn off the mirroring of selfies"),
     "turned": (
-        "turned against the pose",
+        "rotated against the pose",
         "rotate the image, or the pose, so that both agree on what is up",
     ),
-    "badly posed": ("not where the given pose says, by the landmarks of other photos", "estimate such poses anew, or leave the photos out"),
+    "badly posed": ("not where the given pose says, according to the landmarks of other photos", "re-estimate such poses, or leave the photos out"),
     "apart": (
-        "linked to the rest by no landmarks",
-        "photos of another place need a map of their own; otherwise take some in between",
+        "not linked to the rest by any landmark",
+        "photos of another place need a map of their own; otherwise take more in between",
     ),
     "isolated": (
         "short of landmarks in common with others",
-        "leave such photos out, or take some between them and the rest",
+        "leave such photos out, or take more between them and the rest",
     ),
-    "blurred": ("blurred compared with photos from nearby", "take such photos again, with more light or a steadier camera"),
-    "badly exposed": ("exposed differently from the rest", "take such photos again with locked exposure"),
+    "blurred": ("blurred compared with nearby photos", "retake such photos with more light or a steadier camera"),
+    "badly exposed": ("exposed differently from the rest", "retake such photos with locked exposure"),
 }  # fmt: skip
 """How each problem reads after "is" or "are", and what helps."""
 
 
 def sentences(report: CaptureReport) -> list[str]:
-    """Return all that is worth saying about a capture, one or two sentences per line, the gravest problems first."""
+    """Return all remarks on a capture, one or two sentences per line, the most serious problems first."""
     return [_overview(report), *_trial(report), *_problems(report), *_advice(report)]
 
 
 def summary(report: CaptureReport) -> list[str]:
-    """Return at most ``SUMMARY_LINES`` lines, of which the last says how many were left out, if any."""
+    """Return at most ``SUMMARY_LINES`` lines; the last one says how many were left out, if any."""
     lines = sentences(report)
     if len(lines) <= SUMMARY_LINES:
         return lines
     left = len(lines) - SUMMARY_LINES + 1
     return [
         *lines[: SUMMARY_LINES - 1],
-        f"{left} more remarks: 'bidnerf info' prints them, with --draw a picture",
+        f"{left} more remarks: 'bidnerf info' prints them all, and --draw plots the capture",
     ]
 
 
@@ -72,10 +73,10 @@ def _overview(report: CaptureReport) -> str:
     heights = f", {low:.0f}° to {high:.0f}° above the horizon" if around else ""
     first = f"{_photos(count)}, {ARRANGEMENTS[covered.arrangement]}{heights}"
     if not covered.landmarks:
-        return f"{first}; no landmark that several of them show could be triangulated"
+        return f"{first}; no landmark seen by several of them could be triangulated"
     return (
-        f"{first}; {covered.landmarks} triangulated landmarks, a typical one seen in {covered.seen_by:.0f} photos"
-        f" within {covered.seen_within_deg:.0f}°"
+        f"{first}; {covered.landmarks} triangulated landmarks, typically seen in {covered.seen_by:.0f}"
+        f" photos within {covered.seen_within_deg:.0f}°"
     )
 
 
@@ -85,16 +86,16 @@ def _trial(report: CaptureReport) -> Iterator[str]:
         return
     errors = f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
     yield (
-        f"of {_photos(trial.images)} held out, {trial.found} {_were(trial.found)} localized by the landmarks of the others alone"
-        f"{errors}; expect similar results for new photos taken the same way"
+        f"of {_photos(trial.images)} held out, {trial.found} {_were(trial.found)} localized with the"
+        f" landmarks of the others alone{errors}; expect similar results for new photos taken the same way"
     )
 
 
 def _problems(report: CaptureReport) -> Iterator[str]:
     if report.coverage.arrangement == "one place":
         yield (
-            f"rays to the same point differ by {report.coverage.parallax_deg:.1f}°: photos from one place show no"
-            " distances; take photos from places a tenth of the distance to the scene apart or more"
+            f"rays to the same point differ by {report.coverage.parallax_deg:.1f}°: photos from one place do"
+            " not determine distances; move by at least a tenth of the distance to the scene between photos"
         )
     for problem, (what, advice) in PROBLEMS.items():
         if found := report.with_problem(problem):
@@ -106,21 +107,21 @@ def _advice(report: CaptureReport) -> Iterator[str]:
     if len(report.photos) < LEAST_PHOTOS:
         yield f"{_photos(len(report.photos))} {_is(len(report.photos))} hardly enough for a map; take twenty or more, with much overlap"
     for gap in covered.gaps:
-        yield f"no photo in {_between(gap)}: take some there, every 10 to 15°"
+        yield f"there are no photos in {_between(gap)}: take some there, every 10 to 15°"
     if covered.open_side is not None:
         yield (
             f"nothing was photographed in {_between(covered.open_side)}: take more photos there if you expect queries from that side"
         )
     low, high = covered.heights_deg
     if covered.arrangement in ("around", "one side") and high - low < SAME_HEIGHT:
-        yield "all photos are from the same height: add some from higher and lower places"
+        yield "all photos were taken at the same height: add some from higher and lower"
     if len(report.photos) >= LEAST_PHOTOS and covered.seen_by_two > THIN:
         yield (
-            f"{covered.seen_by_two:.0%} of the landmarks are in two photos only: photos in between the present ones would"
-            " make them firmer"
+            f"{covered.seen_by_two:.0%} of the landmarks are seen in only two photos: photos in between"
+            " would constrain them better"
         )
     if report.exposure_range > DRIFTING:
-        yield f"exposure varies by {report.exposure_range:.1f} stops: lock it, where the camera can"
+        yield f"exposure varies by {report.exposure_range:.1f} stops: lock it if the camera allows"
 
 
 def _between(gap: Gap) -> str:

@@ -18,12 +18,12 @@ from bidnerf_core.geometry.se3 import SE3
 
 LARGEST_NOISE = 1e6  # pixels
 MOST_NAMED = 6
-"""Largest number of images that a sentence names."""
+"""Largest number of images named in a sentence."""
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
 RowMotion = tuple[float, float, float, float, float, float]
-"""The motion of a camera while its rows were exposed, see ``rolling_shutter``: metres, then radians."""
+"""A camera's motion during the readout of an image, see ``rolling_shutter``: metres, then radians."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class StoredCamera:
     name: str
     intrinsics: Intrinsics
     T_world_camera: MatrixRows
-    given_T_world_camera: MatrixRows | None = None  # the dataset's pose, where training refined it
-    moved_pixels: float | None = None  # median motion (pixels) of the image's points by the refinement
-    # of the camera from the first row to the last, where refinement estimated it
+    given_T_world_camera: MatrixRows | None = None  # the dataset's pose, if training refined it
+    moved_pixels: float | None = None  # median shift (pixels) of the image's points due to the refinement
+    # of the camera from the first row to the last, if refinement estimated it
     motion: RowMotion | None = None
 
     @property
@@ -44,46 +44,46 @@ class StoredCamera:
         return _pose(self.T_world_camera)
 
     def posed(self, view: View) -> View:
-        """Return the view at this pose, and with this motion."""
+        """Return the view with this pose and motion."""
         motion = None if self.motion is None else torch.tensor(self.motion, dtype=torch.float64)
         return replace(view, T_ref_camera=self.pose, motion=motion)
 
 
 @dataclass(frozen=True)
 class MovedCamera:
-    """The distance of an image's refined pose from the given one."""
+    """How far refinement moved an image from its given pose."""
 
     name: str
     translation: float  # metres
     rotation_deg: float
-    pixels: float  # median distance by which points move in the image
+    pixels: float  # median shift of points in the image
     motion: RowMotion | None = None  # of the camera from the first row of the image to the last
 
 
 @dataclass(frozen=True)
 class PoseConsistency:
-    """The fit of the given poses, and of adjusted ones, to the keypoints that images share."""
+    """How well the given and the adjusted poses fit the keypoints that images share."""
 
-    noise_before: float  # pixels: standard deviation of the keypoints about their points at the given poses
+    noise_before: float  # pixels: standard deviation of reprojection errors at the given poses
     noise_after: float
 
     def __post_init__(self) -> None:
         for value in (self.noise_before, self.noise_after):
             if not 0 <= value <= LARGEST_NOISE:
-                raise InputError(f"noise of keypoints is {value}, expected 0 to {LARGEST_NOISE:g} pixels")
+                raise InputError(f"the keypoint noise is {value}, expected 0 to {LARGEST_NOISE:g} pixels")
 
     @property
     def inconsistency(self) -> float:
-        """The deviation of keypoints (pixels) that errors of the given poses add to the keypoints' own noise."""
+        """Standard deviation (pixels) that errors of the given poses add to the keypoints' own noise."""
         return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
 
 
 @dataclass(frozen=True)
 class PoseRefinement(PoseConsistency):
-    """The consistency of the poses given for a map's images, and which poses training used."""
+    """Consistency of the given poses of a map's images, and which poses training used."""
 
     refined: bool  # whether training used the adjusted poses
-    replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized by the others' landmarks
+    replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized with the others' landmarks
 
 
 def poses_of(cameras: Sequence[StoredCamera]) -> SE3:
@@ -92,7 +92,7 @@ def poses_of(cameras: Sequence[StoredCamera]) -> SE3:
 
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
-    """Return the cameras of training views in the form that ``map.json`` holds."""
+    """Convert training views to cameras as stored in ``map.json``."""
     return tuple(
         StoredCamera(v.frame.name, v.frame.intrinsics, _rows(v.T_ref_camera), motion=_six(v.motion))
         for v in views
@@ -100,7 +100,7 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
 
 
 def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
-    """Return the cameras with the poses that the dataset gives."""
+    """Return the cameras with the dataset's poses."""
     return tuple(
         StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras
     )
@@ -109,7 +109,7 @@ def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
 def moved_from(
     given: Sequence[View], refined: Sequence[StoredCamera], pixels: Sequence[float]
 ) -> tuple[StoredCamera, ...]:
-    """Return the refined cameras; those whose pose changed also record the pose of the ``given`` view."""
+    """Return the refined cameras; those whose pose changed also record the ``given`` view's pose."""
     return tuple(
         camera
         if camera.T_world_camera == (rows := _rows(view.T_ref_camera))
@@ -119,7 +119,7 @@ def moved_from(
 
 
 def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
-    """Return the names of the cameras of which a pose, the given or the refined one, is not a rigid transform."""
+    """Return the names of cameras whose given or refined pose is not a rigid transform."""
     poses = [
         (c.name, rows)
         for c in cameras
@@ -134,7 +134,9 @@ def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
 
 
 def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
-    """Return the right update (translation in metres first) from each given to its refined pose; None for poses that were kept."""
+    """Return the right updates (translation in metres first) from given to refined poses; None for unchanged
+    poses.
+    """
     pairs = [
         (c.given_T_world_camera, c.T_world_camera) for c in cameras if c.given_T_world_camera is not None
     ]
@@ -164,7 +166,11 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     moved = moved_cameras(cameras)
     wrong = [m for m in moved if m.name in found.replaced]
     motions = [camera.motion for camera in cameras if camera.motion is not None]
-    cause = "errors of the given poses and motions of the cameras" if motions else "errors of the given poses"
+    cause = (
+        "errors of the given poses and camera motion during readout"
+        if motions
+        else "errors of the given poses"
+    )
     error = f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
     refined = found.refined and moved
     kept = "the other poses are kept" if wrong else "the poses are kept"
@@ -172,14 +178,14 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     if motions:
         metres, degrees = _sizes(motions)
         lines.append(
-            f"the rows of the images were exposed one after another, while the camera moved by {metres:.2g} and"
+            f"the images have a rolling shutter: during the readout the camera moved by {metres:.2g} and"
             f" {degrees:.2g}° (median)"
         )
     if wrong:
         most = sorted(wrong, key=lambda m: m.pixels, reverse=True)[:MOST_NAMED]
         listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in most)
         listed += f" and {len(wrong) - MOST_NAMED} more" if len(wrong) > MOST_NAMED else ""
-        lines.append(f"moved to where the landmarks of the other images place them: {listed}")
+        lines.append(f"moved to the poses given by the landmarks of the other images: {listed}")
     return lines
 
 
@@ -201,7 +207,9 @@ def _typical_motion(moved: Sequence[MovedCamera]) -> str:
 
 
 def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
-    """Return the views at their refined poses; a view keeps its pose unless ``cameras`` records a refinement of that pose."""
+    """Return the views at their refined poses; a view keeps its pose unless ``cameras`` records a refinement
+    of it.
+    """
     known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
     found = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
     return [view if c is None else c.posed(view) for view, c in zip(views, found, strict=True)]

@@ -1,4 +1,4 @@
-"""The coverage of a capture: from where its scene was photographed, and from where it was not."""
+"""The coverage of a capture: the directions from which its scene was photographed, and those missing."""
 
 from __future__ import annotations
 
@@ -17,21 +17,23 @@ from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedVie
 from bidnerf_core.mapping.geometry.observations import Sightings
 
 FACING = 0.9
-"""Share of the cameras that must have the centre in front of them for the capture to be around it."""
+"""Fraction of the cameras that must have the centre in front of them for the capture to count as going around
+it."""
 CONVERGING = 0.5
-"""Largest distance at which a typical optical axis passes the centre, as a share of the cameras' distance."""
+"""Largest distance at which a typical optical axis passes the centre, relative to the cameras' distance."""
 OPEN_SIDE = 120.0
-"""Least range of directions without a camera, in degrees, with which a capture is from one side."""
+"""Smallest range of directions (degrees) without a camera in a one-sided capture."""
 LEAST_GAP = 15.0
-"""Least width of a gap in degrees: SIFT matches well across narrower ones, which therefore cost nothing."""
+"""Smallest width of a gap in degrees: SIFT matches well across narrower ones, so they do no harm."""
 WIDE_GAP = 45.0
-"""Degrees above which a gap counts however irregular the capture is: from its middle, SIFT matches neither side well."""
+"""Degrees above which any gap counts, however irregular the capture: from its middle, SIFT matches neither
+side well."""
 RARE = 0.01
-"""Probability that a capture whose cameras are spread at random has a gap that counts."""
+"""Probability that a capture with randomly spread cameras has a gap that counts."""
 STEEP = 75.0
-"""Degrees above or below the horizon from which on a camera has no azimuth."""
+"""Degrees above or below the horizon beyond which a camera has no azimuth."""
 FEW_POINTS = 50
-"""Number of triangulated points below which a capture shows hardly any distances."""
+"""Number of triangulated points below which a capture hardly constrains distances."""
 FEW = 4
 """Number of photos below which gaps are not assessed."""
 
@@ -42,9 +44,9 @@ def coverage(
 ) -> CoverageRecord:  # fmt: skip
     """Return how well the views cover their scene.
 
-    ``matched`` are all keypoints that were matched, ``seen`` those that agree on a triangulated point, and
-    ``least_parallax`` is the angle (degrees) between rays below which a point cannot be placed. ``up`` is the upward direction
-    of the scene, by default the one that the cameras give.
+    ``matched`` are all matched keypoints, ``seen`` those consistent with a triangulated point, and
+    ``least_parallax`` is the angle (degrees) between rays below which a point cannot be triangulated. ``up``
+    is the upward direction of the scene, estimated from the cameras by default.
     """
     angle = parallax_deg(matched)
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
@@ -66,9 +68,10 @@ def coverage(
 def _around(
     views: Sequence[View], directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"], converge: bool
 ) -> tuple[Arrangement, Gap | None, tuple[Gap, ...], tuple[float, float]]:
-    """Return the arrangement of ``directions`` (of the cameras from the centre, or of their axes) about the vertical.
+    """Return how ``directions`` (of the cameras from the centre, or of their axes) are arranged about the
+    vertical.
 
-    It comes with the open side, the gaps and the range of heights (degrees) of a ``CoverageRecord``.
+    Also returns the open side, the gaps and the range of elevations (degrees) for a ``CoverageRecord``.
     """
     unit = torch.nn.functional.normalize(directions, dim=-1)
     heights = (unit @ up).clamp(-1, 1).asin().rad2deg()
@@ -82,7 +85,8 @@ def _around(
     order = steps.argsort(descending=True).tolist()
     is_open = float(steps[order[0]]) - hidden >= OPEN_SIDE
     open_side = named[order[0]] if is_open else None
-    # Random directions have exponential steps: of n, one exceeds mean * log(n / p) with probability p.
+    # Random directions have exponentially distributed steps: among n, one exceeds mean * log(n / p) with
+    # probability p.
     mean = float(steps.median()) / math.log(2)
     least = hidden + min(max(LEAST_GAP, mean * math.log(len(names) / RARE)), WIDE_GAP)
     gaps = tuple(named[i] for i in order[int(is_open) :] if float(steps[i]) > least)
@@ -91,7 +95,9 @@ def _around(
 
 
 def _steps(azimuths: Float[Tensor, "v"], names: Sequence[str]) -> tuple[Float[Tensor, "v"], list[Gap]]:
-    """Return the angles (degrees) from each direction to the next, once around, and the same as named gaps."""
+    """Return the angles (degrees) from each direction to the next, all the way around, and the same as named
+    gaps.
+    """
     order = azimuths.argsort()
     steps = torch.diff(azimuths[order], append=azimuths[order[:1]] + 360)
     ends = [names[i] for i in order.tolist()]
@@ -115,9 +121,9 @@ def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[T
 def _meeting_point(
     centres: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3"]
 ) -> tuple[Float[Tensor, "3"], bool]:
-    """Return the point nearest to the optical axes, and whether they meet there."""
+    """Return the point nearest to the optical axes, and whether they converge there."""
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None]
-    matrix = across.sum(0) + 1e-9 * len(axes) * torch.eye(3, dtype=axes.dtype)  # parallel axes meet nowhere
+    matrix = across.sum(0) + 1e-9 * len(axes) * torch.eye(3, dtype=axes.dtype)  # parallel axes never converge
     point = torch.linalg.solve(matrix, (across @ centres[..., None]).sum(0))[:, 0]
     away = point - centres
     before = ((away * axes).sum(-1) > 0).double().mean()
@@ -132,10 +138,10 @@ def _field_of_view_deg(views: Sequence[View]) -> float:
 
 
 def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool:
-    """Return whether views show how far things are: by depth, or from places far enough apart.
+    """Return whether views determine distances: by measured depth, or by enough parallax.
 
-    They do not if hardly any point can be triangulated because the rays to the same point differ too little, or if all
-    cameras are exactly in one place.
+    They do not if hardly any point can be triangulated for lack of parallax, or if all cameras are in exactly
+    one place.
     """
     if any(view.frame.has_depth for view in views):
         return True
@@ -149,7 +155,7 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
 
 
 def parallax_deg(matched: TrackedKeypoints) -> float | None:
-    """Return the median angle of the rays to a matched point; None without points."""
+    """Return the median angle between the rays to a matched point; None without points."""
     return _median(_cones_deg(matched.sightings, matched.count)) if matched.count else None
 
 

@@ -1,4 +1,4 @@
-"""Links between photos of a capture that show the same things, by the landmarks that they share."""
+"""Links between photos of a capture that show the same things, based on shared landmarks."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from torch import Tensor
 from bidnerf_core.mapping import TrackedKeypoints
 
 LINK = 5
-"""Least number of shared landmarks that links two photos. Photos of different places share one by chance, seldom two: a match
-has to lie on the epipolar line, stand out from all others, and agree on a point in front of both cameras.
+"""Number of shared landmarks from which two photos are linked. Photos of different places share one by
+chance, seldom two: a match has to lie on the epipolar line, stand out from all others, and agree on a point
+in front of both cameras.
 """
 LEAST_GROUP = 3
-"""Least number of linked photos that make a group."""
+"""Smallest number of linked photos that form a group."""
 
 
 def linked(seen: TrackedKeypoints) -> csr_array:
     """Return the pairs of images that share enough landmarks, in both directions, as a sparse matrix (v, v).
 
-    ``seen`` are the keypoints that agree on their points.
+    ``seen`` are the keypoints consistent with their points.
     """
     shape = (len(seen.images), max(1, seen.count))
     ones = np.ones(len(seen.point), np.int32)
@@ -35,7 +36,7 @@ def linked(seen: TrackedKeypoints) -> csr_array:
 
 
 def groups(links: csr_array) -> Int[Tensor, "v"]:
-    """Return the group of each image, 0 for the largest; -1 where too few images are linked to make one."""
+    """Return the group of each image, 0 for the largest; -1 if too few images are linked to form one."""
     _, found = connected_components(links, directed=False)
     label = torch.from_numpy(found).long()
     sizes = torch.bincount(label)

@@ -18,53 +18,54 @@ from bidnerf_core.mapping import TrackedKeypoints
 from bidnerf_core.mapping.landmarks.tracks import likely_pairs
 
 LARGEST = 800
-"""Pixels along the longer side to which photos are reduced: finer detail is of no use to a map."""
+"""Pixels along the longer side to which photos are downscaled: finer detail is of no use to a map."""
 FINE, COARSE = 1.0, 4.0
-"""Standard deviations (pixels) of the Gaussians of the two scales whose energies are compared. The finer one suppresses
-noise, which would pass for detail.
+"""Standard deviations (pixels) of the Gaussians for the two scales whose energies are compared. The finer one
+suppresses noise, which would be mistaken for detail.
 """
 SHARPNESS_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
-"""Directions (rows, columns) of the second differences: motion blurs one of them alone."""
+"""Directions (rows, columns) of the second differences; motion blur affects only one of them."""
 DARKEST = 2 / 255
-"""Brightness below which pixels are equally dark: quantisation leaves nothing to compare."""
+"""Brightness below which pixels count as equally dark, since quantization leaves nothing to compare."""
 OVEREXPOSED, UNDEREXPOSED = 254 / 255, 4 / 255
-"""Brightness of the brightest channel at or above which, and at or below which, a pixel holds no measurement."""
+"""Brightness of the brightest channel from which up, or from which down, a pixel is clipped."""
 GAMMA = 2.2
-"""Exponent from the values of an image to linear light, approximately that of sRGB."""
+"""Exponent that converts image values to linear light, approximately that of sRGB."""
 ENOUGH_SHARED = 10
-"""Least number of landmarks by which the exposure of a photo is compared; with fewer, whole images are compared."""
+"""Smallest number of landmarks from which a photo's exposure is estimated; with fewer, whole images are
+compared."""
 BRIGHTNESS_ROUNDS = 20
-"""Rounds of alternation between the brightness of landmarks and the exposure of photos."""
+"""Number of alternations between the brightness of landmarks and the exposure of photos."""
 NEIGHBOURS = 8
-"""Number of photos from nearby places with which a photo is compared."""
+"""Number of nearby photos with which a photo is compared."""
 LEAST_SHOWN = 0.02
-"""Least share of a photo's pixels, away from what is hidden, by which its sharpness is measured."""
+"""Smallest fraction of a photo's pixels, away from masked ones, that suffices to measure its sharpness."""
 LEAST_BLUR = 0.5
-"""Least lack of fine detail, in octaves of its energy, of a photo that counts as blurred."""
+"""Smallest lack of fine detail, in octaves of its energy, at which a photo counts as blurred."""
 OUTLYING = 4.0
-"""Robust standard deviations from the other photos of the capture beyond which a photo stands out."""
+"""Robust standard deviations from the other photos of the capture beyond which a photo is an outlier."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoMeasures:
-    """Numbers measured in photos, one of each kind per photo."""
+    """Measurements of photos, one of each kind per photo."""
 
-    sharpness: Float[Tensor, "v"]  # log2 of fine over coarse energy, in the direction where it is least
+    sharpness: Float[Tensor, "v"]  # log2 of fine over coarse energy, in the direction where it is smallest
     brightness: Float[Tensor, "v"]  # log2 of the median linear brightness
     overexposed: Float[Tensor, "v"]  # share of the pixels
     underexposed: Float[Tensor, "v"]
 
 
 def photo_measures(views: Sequence[View]) -> PhotoMeasures:
-    """Measure each photo by itself."""
+    """Measure each photo on its own."""
     rows = torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 4)
     return PhotoMeasures(*rows.unbind(-1))
 
 
 def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
-    """Return the energy of each photo's fine detail as a share of that in photos from nearby.
+    """Return the energy of each photo's fine detail relative to nearby photos.
 
-    It is 1 for all photos but those that stand out as blurred.
+    It is 1 for all photos except outliers that are blurred.
     """
     found = torch.tensor([sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
     lacking = -above_neighbours(found, nearby(views))
@@ -72,7 +73,9 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
 
 
 def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
-    """Return which values exceed both ``least`` and ``OUTLYING`` robust standard deviations of all about zero."""
+    """Return which values exceed both ``least`` and ``OUTLYING`` robust standard deviations (about zero) of
+    all values.
+    """
     return values > max(least, OUTLYING * mad_deviation(values))
 
 
@@ -94,9 +97,10 @@ def log_light(values: np.ndarray) -> np.ndarray:
 
 
 def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
-    """Return log2 of the ratio of fine to coarse energy, where contrast cancels; the least of four directions.
+    """Return log2 of the ratio of fine to coarse energy, in which contrast cancels; the smallest of four
+    directions.
 
-    Pixels that hidden ones influence do not count, unless no others are left.
+    Pixels affected by ``hidden`` ones are ignored, unless no others are left.
     """
     shown: np.ndarray | None = None if hidden is None else (~hidden.cpu().numpy()).astype(np.float32)
     size = reduced_size(grey.shape[1], grey.shape[0], LARGEST)
@@ -113,14 +117,18 @@ def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> fl
 
 
 def _away_from_hidden(shown: np.ndarray) -> np.ndarray | None:
-    """Return which pixels no hidden one influences, by the share of each that is visible; None if these are too few."""
-    reach = 2 * int(2 * COARSE + COARSE) + 1  # of the blur, to both sides, and of the differences
+    """Return which pixels are unaffected by hidden ones, given how visible each is; None if these are too
+    few.
+    """
+    reach = 2 * int(2 * COARSE + COARSE) + 1  # of the blur, to both sides, plus the differences
     away: np.ndarray = cv2.erode((shown >= 1).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
     return away if away.mean() >= LEAST_SHOWN else None
 
 
 def _energy(image: np.ndarray, direction: tuple[int, int], step: int, counted: np.ndarray | None) -> float:
-    """Return the mean squared second difference along a direction, over the pixels that are ``counted``; None: all."""
+    """Return the mean squared second difference along a direction, over the ``counted`` pixels (None for
+    all).
+    """
     rows, columns = direction[0] * step, direction[1] * step
     ahead = np.roll(image, (-rows, -columns), (0, 1))
     behind = np.roll(image, (rows, columns), (0, 1))
@@ -139,7 +147,7 @@ def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Nearby:
-    """Which photos were taken from nearby places in similar directions, as pairs in both directions, each once."""
+    """Which photos were taken from nearby places in similar directions: pairs in both directions, each once."""
 
     count: int  # of photos
     photo: Int[Tensor, "p"]
@@ -149,13 +157,13 @@ class Nearby:
         return Nearby(self.count, self.photo[kept], self.other[kept])
 
     def within(self, group: Int[Tensor, "v"]) -> Nearby:
-        """Return the pairs of the same group; for photos without one, all of their pairs."""
+        """Return the pairs within the same group; photos without a group keep all of their pairs."""
         same = group[self.photo] == group[self.other]
         alone = torch.bincount(self.photo[same], minlength=self.count) == 0
         return self[same | alone[self.photo]]
 
     def medians(self, values: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """Return the lower median of the values of the photos near each photo; NaN where there are none."""
+        """Return the lower median of the values of the photos near each photo; NaN if there are none."""
         there = torch.bincount(self.photo, minlength=self.count) > 0
         return torch.where(there, _medians(values[self.other], self.photo, self.count), torch.nan)
 
@@ -167,7 +175,7 @@ def nearby(views: Sequence[View]) -> Nearby:
 
 
 def above_neighbours(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
-    """Return by how much each value exceeds the median of those nearby; 0 where there are none."""
+    """Return how much each value exceeds the median of its neighbours; 0 if there are none."""
     return (values - near.medians(values)).nan_to_num(0.0)
 
 
@@ -176,8 +184,9 @@ def exposures(
 ) -> Float[Tensor, "v"]:
     """Return the exposure of each photo (stops) relative to the median of all.
 
-    The brightness of a landmark in a photo is the landmark's own times the exposure of the photo. Both are found in turn, as
-    medians. Photos that show too few landmarks are compared with their neighbours as a whole.
+    The brightness of a landmark in a photo is the landmark's own brightness times the photo's exposure. Both
+    are estimated alternately, as medians. Photos that show too few landmarks are compared with their
+    neighbours as a whole.
     """
     image, point = seen.image, seen.point
     light = _light_of_keypoints(views, seen)
@@ -197,7 +206,7 @@ def exposures(
 
 
 def _light_of_keypoints(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "m"]:
-    """Return log2 of the linear light about each keypoint."""
+    """Return log2 of the linear light around each keypoint."""
     image, number = seen.image, seen.number
     pixels = torch.cat([p.keypoints.pixels for p in seen.images])[number]
     found = torch.zeros(len(image), dtype=torch.float64)
@@ -211,7 +220,7 @@ def _light_of_keypoints(views: Sequence[View], seen: TrackedKeypoints) -> Float[
 
 
 def _medians(values: Float[Tensor, "m"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n"]:
-    """Return the lower median of the values of each index; 0 where there are none."""
+    """Return the lower median of the values with each index; 0 if there are none."""
     order = torch.from_numpy(np.lexsort((values.numpy(), index.numpy())))
     number = torch.bincount(index, minlength=count)
     first = number.cumsum(0) - number

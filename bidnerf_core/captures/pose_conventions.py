@@ -1,9 +1,10 @@
-"""Poses that contradict their images, and what they would have to mean to agree with them.
+"""Detection of poses that contradict their images, and of conventions under which they would agree.
 
-Which keypoints of two images show the same point follows from the images alone (RANSAC of an essential matrix, Nistér, PAMI
-2004). Under right poses these matches lie on their epipolar lines, and their points in front of both cameras; the lines alone do
-not see the sign of a baseline (Hartley, Cheirality, IJCV 1998). Poses under which most pairs of images disagree are wrong, and each
-reading of ``pose_readings`` is tried and counted in the same way.
+The keypoints of two images that show the same point are found from the images alone (RANSAC with an essential
+matrix, Nistér, PAMI 2004). Under correct poses these matches lie on their epipolar lines, and their points in
+front of both cameras; the lines alone do not determine the sign of a baseline (Hartley, Cheirality, IJCV
+1998). Poses are wrong if they disagree with most pairs of images, and each reading of ``pose_readings`` is
+tested in the same way.
 """
 
 from __future__ import annotations
@@ -25,47 +26,54 @@ from bidnerf_core.mapping.landmarks.features import squared_distances
 from bidnerf_core.mapping.landmarks.tracks import LEAST_BASELINE, likely_pairs_of_poses
 
 MOST_PAIRS = 40
-"""Largest number of pairs of images that are examined, of those that poses and order propose, and of those that images propose."""
+"""Largest number of examined pairs among those suggested by poses and order, and among those suggested by
+image similarity."""
 COMPARED_IMAGES, COMPARED_KEYPOINTS = 60, 300
-"""Number of images all of whose pairs are compared, and of the strongest keypoints of each that are."""
+"""Number of images of which all pairs are compared, and number of strongest keypoints used from each."""
 PARTNERS, SIMILAR_MATCHES = 2, 12
-"""Number of other images that an image proposes, and least number of matches of them."""
+"""Number of partners suggested per image, and smallest number of matches with each."""
 ENOUGH_PAIRS = 8
-"""Least number of pairs with matches, from which poses are judged."""
+"""Smallest number of pairs with matches from which poses are judged."""
 RATIO = 0.8
-"""Largest ratio of a match's descriptor distance to that of the next best (Lowe 2004)."""
+"""Largest ratio of a match's descriptor distance to that of the second nearest (Lowe 2004)."""
 ENOUGH_MATCHES = 40
-"""Least number of matches of a pair that agree on an essential matrix."""
+"""Smallest number of inlier matches to an essential matrix for a pair."""
 MATCH_PIXELS, POSE_PIXELS = 1.0, 2.0
-"""Least bounds (pixels) of a match's distance from its epipolar line: by its own essential matrix, and by poses of any source."""
+"""Smallest thresholds (pixels) on a match's distance from its epipolar line: for its own essential matrix,
+and for given poses."""
 USUAL_FOCAL = 700.0
-"""Focal length (pixels) beyond which pixels count as larger: keypoints of larger images are found in reduced ones."""
+"""Focal length (pixels) beyond which the pixel size is scaled up: keypoints of large images are detected in
+downscaled ones."""
 POSE_ANGLE = 4 / USUAL_FOCAL
-"""Distance from the epipolar line, on the plane z = 1, that errors of right poses may cause."""
+"""Distance from the epipolar line, on the plane z = 1, that small errors of correct poses may cause."""
 NEAR_LINES, IN_FRONT = 0.7, 0.7
-"""Least shares of the matches of a pair near their epipolar lines and in front of both cameras, for poses that agree with it."""
+"""Smallest fractions of a pair's matches near their epipolar lines and in front of both cameras for poses to
+agree with it."""
 PARALLAX_PIXELS, ENOUGH_PARALLAX = 3.0, 10
-"""Least parallax of a match that shows on which side of the cameras its point is, and least number of such matches."""
+"""Smallest parallax (pixels) that shows on which side of the cameras a point is, and smallest number of such
+matches."""
 HALF = 0.5
-"""Share of the pairs that given poses must agree with: they are refused where they disagree with most."""
+"""Fraction of the pairs that given poses must agree with; otherwise they are rejected."""
 MOST = 0.7
-"""Share of the pairs that a reading must agree with to be named."""
+"""Fraction of the pairs that a reading must agree with to be suggested."""
 ALMOST_BEST = 0.9
-"""Share of the best reading's pairs with which a more usual one must agree to be preferred."""
+"""Fraction of the best reading's pairs with which a more common one must agree to be preferred."""
 NEARLY_ALL, NOT_ALL = 0.9, 0.75
-"""Shares of the pairs: where the given poses agree with at most the second, a reading that agrees with the first is right, even if
-the given poses do not disagree with most. Some mistakes hardly show where cameras move on one level."""
+"""Fractions of the pairs: if the given poses agree with at most the second, a reading that agrees with the
+first is right, even if the given poses agree with the majority. Some mistakes hardly show when cameras move
+in a plane."""
 FIT_ROUNDS = 10
-"""Rounds of reweighting in which the axes of positions are fitted."""
+"""Number of reweighting iterations when fitting the axes of positions."""
 PRIOR = 1e-4
-"""Weight of the identity in a fit of the axes of positions, relative to that of the matches."""
+"""Weight of the identity in fitting the axes of positions, relative to that of the matches."""
 SIMILAR = 0.03
-"""Largest difference of entries of a fitted matrix, relative to its largest, that is attributed to noise."""
+"""Largest difference between entries of a fitted matrix, relative to its largest, that is attributed to
+noise."""
 
 
 @dataclass(frozen=True)
 class PoseContradiction:
-    """Poses that disagree with the images, and the reading in which they would agree, if there is one."""
+    """Poses that disagree with the images, and the reading under which they would agree, if there is one."""
 
     pairs: int  # of images with matches
     agreeing_as_given: int
@@ -74,21 +82,24 @@ class PoseContradiction:
 
     @property
     def sentence(self) -> str:
-        """What is wrong, and what to do about it."""
+        """Human-readable description of the problem and its remedy."""
         found = (
             f"the poses contradict the photos: they agree with the keypoints of {self.agreeing_as_given} of {self.pairs}"
             " pairs of photos"
         )
         if self.reading is None:
             return (
-                f"{found}, and no usual mistake explains it; check that each pose belongs to its photo, that the matrices are"
-                " camera to world, and the camera's focal length and distortion"
+                f"{found}, and no common mistake explains it; check that each pose belongs to its photo,"
+                " that the matrices are camera to world, and the camera's focal length and distortion"
             )
-        return f"{found}, but of {self.agreeing} if {self.reading.clause}; {self.reading.remedy}"
+        return (
+            f"{found}, but would agree with those of {self.agreeing} if {self.reading.clause};"
+            f" {self.reading.remedy}"
+        )
 
 
 def pose_contradiction(images: Sequence[PosedKeypoints]) -> PoseContradiction | None:
-    """Return how the poses of ``images`` contradict these; None where they agree, or the images do not tell."""
+    """Return how the poses of ``images`` contradict them; None if they agree, or if the images do not tell."""
     proposed = _pairs(images)
     pairs = [pair for i, j in proposed if (pair := _matched(images, i, j)) is not None]
     if len(pairs) < MOST_PAIRS / 2:
@@ -112,7 +123,7 @@ def pose_contradiction(images: Sequence[PosedKeypoints]) -> PoseContradiction | 
 
 @dataclass(frozen=True, eq=False)
 class _MatchedPair:
-    """Two images by number, and points on the plane z = 1 that both see."""
+    """Two images, by index, and their matched points on the plane z = 1."""
 
     first: int
     second: int
@@ -121,7 +132,9 @@ class _MatchedPair:
     pixel: float  # size on the plane z = 1
 
     def agreeing(self, T: SE3) -> Bool[Tensor, "h"]:
-        """Return with which poses T_world_camera (h n) the matches are near their lines and in front of both cameras."""
+        """Return for which poses T_world_camera (h n) the matches are near their epipolar lines and in front
+        of both cameras.
+        """
         R_second_world = T.rotation[:, self.second].mT
         turned = R_second_world @ T.rotation[:, self.first]
         moved = (R_second_world @ (T.translation[:, self.first] - T.translation[:, self.second])[..., None])[
@@ -133,7 +146,7 @@ class _MatchedPair:
         still = torch.linalg.vector_norm(rays[..., :2] / rays[..., 2:] - seen[..., :2], dim=-1)
         at_rest = (
             torch.linalg.vector_norm(moved, dim=-1) < LEAST_BASELINE
-        )  # no lines, but the same directions
+        )  # no epipolar lines: directions must agree
         away = torch.where(at_rest[:, None], still, away)
         near = (away.abs() <= max(POSE_ANGLE, POSE_PIXELS * self.pixel)).double().mean(-1) >= NEAR_LINES
         return near & (self._in_front(rays, seen, moved) | at_rest)
@@ -141,9 +154,10 @@ class _MatchedPair:
     def _in_front(
         self, rays: Float[Tensor, "h m 3"], seen: Float[Tensor, "h m 3"], moved: Float[Tensor, "h 3"]
     ) -> Bool[Tensor, "h"]:
-        """Return whether most points are in front of both cameras, as far as their parallax shows it.
+        """Return whether most points are in front of both cameras, judged by those with enough parallax.
 
-        The depths solve ``a seen = b rays + moved`` in the least-squares sense along the common normal of both rays.
+        The depths solve ``a seen = b rays + moved`` in the least-squares sense along the common normal of
+        both rays.
         """
         normal, moved = torch.linalg.cross(seen, rays), moved[:, None].expand_as(rays)
         a = (torch.linalg.cross(moved, rays) * normal).sum(-1)
@@ -155,14 +169,15 @@ class _MatchedPair:
 
 
 def _agreeing(pairs: Sequence[_MatchedPair], T: SE3) -> Float[Tensor, "h"]:
-    """Return with how many pairs each choice of poses (h n) agrees."""
+    """Return how many pairs each set of poses (h n) agrees with."""
     return torch.stack([pair.agreeing(T).double() for pair in pairs]).sum(0)
 
 
 def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading]:
-    """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines of all pairs.
+    """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines
+    of all pairs.
 
-    They cover positions that are scaled along one axis, and positions and rotations in different worlds.
+    They cover positions scaled along one axis, and positions and rotations from different world frames.
     """
     found = []
     for swapped in (False, True):
@@ -171,7 +186,7 @@ def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading
             apart = bool(((B - torch.diag(B.diagonal())).abs() < SIMILAR * B.abs().max()).all())
             scales = ", ".join(f"{value:.3g}" for value in (B.diagonal() / B[0, 0]).tolist())
             clause, remedy = (
-                "their positions are in another frame than their rotations",
+                "their positions are in a different frame from their rotations",
                 "take both from one source",
             )
             if apart:
@@ -187,10 +202,10 @@ def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading
 
 
 def _fitted(pairs: Sequence[_MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]:
-    """Return matrices by which positions are multiplied so that matches lie on their epipolar lines.
+    """Return matrices that, multiplied with the positions, put matches on their epipolar lines.
 
-    The first and the second are the least-squares solution with either sign, of no certain scale. The last stays near the identity
-    as far as the lines do not tell, as they do of a direction in which the cameras do not move.
+    The first and second are the least-squares solution with either sign, up to scale. The last stays near the
+    identity where the lines give no constraint, such as along a direction in which the cameras do not move.
     """
     rows, counts = [], []
     for pair in pairs:
@@ -214,7 +229,7 @@ def _fitted(pairs: Sequence[_MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]
 def _reweighted(
     A: Float[Tensor, "n 9"], weight: Float[Tensor, "n"], solve: Callable[[Tensor], Tensor]
 ) -> Float[Tensor, "9"]:
-    """Return a robust solution of ``A b = 0``, where ``solve`` returns that of given normal equations (9x9)."""
+    """Return a robust solution of ``A b = 0``; ``solve`` solves given normal equations (9x9)."""
     share = weight
     for _ in range(FIT_ROUNDS):
         solution = solve(A.mT @ (share[:, None] * A))
@@ -235,7 +250,9 @@ def _near_identity(H: Float[Tensor, "9 9"]) -> Float[Tensor, "9"]:
 
 
 def _pairs(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs that probably show the same things: nearby by the poses, which may be wrong, or in the order given."""
+    """Return pairs that probably show the same things: nearby according to the poses, which may be wrong, or
+    in the given order.
+    """
     count = len(images)
     pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}
     if count > 1:
@@ -246,7 +263,9 @@ def _pairs(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
 
 
 def _similar(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs of images that probably show the same things by their strongest keypoints, the most similar first."""
+    """Return pairs of images that probably show the same things, judging by their strongest keypoints, most
+    similar first.
+    """
     chosen = range(0, len(images), max(1, -(-len(images) // COMPARED_IMAGES)))
     strongest = [images[i].keypoints.descriptors[:COMPARED_KEYPOINTS] for i in chosen]
     found: dict[tuple[int, int], int] = {}
@@ -260,7 +279,7 @@ def _similar(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
 
 
 def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return the rows of the descriptors that are mutual nearest neighbours and stand out from the next best."""
+    """Return the indices of descriptors that are mutual nearest neighbours and pass the ratio test."""
     if min(len(a), len(b)) < 2:
         return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
     distance = squared_distances(a, b)
@@ -272,7 +291,7 @@ def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tenso
 
 
 def _matched(images: Sequence[PosedKeypoints], i: int, j: int) -> _MatchedPair | None:
-    """Return the matches of two images that agree on an essential matrix; None if these are too few."""
+    """Return two images' inlier matches to an essential matrix; None if these are too few."""
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
         return None

@@ -1,7 +1,9 @@
-"""Readings of camera poses: what given matrices would mean by another convention, or after another usual mistake.
+"""Readings of camera poses: what given matrices would mean under another convention, or after another common
+mistake.
 
-Each reading is a transformation of all poses of a capture. They are made from a few tables, so that a new one is a row: axes of the
-cameras, inverses in whole or in part, orders of quaternions, left-handed worlds, axes of the positions, and the order of the images.
+Each reading is a transformation of all poses of a capture. They are built from a few tables, so adding one
+takes a row: camera axes, full or partial inverses, quaternion orders, left-handed worlds, axes of the
+positions, and the order of the images.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from torch import Tensor
 from bidnerf_core.geometry.se3 import SE3
 
 Understand = Callable[[SE3], SE3]
-"""Returns the true T_world_camera (n) for the given ones; NaN where an image would have no pose."""
+"""Maps the given poses (n) to the true T_world_camera; NaN for an image left without a pose."""
 Axes = tuple[tuple[int, int, int], ...]
 """A signed permutation matrix by rows."""
 
@@ -30,7 +32,7 @@ SWAP = "multiply each from the right by diag(1, -1, -1, 1)"
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading of given poses, in words and as a transformation."""
+    """One interpretation of given poses, in words and as a transformation."""
 
     clause: str  # completes "the poses would agree if ..."
     remedy: str  # what to do about it
@@ -41,7 +43,9 @@ class Reading:
 
 @cache
 def readings(count: int) -> tuple[Reading, ...]:
-    """Return the readings of ``count`` poses, the usual ones first: of those that fit equally well, the first is preferred."""
+    """Return the readings of ``count`` poses, common ones first: among those that fit equally well, the first
+    is preferred.
+    """
     families = (
         _of_axes, _of_inverses, _of_parts, _of_quaternions, _of_left_handed_worlds, _of_positions, lambda: _of_orders(count),
     )  # fmt: skip
@@ -49,7 +53,7 @@ def readings(count: int) -> tuple[Reading, ...]:
 
 
 def _of_axes() -> Iterator[Reading]:
-    """Yield cameras with other axes, y and z reversed first."""
+    """Yield readings with other camera axes, starting with y and z reversed."""
     yield Reading(
         "their cameras' y and z axes are reversed (OpenCV's and COLMAP's axes where OpenGL's and Blender's are expected, or the"
         " other way round)",
@@ -65,7 +69,7 @@ def _of_axes() -> Iterator[Reading]:
 
 
 def _of_inverses() -> Iterator[Reading]:
-    """Yield inverse matrices, with every choice of axes."""
+    """Yield readings as inverse matrices, with every choice of axes."""
     for axes in sorted(signed_permutations(1), key=lambda axes: axes not in (AS_GIVEN, Y_AND_Z_REVERSED)):
         also = f", of cameras whose right, down and forward are {_named(axes)}"
         yield Reading(
@@ -81,15 +85,16 @@ PARTS = (
     ("R", "", -1, "their positions are negated", "multiply the first three numbers of the fourth column of each by -1"),
     ("R", "R", -1, "their translations are those of inverses, while their rotations are not", "replace each translation t by -R t"),
     ("R^T", "", -1, "their rotations are transposed and their positions negated", "transpose the upper left 3x3 of each, and negate the fourth column"),
-    ("R^T", "R^T", 1, "they are inverses whose translations lack the minus", "transpose each rotation R, and replace t by R^T t"),
+    ("R^T", "R^T", 1, "they are inverses whose translations lack the minus sign", "transpose each rotation R, and replace t by R^T t"),
     ("R", "R^T", -1, "their translations are -R times the positions", "replace each translation t by -R^T t"),
-    ("R", "R", 1, "their translations are those of inverses without the minus, while their rotations are not", "replace each translation t by R t"),
+    ("R", "R", 1, "their translations are those of inverses without the minus sign, while their rotations are"
+                " not", "replace each translation t by R t"),
     ("R", "R^T", 1, "their translations are R times the positions", "replace each translation t by R^T t"),
-    ("R^T", "R", 1, "their rotations are transposed, and their translations turned", "transpose each rotation R, and replace t by R t"),
-    ("R^T", "R", -1, "their rotations are transposed, and their translations turned and negated", "transpose each rotation R, and replace t by -R t"),
+    ("R^T", "R", 1, "their rotations are transposed, and their translations rotated", "transpose each rotation R, and replace t by R t"),
+    ("R^T", "R", -1, "their rotations are transposed, and their translations rotated and negated", "transpose each rotation R, and replace t by -R t"),
 )  # fmt: skip
-"""Rotation and translation understood apart: which rotation is the true one, what times the translation is the position of the
-camera, and its sign. ``R`` is the given rotation."""
+"""Rotation and translation interpreted separately: which rotation is the true one, the factor that turns the
+translation into the camera position, and its sign. ``R`` is the given rotation."""
 
 
 def _of_parts() -> Iterator[Reading]:
@@ -103,7 +108,7 @@ def _of_parts() -> Iterator[Reading]:
 
 
 def _of_quaternions() -> Iterator[Reading]:
-    """Yield quaternions whose w was sought at the wrong end, of poses and of their inverses."""
+    """Yield readings of quaternions with w taken from the wrong end, for poses and for their inverses."""
     for order, found, expected in (
         ((3, 0, 1, 2), "x y z w", "w x y z"),
         ((1, 2, 3, 0), "w x y z", "x y z w"),
@@ -121,15 +126,15 @@ def _of_quaternions() -> Iterator[Reading]:
                 T = SE3(quaternion_to_rotation_matrix(quaternion[..., list(order)]), T.translation)
                 return T.inverse() if of_inverse != then else T
 
-            also = ", and the poses inverses (world to camera)" if then_invert else ""
+            also = ", and the poses are inverses (world to camera)" if then_invert else ""
             yield from _in_file_axes(
-                f"their quaternions are in the order {found} where {expected} is expected{also}",
+                f"their quaternions are in the order {found}, but {expected} is expected{also}",
                 f"write the quaternions as {expected}{', and invert the poses' if then_invert else ''}", understand,
             )  # fmt: skip
 
 
 def _of_left_handed_worlds() -> Iterator[Reading]:
-    """Yield worlds and cameras with left-handed axes, as in Unity and Unreal: a mirror image of both."""
+    """Yield readings of left-handed worlds and cameras, as in Unity and Unreal: a mirror image of both."""
     for axes in signed_permutations(-1):
         A = _matrix(axes)
         diagonal = torch.equal(A, torch.diag(A.diagonal()))
@@ -147,7 +152,7 @@ def _of_left_handed_worlds() -> Iterator[Reading]:
 
 
 def _of_positions() -> Iterator[Reading]:
-    """Yield positions with other axes than the rotations have."""
+    """Yield readings in which positions have different axes from the rotations."""
     for sign in (-1, 1):
         for axes in signed_permutations(sign):
             D = _matrix(axes)
@@ -177,11 +182,11 @@ def _of_positions() -> Iterator[Reading]:
 
 
 def _of_orders(count: int) -> Iterator[Reading]:
-    """Yield poses that belong to other images."""
+    """Yield readings in which poses belong to other images."""
     numbers = list(range(count))
     text, text_from_1 = (sorted(numbers, key=lambda i: str(i + first)) for first in (0, 1))
     orders: list[tuple[str, Sequence[int]]] = []
-    for shift, words in ((1, "the next image"), (-1, "the image before"), (2, "the second next image"), (-2, "the second image before")):  # fmt: skip
+    for shift, words in ((1, "the next image"), (-1, "the image before"), (2, "the image after next"), (-2, "the image before the previous one")):  # fmt: skip
         orders.append(
             (f"each is that of {words}", [i - shift if 0 <= i - shift < count else -1 for i in numbers])
         )
@@ -189,13 +194,11 @@ def _of_orders(count: int) -> Iterator[Reading]:
     for order in (text, text_from_1):
         orders.append(
             (
-                "they are in the order of numbers as text (1, 10, 11, 2), the images in that of numbers",
+                "they are in text order (1, 10, 11, 2), while the images are in numeric order",
                 _inverse(order),
             )
         )
-        orders.append(
-            ("they are in the order of numbers, the images in that of numbers as text (1, 10, 11, 2)", order)
-        )
+        orders.append(("they are in numeric order, while the images are in text order (1, 10, 11, 2)", order))
     for clause, places in orders:
 
         def understand(T: SE3, order: Sequence[int] = places) -> SE3:
@@ -203,11 +206,13 @@ def _of_orders(count: int) -> Iterator[Reading]:
             unknown = torch.where(index >= 0, 0.0, torch.nan).to(T.translation)
             return SE3(T.rotation[index], T.translation[index] + unknown[:, None])
 
-        yield from _in_file_axes(clause, "assign the poses to the images anew", understand)
+        yield from _in_file_axes(clause, "reassign the poses to the images", understand)
 
 
 def _in_file_axes(clause: str, remedy: str, understand: Understand) -> Iterator[Reading]:
-    """Yield a reading of matrices as they are here, and as they were in a file of which the y and z axes were reversed."""
+    """Yield a reading of matrices as they are here, and as they were in a file that had the y and z axes
+    reversed.
+    """
     for before, after in ((False, False), (True, True), (False, True), (True, False)):
 
         def whole(T: SE3, before: bool = before, after: bool = after) -> SE3:
@@ -215,14 +220,15 @@ def _in_file_axes(clause: str, remedy: str, understand: Understand) -> Iterator[
             T = understand(with_axes(T, F) if before else T)
             return with_axes(T, F) if after else T
 
-        # A reader has reversed y and z of right poses as well, so this needs no remedy; one of both does.
+        # A reader has reversed y and z of correct poses as well, so this needs no remedy; a reversal on one
+        # side only does.
         more = before != after
         also = ", and their cameras' y and z axes are reversed" if more else ""
         yield Reading(clause + also, remedy + (f", then {SWAP}" if more else ""), whole)
 
 
 def with_axes(T: SE3, axes: Float[Tensor, "3 3"]) -> SE3:
-    """Return the poses of cameras whose axes are the columns of ``axes`` in the given cameras' frames."""
+    """Return the poses of cameras whose axes are the columns of ``axes`` in the given camera frames."""
     return SE3(T.rotation @ axes.to(T.rotation), T.translation)
 
 
@@ -239,7 +245,9 @@ def _positions_and_axes(T: SE3, of_positions: Understand) -> SE3:
 
 
 def signed_permutations(determinant: int) -> tuple[Axes, ...]:
-    """Return the 24 signed permutation matrices of a determinant (1 or -1), the identity first where it is among them."""
+    """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if
+    included.
+    """
     found = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
@@ -261,7 +269,7 @@ def _inverse(order: Sequence[int]) -> list[int]:
 
 
 def _named(axes: Axes) -> str:
-    """Return where the true camera's axes point, in terms of the given camera's."""
+    """Describe where the true camera's axes point, in terms of the given camera's."""
     names = ("right", "down", "forward"), ("left", "up", "backward")
     words = []
     for column in zip(*axes, strict=True):

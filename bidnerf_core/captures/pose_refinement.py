@@ -1,4 +1,4 @@
-"""Refinement of the given poses of images by the keypoints that the images share."""
+"""Refinement of the images' given poses from the keypoints they share."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ from bidnerf_core.mapping.geometry.triangulation import noise
 from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, pose_updates
 
 ROUNDS = 3
-"""Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""
+"""Largest number of adjustments. After each, the keypoints are rematched, which finds matches that wrong
+poses prevented."""
 SETTLED_PIXELS = 0.25
-"""Largest motion of an image in an adjustment (pixels) after which no further one is needed."""
+"""Largest image motion (pixels) in an adjustment at which iteration stops."""
 LEAST_DEVIATION = 1e-9
-"""Least standard deviation of the poses (metres, radians) that is assumed."""
+"""Smallest standard deviation of the poses (metres, radians) that is assumed."""
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustedPoses:
     """The poses that fit the keypoints best, and how well the given ones do."""
 
-    tracked: TrackedViews  # with these poses, and matched by them
-    pixels: Float[Tensor, "v"]  # median motion in each image of the points that it shows; 0 without points
+    tracked: TrackedViews  # with these poses, and rematched with them
+    pixels: Float[Tensor, "v"]  # median shift in each image of the points that it shows; 0 without points
     consistency: PoseConsistency  # of the given poses
 
 
@@ -51,13 +52,14 @@ def adjusted_poses(
     progress: Callable[[int, int], None] = lambda done, total: None,
     least: float = 0.0,
 ) -> AdjustedPoses | None:
-    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
+    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of
+    either.
 
-    The errors of the given poses are taken as independent of each other, and as large as resection of the images
-    suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean motion of the images
-    is about zero. If the keypoints show that the cameras moved while the rows of their images were exposed, these motions are
-    estimated too. Otherwise, if the first adjustment finds an inconsistency of less than ``least`` pixels, its poses are
-    returned at once.
+    The errors of the given poses are assumed to be independent, and as large as resection of the images
+    suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean
+    motion of the images is about zero. If the keypoints show a rolling shutter, the motions of the cameras
+    during readout are estimated too. Otherwise, if the first adjustment finds an inconsistency of less than
+    ``least`` pixels, its poses are returned at once.
     """
     given = tracked.T_world_camera
     seen, points = tracked.triangulated(config)
@@ -77,7 +79,7 @@ def adjusted_poses(
         pixels = _motion(seen, fit.points, given, fit.T_world_camera)
         tracked = tracked.at(fit.T_world_camera, fit.motion)
         noticed = False
-        if motion == STILL and number < ROUNDS - 1:  # later ones could not be estimated any more
+        if motion == STILL and number < ROUNDS - 1:  # later ones could no longer be estimated
             motion = _common_motion(tracked, config)
             noticed = motion != STILL
         if number == 0 and not noticed:
@@ -122,7 +124,7 @@ def _spread(values: Float[Tensor, "v 3"]) -> float:
 def _motion(
     seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3
 ) -> Float[Tensor, "v"]:
-    """Return the median motion (pixels) in each image of the points that it shows, between two poses of the image."""
+    """Return the median shift (pixels) of each image's points between its given and its found pose."""
     shown, image = points[seen.point], seen.image
     focal = seen.sightings.focal[:, None]
     places = [

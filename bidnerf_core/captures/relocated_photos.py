@@ -1,4 +1,4 @@
-"""Photos of a capture that may be wrongly posed, localized by the landmarks of the other photos."""
+"""Photos of a capture with suspicious poses, localized with the landmarks of the other photos."""
 
 from __future__ import annotations
 
@@ -20,23 +20,26 @@ from bidnerf_core.localization.landmarks.mirrored import mirror_image
 from bidnerf_core.mapping import LandmarkConfig, TrackedKeypoints, TrackedViews
 
 SUSPECT = 0.5
-"""A photo is a suspect if the share of its keypoints that are landmarks is below this fraction of the capture's median."""
+"""A photo is suspect if the fraction of its keypoints that are landmarks is below this multiple of the
+capture's median."""
 MOST_SUSPECTS = 32
-"""Largest number of photos that are localized anew."""
+"""Largest number of photos that are relocalized."""
 POSE_DEVIATIONS, POSE_PIXELS = 6.0, 4.0
-"""Standard deviations, and pixels of image motion, by which a bad pose at least differs from the landmarks' pose.
+"""Standard deviations, and pixels of image motion, by which a bad pose differs at least from the pose given
+by landmarks.
 
 The latter is twice as far as a match may lie from its epipolar line.
 """
 TURNED_ANGLE = 60.0
-"""Least rotation about the optical axis, in degrees, of a photo that counts as turned rather than badly posed."""
+"""Smallest rotation about the optical axis, in degrees, at which a photo counts as rotated rather than badly
+posed."""
 ALONG_AXIS = 0.9
-"""Least cosine between that rotation's axis and the optical axis."""
+"""Smallest cosine between that rotation's axis and the optical axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relocation:
-    """A photo's pose by the landmarks of other photos, compared with the given one."""
+    """A photo's pose from other photos' landmarks, compared with the given one."""
 
     update: Float[Tensor, "6"]  # right update from the given pose, translation (metres) first
     deviations: float  # length of the update, in standard deviations
@@ -54,7 +57,9 @@ class Relocation:
         return "turned" if about_axis and math.degrees(angle) >= TURNED_ANGLE else "badly posed"
 
     def onto(self, record: PhotoRecord) -> PhotoRecord:
-        """Return the record with the error of its given pose filled in; that of a mirrored photo cannot be compared."""
+        """Return the record with the error of its given pose filled in; a mirrored photo's pose cannot be
+        compared.
+        """
         if self.mirrored:
             return record
         translation, rotation = (float(torch.linalg.vector_norm(part)) for part in self.update.split(3))
@@ -65,7 +70,9 @@ class Relocation:
 
 
 def suspects(seen: TrackedKeypoints, count: Int[Tensor, "v"], group: Int[Tensor, "v"]) -> list[int]:
-    """Return the photos outside the largest group, and those whose keypoints are landmarks much more rarely than usual."""
+    """Return the photos outside the largest group, and those with unusually few keypoints among the
+    landmarks.
+    """
     keypoints = torch.tensor([len(image.keypoints) for image in seen.images])
     share = count / keypoints.clamp(min=1)
     main = group == 0
@@ -82,12 +89,12 @@ def relocated(
     numbers: Sequence[int],
     config: LandmarkConfig,
 ) -> dict[int, Relocation]:
-    """Localize the suspects by landmarks that are built without them, as they are and then mirrored."""
+    """Localize the suspects with landmarks built without them, as they are and then mirrored."""
     if not numbers:
         return {}
     try:
         matcher = LandmarkMatcher(tracked.without(numbers).landmarks(config))
-    except InputError:  # what is left shows nothing in common
+    except InputError:  # the rest has no overlap
         return {}
     answers: dict[int, Relocation] = {}
     for number in numbers:
@@ -111,6 +118,8 @@ def _compared(found: LandmarkPose, view: View, mirrored: bool) -> Relocation:
 
 
 def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:
-    """Return how far, in pixels and at most, an update of the pose moves the image of a point at ``distance`` (metres)."""
+    """Return how far (pixels, at most) an update of the pose moves the image of a point at ``distance``
+    (metres).
+    """
     translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
     return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))

@@ -1,4 +1,4 @@
-"""Evidence that the images of a capture were taken with a rolling shutter by moving cameras."""
+"""Evidence that a capture's images were taken by moving cameras with a rolling shutter."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from bidnerf_core.mapping.geometry.triangulation import noise
 from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, observed_at_rest
 
 MOST_IMAGES = 60
-"""Largest number of images that are examined; they are spread over the capture."""
+"""Largest number of images examined, spread over the capture."""
 MOST_EVIDENCE = 10.0
-"""Largest contribution of an image to the logarithm of the evidence, for or against a motion: no few images decide."""
+"""Largest contribution of an image to the log evidence for or against a motion, so that no few images decide."""
 
 
 def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlation: float) -> MotionPrior:
-    """Return the prior of the cameras' motions if it is more probable that they moved, else ``STILL``.
+    """Return the prior of the cameras' motions if a rolling shutter is more probable, else ``STILL``.
 
-    The hypotheses concern the capture as a whole: all images have been exposed row by row, or none. Each image is resected
-    from ``points`` with and without a motion. ``correlation`` is the number of keypoints that count as one.
+    The hypotheses concern the capture as a whole: either all images have a rolling shutter, or none. Each
+    image is resected from ``points`` with and without a motion. ``correlation`` is the number of keypoints
+    that count as one.
     """
     sightings, image = seen.sightings, seen.image
     numbers = (torch.bincount(image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""The survey of a capture: measure its photos, find those with problems, and localize the suspects among them."""
+"""Survey of a capture: measure its photos, find those with problems, and localize the suspects among them."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, pose_updates,
 
 NOT_TRIED = HeldOutTrial()
 LEAST_EXPOSURE = 1.0
-"""Least difference, in stops, from the median exposure of a badly exposed photo; training corrects smaller ones."""
+"""Smallest difference, in stops, of a badly exposed photo from the median exposure; training corrects smaller
+ones."""
 CLIPPED = 0.25
-"""Largest excess of the share of clipped pixels in a photo over that in its neighbours."""
+"""Largest excess of a photo's fraction of clipped pixels over that of its neighbours."""
 
 
 def surveyed(
@@ -48,11 +49,11 @@ def surveyed(
     trial: HeldOutTrial = NOT_TRIED,
     up: UpDirection | None = None,
 ) -> CaptureReport:
-    """Return the record of the capture whose keypoints are matched in ``tracked``, in the order of ``views``.
+    """Return the report on a capture whose keypoints are matched in ``tracked``, in the order of ``views``.
 
-    Photos that share few landmarks with others are localized by the landmarks of those that share many, as they are and
-    mirrored: this distinguishes a wrong pose from a photo of something else. ``trial`` holds the errors of held-out photos, and
-    ``up`` is the upward direction of the scene where it is known.
+    Photos that share few landmarks with others are localized with the landmarks of those that share many,
+    both as they are and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial``
+    holds the errors of held-out photos, and ``up`` is the upward direction of the scene if known.
     """
     seen, positions = tracked.triangulated(config)
     links, measures = linked(seen), photo_measures(views)
@@ -88,9 +89,10 @@ def _sound(views: Sequence[View], problems: Sequence[tuple[PhotoProblem, ...]]) 
 def _by_own_landmarks(
     seen: TrackedKeypoints, positions: Float[Tensor, "n 3"], views: Sequence[View]
 ) -> dict[int, Relocation]:
-    """Compare the poses that fit the photos' own landmarks with the given ones, by their scatter in this capture.
+    """Compare the poses that fit the photos' own landmarks with the given ones, relative to the scatter in
+    this capture.
 
-    Poses by fewer landmarks than usual scatter more: their variance is inversely proportional to the number.
+    Poses from fewer landmarks scatter more: the variance is inversely proportional to their number.
     """
     sightings = seen.sightings
     updates = pose_updates(seen, positions, noise(sightings, positions))
@@ -116,14 +118,14 @@ def _problems(
     group: Int[Tensor, "v"],
     posed: Mapping[int, Relocation | None],
 ) -> list[tuple[PhotoProblem, ...]]:
-    """Return the problems of each photo, the gravest first."""
+    """Return each photo's problems, most serious first."""
     blurred = standing_out(-above_neighbours(measures.sharpness, near), LEAST_BLUR)
     clipped = torch.maximum(
         above_neighbours(measures.overexposed, near), above_neighbours(measures.underexposed, near)
     )
     badly_exposed = standing_out(exposure.abs(), LEAST_EXPOSURE) | (clipped > CLIPPED)
     names: list[tuple[PhotoProblem, ...]] = []
-    grouped = bool((group >= 0).any())  # where no photo is linked to others, no photo stands out for it
+    grouped = bool((group >= 0).any())  # if no photos are linked at all, none is reported for it
     for i in range(len(exposure)):
         found = posed.get(i)
         wrong = found.problem if found else None

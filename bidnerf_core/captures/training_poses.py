@@ -1,4 +1,4 @@
-"""The poses with which photos train a map: the given ones, or better ones where the photos contradict them."""
+"""The poses used for training: the given ones, or corrected ones where the photos contradict them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import LandmarkConfig, TrackedViews
 
 INCONSISTENT = 0.25
-"""Least deviation (pixels) that errors of the given poses must add to that of the keypoints for the poses to be refined.
-Poses by structure from motion or a renderer add less than a tenth.
+"""Smallest deviation (pixels) added to the keypoints by errors of the given poses at which the poses are
+refined. Poses from structure from motion or a renderer add less than a tenth.
 """
 
 
@@ -27,8 +27,8 @@ class TrainingPoses:
     """The poses to train with, and how far they are from the given ones."""
 
     tracked: TrackedViews  # with these poses
-    pixels: Float[Tensor, "v"]  # median motion of the points in an image; 0 where its pose was kept
-    replaced: list[int]  # images whose given pose was wrong, placed by landmarks of the others
+    pixels: Float[Tensor, "v"]  # median shift of the points in an image; 0 if its pose was kept
+    replaced: list[int]  # images whose given pose was wrong, localized with the others' landmarks
     refined: bool  # whether all poses were refined
     consistency: PoseConsistency | None  # of the given poses; None if not known
 
@@ -42,8 +42,9 @@ def training_poses(
 ) -> TrainingPoses:
     """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
 
-    A photo that the landmarks of the others find at another place than its given pose is moved there. All poses are refined
-    if errors of the given ones add ``least`` pixels to the deviation of the keypoints; otherwise they are kept.
+    A photo whose given pose contradicts the landmarks of the others is moved to where these place it. All
+    poses are refined if errors of the given ones add at least ``least`` pixels to the deviation of the
+    keypoints; otherwise they are kept.
     """
     config = LandmarkConfig() if config is None else config
     given = tracked.T_world_camera
@@ -65,7 +66,7 @@ def training_poses(
 def _chosen(
     tracked: TrackedViews, fit: AdjustedPoses | None, wrong: list[int], least: float
 ) -> TrainingPoses:
-    """Return the refined poses if needed, else the present ones, of which only those that were wrong are refined."""
+    """Return the refined poses if needed, else the present ones, in which only wrong poses are replaced."""
     still = torch.zeros(len(tracked.observations.images), dtype=torch.float64)
     if fit is None:
         return TrainingPoses(tracked, still, wrong, False, None)
@@ -83,7 +84,7 @@ def _chosen(
 def _wrongly_posed(
     tracked: TrackedViews, views: Sequence[View], config: LandmarkConfig
 ) -> dict[int, Relocation]:
-    """Return the photos that the landmarks of the others find at another place, by number."""
+    """Return the photos, by index, that the landmarks of the others place elsewhere."""
     seen, _ = tracked.triangulated(config)
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, count, groups(linked(seen)))

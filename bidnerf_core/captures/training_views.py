@@ -1,4 +1,4 @@
-"""The views for a training: with refined poses, and with the landmarks that they show."""
+"""The views for training: with refined poses, and with the landmarks they show."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ RefinementChoice = Literal["auto", "always", "never"]
 
 
 RUN, MOST_RUNS = 5, 12
-"""Number of successive views in a run, and largest number of runs, by which poses are checked where keypoints are not needed."""
+"""Number of consecutive views in a run, and largest number of runs, used to check poses when keypoints are
+not needed otherwise."""
 UNUSUAL_RATIO = 0.05
-"""Least relative error of measured depth, compared with triangulated points, that is worth a remark."""
+"""Smallest relative error of measured depth, compared with triangulated points, that is reported."""
 OTHER_UNIT = 2.0
-"""Ratio of measured depth to triangulated depth, or the reverse, that only another unit explains."""
+"""Ratio between measured and triangulated depth, in either direction, that only a different unit explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +47,9 @@ class TrainingViews:
     """Views prepared for training, and what is known about their poses."""
 
     views: list[View]
-    tracked: TrackedViews | None  # their keypoints, from which baking builds landmarks
+    tracked: TrackedViews | None  # the keypoints from which baking builds landmarks
     cameras: tuple[StoredCamera, ...]
-    refinement: PoseRefinement | None = None  # None where nothing is known about the given poses
+    refinement: PoseRefinement | None = None  # None if nothing is known about the given poses
     distances: bool = True  # whether the views determine distances
 
 
@@ -59,8 +60,8 @@ def prepared(
 ) -> TrainingViews:  # fmt: skip
     """Refine the poses of the views if requested, and find the landmarks that they show.
 
-    ``features`` is the name of the detector of their keypoints. Raises ``InputError`` where the poses contradict most pairs of
-    images, unless ``trust_poses`` is set, and where depth is plainly in another unit.
+    ``features`` is the name of the keypoint detector. Raises ``InputError`` if the poses contradict most
+    pairs of images, unless ``trust_poses`` is set, and if depth is clearly in another unit.
     """
     if refinement == "never":
         tracked, seeing = located(views, progress, cancel, features, trust_poses)
@@ -87,8 +88,9 @@ def prepared(
         summary = PoseRefinement(before, after, found.refined, names)
     if summary is None and (refinement == "always" or len(views) >= ENOUGH_IMAGES):
         log.info(
-            f"the poses are kept: to refine them takes {ENOUGH_IMAGES} images or more that show {LEAST_VISIBLE_POINTS}"
-            " triangulated points each; if these images overlap, check the order and the axes of their poses"
+            f"the poses are kept: refining them takes at least {ENOUGH_IMAGES} images with"
+            f" {LEAST_VISIBLE_POINTS} triangulated points each; if these images overlap, check the order and"
+            " the axes of their poses"
         )
     for line in [] if summary is None else pose_sentences(cameras, summary):
         log.info(line)
@@ -105,8 +107,8 @@ def located(
 ) -> tuple[TrackedViews | None, list[View]]:
     """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
-    Return the tracks, from which baking builds the map's landmarks, and the views with the landmarks that each shows;
-    from these training takes distances.
+    Returns the tracks, from which baking builds the map's landmarks, and the views with the landmarks that
+    each shows, from which training takes distances.
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
@@ -115,7 +117,7 @@ def located(
 
 
 def _lacks_distances(view: View) -> bool:
-    """Return whether a view has neither dense depth nor a silhouette, from which training would know where matter is."""
+    """Return whether a view has neither dense depth nor a silhouette to show training where matter is."""
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
@@ -126,9 +128,10 @@ def _tracked(
     features: str,
     trust_poses: bool,
 ) -> TrackedViews:
-    """Track the keypoints of the views. Raises ``InputError`` where poses contradict the images, or depth is in another unit.
+    """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images, or depth is in
+    another unit.
 
-    The unit is blamed last: under wrong poses, triangulated distances say nothing about it.
+    The unit is checked last: under wrong poses, triangulated distances say nothing about it.
     """
     tracked = tracked_views(views, features, progress=counter("landmarks", "steps", progress, cancel))
     if not trust_poses:
@@ -138,27 +141,27 @@ def _tracked(
 
 
 def _sample(views: Sequence[View]) -> list[View]:
-    """Return runs of successive views, evenly spread, that suffice to check the poses."""
+    """Return evenly spread runs of consecutive views that suffice to check the poses."""
     runs = max(1, math.ceil(len(views) / RUN))
     every = max(1, math.ceil(runs / MOST_RUNS))
     return [view for run in range(0, runs, every) for view in views[RUN * run : RUN * (run + 1)]]
 
 
 def _check_poses(images: Sequence[PosedKeypoints]) -> None:
-    """Raise ``InputError`` where the poses contradict most pairs of images."""
+    """Raise ``InputError`` if the poses contradict most pairs of images."""
     if (found := pose_contradiction(images)) is not None:
-        raise InputError(
-            f"{found.sentence} (--trust-poses, trust_poses in Python, trains with them all the same)"
-        )
+        raise InputError(f"{found.sentence} (--trust-poses, trust_poses in Python, trains with them anyway)")
 
 
 def check_depth_unit(tracked: TrackedViews) -> None:
-    """Raise ``InputError`` where measured depth is in another unit than the poses; log a scale that is a few percent off."""
+    """Raise ``InputError`` if measured depth is in another unit than the poses; log a scale that is a few
+    percent off.
+    """
     seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
     ratio = depth_ratio(seen.sightings, points, tracked.depth[seen.number])
     if ratio is None or abs(ratio - 1) < UNUSUAL_RATIO:
         return
-    remark = f"measured depth is {ratio:.3g} times as long as the poses and the photos say"
+    remark = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"
     if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
         raise InputError(
             f"{remark}; expected depth and poses in the same unit: check the unit of the depth images"

@@ -1,7 +1,8 @@
-"""A trial of a map's landmarks: localize some of its own images by landmarks that are built without them.
+"""Validation of a map's landmarks: localize some of its own images with landmarks built without them.
 
-The errors show how accurate poses by landmarks are in this map, and how many keypoints count as one measurement: triangulated
-points, lenses, rolling shutters and the given poses all have errors that the keypoints of an image share.
+The errors show how accurate poses from landmarks are in this map, and how many keypoints count as one
+measurement: triangulated points, lenses, rolling shutters and the given poses all have errors that the
+keypoints of an image share.
 """
 
 from __future__ import annotations
@@ -31,11 +32,12 @@ from bidnerf_core.mapping import (
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
 HELD_OUT, MOST_HELD_OUT = 8, 24
-"""One image in ``HELD_OUT`` is held out, and at most ``MOST_HELD_OUT`` in all."""
+"""One in ``HELD_OUT`` images is held out, ``MOST_HELD_OUT`` in all at most."""
 ENOUGH_ANSWERS = 6
-"""Least number of localized images from which scatter is estimated."""
+"""Smallest number of localized images from which scatter is estimated."""
 QUANTILE = 0.9
-"""Quantile of the errors at which their model is fitted: it covers the tails, and one image of ten may have a wrong pose."""
+"""Quantile at which the error model is fitted: it covers the tails, and allows one image in ten to have a
+wrong pose."""
 CORRELATIONS = (1.0, 300.0)
 """Range of the number of keypoints that count as one measurement."""
 
@@ -47,7 +49,7 @@ class _Answer:
 
     @property
     def matches(self) -> int:
-        """The number of correspondences that the pose was refined on."""
+        """The number of correspondences used to refine the pose."""
         return len(self.found.correspondences)
 
 
@@ -58,7 +60,9 @@ def build_tried_landmarks(
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
-    """Build landmarks as ``mapping.landmarks.building.build_landmarks`` does, and try them: see ``tried_landmarks``."""
+    """Build landmarks like ``mapping.landmarks.building.build_landmarks``, and validate them: see
+    ``tried_landmarks``.
+    """
     return tried_landmarks(tracked_views(views, features, config, progress), views, config, report)
 
 
@@ -68,11 +72,11 @@ def tried_landmarks(
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
-    """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on images that are held out.
+    """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on held-out images.
 
-    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks, and enlarges
-    ``pose_covariance`` if errors are larger than any ``correlation`` explains, as where many given poses are wrong. Raises
-    ``InputError`` if there are no landmarks.
+    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks,
+    and enlarges ``pose_covariance`` if errors are larger than any ``correlation`` explains, for instance
+    because many given poses are wrong. Raises ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
     held_out = _held_out(len(views))
@@ -89,7 +93,7 @@ def tried_landmarks(
 
 
 def _held_out(count: int) -> list[int]:
-    """Return the numbers of the images that are held out, evenly spread."""
+    """Return the indices of the held-out images, evenly spread."""
     wanted = min(count // HELD_OUT, MOST_HELD_OUT)
     return [int((i + 0.5) * count / wanted) for i in range(wanted)]
 
@@ -100,19 +104,19 @@ def _answers(
     held_out: Sequence[int],
     config: LandmarkConfig,
 ) -> list[_Answer]:
-    """Localize the images that are held out, and return the accepted answers."""
+    """Localize the held-out images, and return the accepted answers."""
     if not held_out:
         return []
     try:
         landmarks = tracked.without(held_out).landmarks(config)
-    except InputError:  # what is left shows nothing in common
+    except InputError:  # the rest has no overlap
         return []
     plain = replace(landmarks, correlation=1.0, pose_covariance=torch.zeros_like(landmarks.pose_covariance))
     matcher, answers = LandmarkMatcher(plain), []
     for number in held_out:
         T = views[number].T_ref_camera.to("cpu", torch.float64)
         view = View(views[number].frame, SE3.identity())
-        # Poses that were found without a motion are compared with such poses.
+        # Poses found without a motion are compared with such poses.
         features, moving = tracked.detector_of(view, number), views[number].motion is not None
         found = propose(matcher, [view], features, moving=moving)
         if found is not None and landmark_verdict(found).accepted:
@@ -131,7 +135,7 @@ def _trial(answers: Sequence[_Answer], images: int) -> HeldOutTrial:
 
 
 def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
-    """Return the ``correlation`` with which the errors are as large as the covariances of the fits predict."""
+    """Return the ``correlation`` for which the errors are as large as the covariances of the fits predict."""
     updates = torch.stack([answer.update for answer in answers])
     covariances = torch.stack([answer.found.covariance for answer in answers])
     expected = chi_squared_quantile(QUANTILE, 6)
@@ -146,20 +150,20 @@ def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
 
 
 def _unexplained(answers: Sequence[_Answer]) -> Float[Tensor, "6 6"]:
-    """Return the covariance of independent errors along each axis as large as those of the answers."""
+    """Return a diagonal covariance that would explain the answers' errors along each axis."""
     squared = torch.stack([answer.update for answer in answers]).square()
     return torch.diag(squared.quantile(QUANTILE, dim=0) / chi_squared_quantile(QUANTILE, 1))
 
 
 def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
-    """Return the factors by which to scale the covariances of answers that treat keypoints as independent."""
+    """Return the factors that scale the covariances of answers that treat keypoints as independent."""
     return torch.tensor([landmarks.correlation_of(answer.matches) for answer in answers], dtype=torch.float64)
 
 
 def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "4"]:
     """Return the standard deviations of the corrections estimated for intrinsics that are in fact right.
 
-    The part explained by the uncertainty of each fit is removed.
+    The part explained by the uncertainty of each fit is subtracted.
     """
     posteriors = [answer.found.guided.posterior for answer in answers if answer.found.guided is not None]
     apparent = torch.stack([posterior.apparent[:4] for posterior in posteriors])

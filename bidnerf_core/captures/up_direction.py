@@ -1,8 +1,9 @@
-"""The upward direction of a scene: from gravity where the capture measured it, else from planes and cameras.
+"""The upward direction of a scene: from gravity if the capture measured it, else from planes and cameras.
 
-People hold cameras level, but they look down on desks and objects, so the mean of the cameras' upward axes is tilted by as much
-as the cameras are. Two facts do not suffer from this: the horizontal image axes of level cameras are perpendicular to the
-vertical, and floors, ceilings and tables are planes across it. The direction is the one that both support best.
+People hold cameras level, but they look down on desks and objects, so the mean of the cameras' upward axes is
+tilted as much as the cameras are. Two cues do not suffer from this: the horizontal image axes of level
+cameras are perpendicular to the vertical, and floors, ceilings and tables are horizontal planes. The
+direction is the one with the most support from both.
 """
 
 from __future__ import annotations
@@ -20,29 +21,29 @@ from torch.nn.functional import normalize
 from bidnerf_core.geometry.se3 import SE3
 
 UpSource = Literal["gravity", "planes", "cameras"]
-"""What an upward direction was found from."""
+"""Where an upward direction comes from."""
 
 ROLL_DEG = 6.0
-"""Standard deviation by which hand-held cameras are rolled against the horizon."""
+"""Standard deviation of the roll of hand-held cameras relative to the horizon."""
 INDEPENDENT = 8
 """Largest number of cameras whose rolls count as independent, since many frames of a video share one."""
 SIDEWAYS = 2.0
-"""Log odds of upright against sideways images, as phones that are held upright store them."""
+"""Log odds of upright against sideways images, as stored by phones that are held upright."""
 LOOKING_UP = 3.0
-"""Log odds against cameras that all look straight up, in proportion to the sine of the angle."""
+"""Log odds against all cameras looking straight up, proportional to the sine of the angle."""
 ALIKE_DEG = 8.0
 """Angle within which normals belong to one plane or to parallel ones."""
 CHANCE = 1 - math.cos(math.radians(ALIKE_DEG))
-"""Share of randomly oriented surfels whose normals agree with a direction."""
+"""Fraction of randomly oriented surfels whose normals agree with a direction."""
 CLEAR = 3 * CHANCE
-"""Least share of the surfels, beyond chance, that makes a plane."""
+"""Smallest fraction of the surfels, beyond chance, that makes a plane."""
 DIRECTIONS, SAMPLED, PLANES = 1500, 20_000, 6
-"""Directions that are tried, surfels that are looked at, and the number of candidates among planes."""
+"""Number of directions tried, of surfels sampled, and of candidate planes."""
 
 
 @dataclass(frozen=True)
 class UpDirection:
-    """The upward direction of a scene, and what it was found from."""
+    """The upward direction of a scene, and its source."""
 
     direction: tuple[float, float, float]  # unit, world
     source: UpSource
@@ -58,9 +59,10 @@ def given_up(direction: Sequence[float]) -> UpDirection:
 
 
 def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpDirection:
-    """Return the upward direction of a scene from its cameras and, where there is a surface, from the normals of its surfels.
+    """Estimate the upward direction of a scene from its cameras and, if there is a surface, its surfels'
+    normals.
 
-    ``poses`` are T_world_camera of the images (n), at least one; the sign of a normal has no meaning.
+    ``poses`` are T_world_camera of the images (n), at least one; the signs of normals are ignored.
     """
     rotations = poses.rotation.detach().cpu().double()
     planes = _planes(normals)
@@ -85,7 +87,7 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
 def _snapped(
     up: Float[Tensor, "3"], source: UpSource, planes: Sequence[tuple[Tensor, float, UpSource]]
 ) -> UpDirection:
-    """Return the direction, moved onto the normal of a plane that is nearly across it."""
+    """Snap the direction to the normal of a plane that is nearly perpendicular to it."""
     if source == "cameras":
         cosine = math.cos(math.radians(ALIKE_DEG))
         near = [(share, axis) for axis, share, _ in planes if abs(float(axis @ up)) > cosine]
@@ -98,22 +100,26 @@ def _snapped(
 def _level(
     up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]
 ) -> list[tuple[Tensor, float, UpSource]]:
-    """Return the direction that is most nearly perpendicular to all horizontal image axes, nearest to the mean upward axis.
+    """Return the direction most nearly perpendicular to all horizontal image axes, nearest to the mean upward
+    axis.
 
-    Where the cameras all look one way, only the plane of such directions is known, and the mean decides within it.
+    If all cameras face the same way, only the plane of such directions is known, and the mean decides within
+    it.
     """
     mean = normalize(up_axis.mean(0), dim=0)
     spread = level_axis.mT @ level_axis / len(level_axis)
     prior = 0.1 * (
         torch.eye(3, dtype=torch.float64) - torch.outer(mean, mean)
-    )  # a tilt by 20 degrees is usual
+    )  # a tilt of 20 degrees is common
     roll = math.sin(math.radians(ROLL_DEG)) ** 2
     weight = min(len(up_axis), INDEPENDENT)
     return [(torch.linalg.eigh(weight * spread / roll + prior / 0.1 / 0.35**2)[1][:, 0], 0.0, "cameras")]
 
 
 def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, UpSource]]:
-    """Return the directions with which most normals agree, and the share of the normals beyond chance that do."""
+    """Return the directions with which most normals agree, and the fraction of normals, beyond chance, that
+    do.
+    """
     if normals is None or not len(normals):
         return []
     some = normals.detach().cpu().double()[:: max(1, len(normals) // SAMPLED)]
@@ -134,7 +140,7 @@ def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, U
 
 
 def _mean_axis(normals: Float[Tensor, "n 3"], axis: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Return the mean direction of the normals near an axis, closing in on it."""
+    """Return the mean direction of the normals near an axis, refined iteratively."""
     for degrees in (ALIKE_DEG, ALIKE_DEG, ALIKE_DEG / 2, ALIKE_DEG / 4):
         along = normals @ axis
         near = along.abs() > math.cos(math.radians(degrees))

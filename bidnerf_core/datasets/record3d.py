@@ -245,7 +245,7 @@ def _times(metadata: Record, count: int) -> list[float | None]:
     """Return the times of the frames, by their stamps or by the rate."""
     stamps = metadata.items("frameTimestamps")
     if stamps is not None and len(stamps) >= count:
-        return [metadata.checked_number(stamp, "a number of frameTimestamps") for stamp in stamps[:count]]
+        return [metadata.checked_number(stamp, "an entry of frameTimestamps") for stamp in stamps[:count]]
     fps = metadata.number("fps")
     return [number / fps if fps else None for number in range(count)]
 
@@ -268,7 +268,7 @@ def _cameras(metadata: Record, count: int) -> list[Intrinsics]:
 def _camera(metadata: Record, row: list[Any], width: int, height: int) -> Intrinsics:
     if len(row) < 4:
         raise metadata.error(f"perFrameIntrinsicCoeffs has {row}, expected fx fy cx cy")
-    fx, fy, cx, cy = (metadata.checked_number(value, "a number of the intrinsics") for value in row[:4])
+    fx, fy, cx, cy = (metadata.checked_number(value, "an entry of the intrinsics") for value in row[:4])
     try:
         return Intrinsics(fx, fy, cx + CENTRE_OF_PIXEL, cy + CENTRE_OF_PIXEL, width, height)
     except InputError as error:

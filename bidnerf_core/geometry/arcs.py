@@ -15,7 +15,9 @@ from bidnerf_core.geometry.se3 import SE3
 def turned_about(
     T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float
 ) -> SE3:
-    """Return the camera's pose after a rotation about the axis ``up`` through ``middle`` (metres, world)."""
+    """Return the camera's pose after a rotation by ``angle_deg`` about the axis ``up`` through ``middle``
+    (metres, world).
+    """
     phi = math.radians(angle_deg) * torch.nn.functional.normalize(up, dim=0)
     turn = SE3.exp(torch.cat([torch.zeros_like(phi), phi]))
     moved = T_world_camera.translation - middle
@@ -23,7 +25,9 @@ def turned_about(
 
 
 def seen_middle(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
-    """Return the least-squares point nearest to all optical axes (metres, world), which the surrounding cameras look at."""
+    """Return the least-squares intersection of all optical axes (metres, world): the point the surrounding
+    cameras look at.
+    """
     eye = torch.eye(3, dtype=torch.float64)
     across = [eye - torch.outer(T.rotation[:, 2], T.rotation[:, 2]) for T in poses]
     normal = torch.stack(across).sum(0) + 1e-9 * eye  # for parallel axes, any point will do
@@ -39,10 +43,12 @@ def mean_up(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
 
 
 def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
-    """Return the indices of ``count`` frames, ``angle_deg`` apart about their common centre, the last of which is ``last``.
+    """Return the indices of ``count`` frames, ``angle_deg`` apart about their common centre, ending with
+    ``last``.
 
-    At each step about the vertical axis, the frame whose direction from the centre is nearest is chosen. Both senses of
-    rotation are tried, and the better fit is returned; None if at some step no unused frame lies within half a step.
+    At each step about the vertical axis, the frame nearest in direction from the centre is chosen. Both
+    senses of rotation are tried, and the better fit is returned; None if at some step no unused frame lies
+    within half a step.
     """
     middle, up = seen_middle(poses), mean_up(poses)
     directions = torch.nn.functional.normalize(torch.stack([T.translation - middle for T in poses]), dim=-1)
@@ -54,7 +60,9 @@ def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[
 def _one_way(
     poses: Sequence[SE3], directions: Tensor, last: int, middle: Tensor, up: Tensor, count: int, angle: float
 ) -> tuple[float, tuple[int, ...]] | None:
-    """Return the mean angle (rad) between frames and their ideal places, and the frames' indices; None if one is missing."""
+    """Return the mean angle (rad) between frames and their ideal places, and the frames' indices; None if one
+    is missing.
+    """
     taken, missed = [last], 0.0
     for step in range(1, count):
         wanted = turned_about(poses[last], middle, up, step * angle).translation - middle

@@ -1,4 +1,4 @@
-"""The pose of a camera that looks at a place."""
+"""The pose of a camera that looks at a given point."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ def look_at(
     target: Sequence[float] | Float[Tensor, "3"],
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> SE3:
-    """Return ``T_world_camera`` (float64) of a camera at ``eye`` that looks at ``target`` with ``up`` upwards."""
+    """Return ``T_world_camera`` (float64) of a camera at ``eye`` that looks at ``target``, with ``up``
+    pointing upwards.
+    """
     position = torch.as_tensor(eye, dtype=torch.float64)
     forward = torch.as_tensor(target, dtype=torch.float64) - position
     if not torch.linalg.vector_norm(forward) > 0:
-        raise InputError(f"look_at: the camera's place {position.tolist()} and its target are the same")
+        raise InputError(f"look_at: the camera position {position.tolist()} equals its target")
     forward = torch.nn.functional.normalize(forward, dim=0)
     right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=torch.float64))
     if torch.linalg.vector_norm(right) < 1e-6:  # straight up or down: any right will do

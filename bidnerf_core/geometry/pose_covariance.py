@@ -15,7 +15,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 
 CovarianceConvention = Literal["bidnerf", "gtsam", "ros"]
-"""What the rows of a covariance stand for.
+"""Order and frame of the rows of a covariance.
 
 - ``"bidnerf"``: translation, then rotation, of a right update in the camera's axes (as Sophus has it).
 - ``"gtsam"``: rotation, then translation, of a right update in the camera's axes: the tangent of GTSAM's ``Pose3``.
@@ -26,10 +26,11 @@ CovarianceConvention = Literal["bidnerf", "gtsam", "ros"]
 def covariance_in(
     covariance: Float[Tensor, "6 6"], T_world_camera: SE3, convention: CovarianceConvention
 ) -> Float[Tensor, "6 6"]:
-    """Return a covariance of ours at ``T_world_camera`` in another convention (float64).
+    """Convert one of our covariances at ``T_world_camera`` to another convention (float64).
 
-    A right update by (rho, phi) moves the position by ``R rho`` in the world and premultiplies the rotation by ``exp(R phi)``, to
-    first order, hence ROS' covariance has both blocks rotated. Raises ``InputError`` for an unknown convention.
+    A right update by (rho, phi) moves the position by ``R rho`` in the world and premultiplies the rotation
+    by ``exp(R phi)``, to first order, so both blocks are rotated for ROS. Raises ``InputError`` for an
+    unknown convention.
     """
     if convention not in get_args(CovarianceConvention):
         raise InputError(

@@ -18,7 +18,7 @@ from bidnerf_core.io.json import Record
 from bidnerf_core.io.rows import read_rows
 
 LARGEST_POSE = 4096
-"""Bytes of a file of one pose."""
+"""Largest size of a file with one pose, in bytes."""
 RIGID_TO = 5e-3
 """Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
 
@@ -26,9 +26,9 @@ RIGID_TO = 5e-3
 def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, float]:
     """Return ``T_world_camera`` (OpenCV axes, float64) from a matrix (3x4 or 4x4, OpenGL axes), and the scale removed from it.
 
-    A rotation that is orthonormal up to rounding is orthonormalized. A homogeneous matrix whose last entry is not 1 is divided
-    by it, and a rotation of uniform scale is normalized; the position of the camera is that of the matrix. The scale is 1
-    where there was neither. Raises ``InputError`` for any other matrix.
+    A rotation that is orthonormal up to rounding is orthonormalized. A homogeneous matrix whose last entry is
+    not 1 is divided by it, and a rotation of uniform scale is normalized; the position of the camera is that
+    of the matrix. The scale is 1 if neither applies. Raises ``InputError`` for any other matrix.
     """
     matrix, scale = _homogeneous(record, key, record.items(key))
     size = float(torch.linalg.det(matrix[:, :3]).abs()) ** (1 / 3)
@@ -39,7 +39,8 @@ def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, 
 
 
 def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
-    """Return ``T_world_camera`` (OpenCV axes, float64) of the rows (3x4 or 4x4, OpenGL axes) of a rigid transform.
+    """Convert the rows (3x4 or 4x4, OpenGL axes) of a rigid transform to ``T_world_camera`` (OpenCV axes,
+    float64).
 
     ``key`` is the key of ``rows`` in ``record``, for messages. Raises ``InputError`` for any other matrix.
     """
@@ -47,7 +48,7 @@ def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
 
 
 def _opencv(matrix: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
-    """Return a pose with OpenCV axes instead of OpenGL's: y up becomes y down, z backward becomes z forward."""
+    """Convert a pose from OpenGL to OpenCV axes: y up becomes y down, z backward becomes z forward."""
     return matrix * matrix.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
@@ -69,7 +70,7 @@ def _rigid(record: Record, key: str, matrix: Float[Tensor, "3 4"]) -> SE3:
 def rigid_pose(matrix: Float[Tensor, "3 4"]) -> SE3:
     """Return the rigid transform that ``matrix`` represents up to rounding.
 
-    Raises ``InputError`` for any other matrix; the message states only how its rotation part is wrong.
+    Raises ``InputError`` for any other matrix; the message states only what is wrong with its rotation part.
     """
     given = SE3(matrix[:3, :3], matrix[:3, 3])
     if not given.is_rigid(RIGID_TO):
@@ -79,7 +80,7 @@ def rigid_pose(matrix: Float[Tensor, "3 4"]) -> SE3:
 
 
 def _matrix(record: Record, key: str, rows: list[Any] | None) -> Float[Tensor, "3 4"]:
-    """Return the first three of three or four rows of finite numbers; a fourth row must be 0 0 0 1."""
+    """Return the first three rows of a 3x4 or 4x4 matrix of finite numbers; a fourth row must be 0 0 0 1."""
     matrix, scale = _homogeneous(record, key, rows)
     if scale != 1.0:
         raise record.error(f"the last row of {key} is [0, 0, 0, {scale:g}], expected [0, 0, 0, 1]")
@@ -92,7 +93,7 @@ def _homogeneous(record: Record, key: str, rows: list[Any] | None) -> tuple[Floa
         raise record.error(f"no {key}, expected a 4x4 camera-to-world matrix")
     if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
         raise record.error(f"{key} is not 3x4 or 4x4, expected a 4x4 matrix")
-    numbers = [[record.checked_number(x, f"a number of {key}") for x in row] for row in rows]
+    numbers = [[record.checked_number(x, f"an entry of {key}") for x in row] for row in rows]
     last = numbers[3] if len(numbers) == 4 else [0.0, 0.0, 0.0, 1.0]
     if not last[3] > 0 or max(map(abs, last[:3])) > 1e-6 * last[3]:
         raise record.error(f"the last row of {key} is {last}, expected [0, 0, 0, 1]")
@@ -101,9 +102,9 @@ def _homogeneous(record: Record, key: str, rows: list[Any] | None) -> tuple[Floa
 
 
 def read_pose_matrix(path: Path) -> SE3:
-    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file of one 4x4 matrix.
+    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
 
-    Raises ``InputError``, which names the line that is not usable.
+    Raises ``InputError``, which names the offending line.
     """
     expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
     rows = [row.numbers(count=4) for row in read_rows(path, "a file of a pose", expected, LARGEST_POSE)]

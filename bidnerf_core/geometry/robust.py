@@ -1,8 +1,8 @@
-"""Robust losses, and the weights with which iteratively reweighted least squares minimises them.
+"""Robust losses, and their weights for iteratively reweighted least squares.
 
-All but ``l1`` are ``r^2 / 2`` for residuals that are small compared with their scale, so that one may replace another without
-a change of weights; ``l1`` has the slope of ``huber`` at large residuals. Names and shapes are those of Barron 2019, "A
-general and adaptive robust loss function" (eqs. 7, 13 to 16), times the squared scale.
+All but ``l1`` equal ``r^2 / 2`` for residuals that are small relative to their scale, so one may replace
+another without a change of weights; ``l1`` has the slope of ``huber`` at large residuals. Names and shapes
+follow Barron 2019, "A general and adaptive robust loss function" (eqs. 7, 13 to 16), times the squared scale.
 """
 
 from __future__ import annotations
@@ -64,22 +64,24 @@ WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "cauchy": lambda r, c: inlier_weight(r**2, math.sqrt(2) * c),
     "geman-mcclure": lambda r, c: inlier_weight(r**2, 2 * c) ** 2,
 }
-"""``rho'(r) / r`` of each; that of ``l1``, which is unbounded at 0, is limited there."""
+"""``rho'(r) / r`` of each loss; that of ``l1``, which is unbounded at 0, is limited there."""
 
 
 def inlier_weight(squared: Values, half: float) -> Values:
     """Return ``1 / (1 + s / half^2)`` of squared residuals s: 1 at 0, a half where the residual is ``half``.
 
-    This is the weight of ``cauchy_loss``. It is also the degree to which a residual is an inlier (Geman and McClure 1985): one
-    minus it is their loss, and its square is that loss's weight in least squares.
+    This is the weight of ``cauchy_loss``. It is also the degree to which a residual is an inlier (Geman and
+    McClure 1985): their loss is one minus this value, and its least-squares weight is the square.
     """
     return 1 / (1 + squared / half**2)
 
 
 def cauchy_loss(squared: np.ndarray, half: float) -> float:
-    """Return Cauchy's loss of squared residuals s, summed: ``half^2 / 2 log(1 + s / half^2)``; see ``inlier_weight``.
+    """Return Cauchy's loss of squared residuals s, summed: ``half^2 / 2 log(1 + s / half^2)``; see
+    ``inlier_weight``.
 
-    Unlike ``cauchy``, it takes vectors by their squared length, and its scale is where the weight is a half.
+    Unlike ``cauchy``, it takes squared lengths of vectors, and its scale is the residual at which the weight
+    is one half.
     """
     return 0.5 * half**2 * float(np.log1p(squared / half**2).sum())
 
@@ -102,7 +104,7 @@ class Robust:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.scale) and self.scale > 0):
-            raise InputError(f"scale of the robust loss is {self.scale}, expected a positive number")
+            raise InputError(f"the scale of the robust loss is {self.scale}, expected a positive number")
 
     def __call__(self, residual: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
         return LOSSES[self.name](residual, self.scale)
@@ -113,9 +115,9 @@ class Robust:
 
 
 def chi_squared_quantile(probability: float, count: int) -> float:
-    """Return the value below which the sum of ``count`` squared standard normal numbers lies with a probability."""
+    """Return the quantile of the chi-squared distribution with ``count`` degrees of freedom."""
     from scipy.special import (
-        gammaincinv,  # scipy.stats has the same, and takes a tenth of the time of all imports
+        gammaincinv,  # scipy.stats has the same function, but takes a tenth of the total import time
     )
 
     return 2.0 * float(gammaincinv(count / 2, probability))

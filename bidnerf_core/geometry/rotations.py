@@ -1,4 +1,6 @@
-"""Rotations and updates of single poses in NumPy, in microseconds; ``SE3`` and SciPy, made for batches, take a millisecond."""
+"""Rotations and updates of single poses in NumPy, in microseconds; ``SE3`` and SciPy are built for batches
+and take a millisecond.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from torch import Tensor
 from bidnerf_core.geometry.se3 import SE3
 
 SERIES_ANGLE = 1e-4
-"""Angle (radians) below which coefficients come from their series."""
+"""Angle (radians) below which coefficients are computed from their series."""
 WIDE_ANGLE = 2.5
 """Angle (radians) above which the logarithm is left to SciPy: the skew part then no longer determines the axis well."""
 
@@ -63,7 +65,7 @@ def retracted(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:
 
 
 def update_between(a: SE3, b: SE3) -> Float[Tensor, "6"]:
-    """Return the right update that leads from ``a`` to ``b``: ``(a.inverse() @ b).log()``; float64, without derivatives."""
+    """Return the right update from ``a`` to ``b``: ``(a.inverse() @ b).log()``; float64, without derivatives."""
     back = a.rotation.numpy().T
     phi = rotation_vector(back @ b.rotation.numpy())
     rho = np.linalg.solve(left_jacobian(phi), back @ (b.translation - a.translation).numpy())

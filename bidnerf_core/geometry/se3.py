@@ -25,11 +25,12 @@ from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
 SERIES_BELOW = 1e-2
-"""Angles (rad) under which coefficients come from their series: sin and cos cancel there, in value and derivative."""
+"""Angle (rad) below which coefficients are computed from their series: sin and cos cancel there, in value and
+derivative."""
 
 
 QuaternionOrder = Literal["wxyz", "xyzw"]
-"""The place of a quaternion's scalar part w."""
+"""The position of a quaternion's scalar part w."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +46,16 @@ class SE3:
 
     @staticmethod
     def from_matrix(matrix: Float[Tensor, "*b 4 4"]) -> SE3:
-        """Return the transform of a homogeneous matrix. Its numbers are not checked; ``is_rigid`` does that.
+        """Convert a homogeneous matrix. Its entries are not checked; ``is_rigid`` does that.
 
-        Raises ``InputError`` for what is no tensor of 4x4 matrices.
+        Raises ``InputError`` unless it is a tensor of 4x4 matrices.
         """
         if not isinstance(matrix, Tensor):
             raise InputError(
                 f"matrix is a {type(matrix).__name__}, expected a tensor; torch.as_tensor makes one"
             )
         if matrix.shape[-2:] != (4, 4):
-            raise InputError(f"matrix has shape {tuple(matrix.shape)}, expected (..., 4, 4)")
+            raise InputError(f"the matrix has shape {tuple(matrix.shape)}, expected (..., 4, 4)")
         return SE3(matrix[..., :3, :3], matrix[..., :3, 3])
 
     @staticmethod
@@ -76,8 +77,8 @@ class SE3:
     def quaternion(self, order: QuaternionOrder) -> Float[Tensor, "*b 4"]:
         """Return the unit quaternion of the rotation, with its scalar part w >= 0.
 
-        ``order`` is ``"xyzw"`` (ROS, TUM, scipy, glTF, Unity) or ``"wxyz"`` (COLMAP, Eigen's constructor, Blender, nerfstudio).
-        Raises ``InputError`` for any other.
+        ``order`` is ``"xyzw"`` (ROS, TUM, scipy, glTF, Unity) or ``"wxyz"`` (COLMAP, Eigen's constructor,
+        Blender, nerfstudio). Raises ``InputError`` for any other value.
         """
         if order not in get_args(QuaternionOrder):
             raise InputError(f"order is {order!r}, expected one of {', '.join(get_args(QuaternionOrder))}")
@@ -89,7 +90,7 @@ class SE3:
     def from_quaternion(
         quaternion: Float[Tensor, "*b 4"], translation: Float[Tensor, "*b 3"], order: QuaternionOrder
     ) -> SE3:
-        """Return the transform of a quaternion in ``order``, see ``quaternion``, and a translation.
+        """Build the transform from a quaternion in ``order`` (see ``quaternion``) and a translation.
 
         Raises ``InputError`` for a quaternion whose length is 0 or not finite.
         """
@@ -97,7 +98,7 @@ class SE3:
             raise InputError(f"order is {order!r}, expected one of {', '.join(get_args(QuaternionOrder))}")
         length = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
         if not bool((length.isfinite() & (length > 0)).all()):
-            raise InputError("a quaternion of length 0, or one that is not finite, expected a rotation")
+            raise InputError("a quaternion has length 0 or is not finite, expected a rotation")
         unit = (quaternion if order == "wxyz" else quaternion.roll(1, dims=-1)) / length
         w, v = unit[..., :1, None], unit[..., 1:]
         cross = skew(v)
@@ -120,7 +121,9 @@ class SE3:
         return _matvec(self.rotation, vectors)
 
     def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
-        """Return ``retract`` to first order in ``tangent``: cheaper, with the same value and derivative at 0; not rigid elsewhere."""
+        """Approximate ``retract`` to first order in ``tangent``: cheaper, with the same value and derivative
+        at 0, but not rigid elsewhere.
+        """
         rho, phi = tangent[..., :3], tangent[..., 3:]
         return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
 
@@ -143,9 +146,9 @@ class SE3:
         return SE3(u @ (sign[..., None] * vh), self.translation)
 
     def polished(self) -> SE3:
-        """Return the transform without the rounding of a product: a Newton-Schulz step towards the nearest rotation.
+        """Remove a product's rounding errors by one Newton-Schulz step towards the nearest rotation.
 
-        It needs no factorization, for which a host waits. The rotation must be orthonormal but for rounding.
+        Unlike a factorization, this does not block the host. The rotation must be orthonormal up to rounding.
         """
         R = self.rotation
         return SE3(1.5 * R - 0.5 * R @ (R.mT @ R), self.translation)
@@ -244,7 +247,9 @@ def _coupling(rho: Float[Tensor, "*b 3"], phi: Float[Tensor, "*b 3"]) -> Float[T
 
 
 def _guarded_angle(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Squared angle, where it is small, and an angle that is 1 there: neither branch of a ``where`` may divide by 0."""
+    """Return the squared angle, whether it is small, and the angle (1 if small): neither branch of a
+    ``where`` may divide by 0.
+    """
     squared = (phi * phi).sum(-1)
     small = squared < SERIES_BELOW**2
     return squared, small, torch.where(small, torch.ones_like(squared), squared).sqrt()
@@ -262,17 +267,17 @@ def _matvec(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def pose_from_matrix(matrix: Float[Tensor, "..."], what: str) -> SE3:
-    """Return T_world_camera of a homogeneous 4x4 matrix, by rows.
+    """Convert a row-major homogeneous 4x4 matrix to T_world_camera.
 
-    Raises ``InputError``, which begins with ``what``, for another shape, another last row than 0 0 0 1, and a rotation that
-    is not orthonormal.
+    Raises ``InputError``, whose message begins with ``what``, unless it is 4x4, ends in 0 0 0 1 and has an
+    orthonormal rotation.
     """
     if matrix.shape != (4, 4):
         raise InputError(f"{what} has shape {tuple(matrix.shape)}, expected a 4x4 matrix T_world_camera")
     last = matrix[3].tolist()
     if not _is_last_row(last):
         transposed = _is_last_row(matrix[:, 3].tolist())
-        hint = "; its last column is, so it is written by columns: transpose it" if transposed else ""
+        hint = "; its last column is, so the matrix is column-major: transpose it" if transposed else ""
         raise InputError(f"{what} has the last row {last}, expected [0, 0, 0, 1]{hint}")
     pose = SE3.from_matrix(matrix.to(torch.float64))
     if not bool(pose.is_rigid()):

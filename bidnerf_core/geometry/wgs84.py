@@ -1,7 +1,8 @@
-"""Places on the earth: geodetic coordinates on the ellipsoid WGS 84, and local frames whose axes point east, north and up.
+"""Places on the earth: geodetic coordinates on the WGS 84 ellipsoid, and local east-north-up frames.
 
-Earth-centred coordinates (ECEF) are metres; latitudes and longitudes are degrees, and heights are metres above the ellipsoid, not
-above the sea. Everything is float64: a float32 resolves half a metre of the earth's radius.
+Earth-centred coordinates (ECEF) are in metres, latitudes and longitudes in degrees, and heights in metres
+above the ellipsoid, not above sea level. Everything is float64: float32 resolves only half a metre at the
+earth's radius.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Geodetic:
     height: float
 
     def __post_init__(self) -> None:
-        """Raise ``InputError`` for numbers that no place near the earth has."""
+        """Raise ``InputError`` for coordinates that no place near the earth has."""
         bounds = (("latitude", 90.0), ("longitude", 180.0), ("height", FARTHEST))
         for name, most in bounds:
             value = getattr(self, name)
@@ -71,7 +72,7 @@ class Geodetic:
 
 
 def geodetic(ecef: Float[Tensor, "3"]) -> Geodetic:
-    """Return the geodetic coordinates of a point in earth-centred ones (Bowring 1976, iterated)."""
+    """Convert an earth-centred point to geodetic coordinates (Bowring 1976, iterated)."""
     x, y, z = (float(value) for value in ecef)
     from_axis = math.hypot(x, y)
     reduced = math.atan2(z, (1 - FLATTENING) * from_axis)
@@ -90,5 +91,5 @@ def geodetic(ecef: Float[Tensor, "3"]) -> Geodetic:
 
 
 def _prime_vertical_radius(latitude: float) -> float:
-    """Return the ellipsoid's radius of curvature across the meridian (metres) at a latitude in radians."""
+    """Return the ellipsoid's prime vertical radius of curvature (metres) at a latitude in radians."""
     return SEMI_MAJOR / math.sqrt(1 - ECCENTRICITY_SQUARED * math.sin(latitude) ** 2)

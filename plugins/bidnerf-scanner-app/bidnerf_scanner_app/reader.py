@@ -258,7 +258,7 @@ def _numbers(record: Record, key: str, count: int) -> list[float]:
         raise record.error(f"no {key}, expected {count} numbers")
     if len(found) != count:
         raise record.error(f"{key} has {len(found)} entries, expected {count} numbers")
-    return [record.checked_number(value, f"a number of {key}") for value in found]
+    return [record.checked_number(value, f"an entry of {key}") for value in found]
 
 
 reader = ScannerAppReader()

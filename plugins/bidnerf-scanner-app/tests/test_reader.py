@@ -262,7 +262,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no intrinsics": (lambda f: rewrite(f, lambda c: c.pop("intrinsics")), r"no intrinsics, expected 9"),
     "pose NaN": (
         lambda f: rewrite(f, lambda c: c["cameraPoseARFrame"].__setitem__(3, float("nan"))),
-        r"a number of cameraPoseARFrame is NaN, expected a finite number",
+        r"an entry of cameraPoseARFrame is NaN, expected a finite number",
     ),
     "transposed intrinsics": (
         lambda f: rewrite(f, lambda c: c.update(intrinsics=[FOCAL, 0, 0, 0, FOCAL, 0, *CENTRE, 1])),
