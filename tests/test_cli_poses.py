@@ -162,7 +162,7 @@ def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])
 def test_depth_in_another_unit_is_refused(ratio: float) -> None:
-    with pytest.raises(InputError, match=r"times as long as the poses .*depth_unit_scale_factor"):
+    with pytest.raises(InputError, match=r"times the depth that the poses .*depth_unit_scale_factor"):
         training_views.check_depth_unit(measured(ratio))
 
 
@@ -172,7 +172,7 @@ def test_a_scale_of_depth_that_is_a_few_percent_off_is_told(
 ) -> None:
     caplog.set_level("INFO", "bidnerf")
     training_views.check_depth_unit(measured(ratio))
-    assert ("times as long as the poses and the photos say; training takes both" in caplog.text) == said
+    assert ("times the depth that the poses and photos imply; training takes both" in caplog.text) == said
 
 
 @pytest.mark.data
