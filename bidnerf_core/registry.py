@@ -1,5 +1,5 @@
-"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers and
-importers.
+"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers,
+importers and exporters.
 
 A distribution provides an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones are
 provided in the same way. A script or a notebook adds one with ``register``. Listing reads only metadata and
@@ -36,6 +36,7 @@ GROUPS: Mapping[str, str] = {
     "faults": "fault",
     "writers": "writer",
     "importers": "importer",
+    "exporters": "exporter",
 }
 """The kinds of object that can be registered, and the noun for each. The entry-point group has the prefix
 ``bidnerf.``."""
@@ -402,12 +403,13 @@ def _imported(info: PluginInfo) -> Any:
 
 def _checked(info: PluginInfo, plugin: Any, defects: Defects | None) -> Any:
     noun = GROUPS[info.group]
+    kind = f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
     try:
         wrong = None if defects is None else next(defects(plugin), None)
     except Exception as error:  # a property may raise anything
-        raise PluginError(f"{info}: not a {noun}: {_described(error)}") from error
+        raise PluginError(f"{info}: not {kind}: {_described(error)}") from error
     if wrong is not None:
-        raise PluginError(f"{info}: not a {noun}: {wrong}")
+        raise PluginError(f"{info}: not {kind}: {wrong}")
     return plugin
 
 

@@ -17,6 +17,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io.json import read_record
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
+from bidnerf_core.registry import PluginError, registered
 from bidnerf_core.testing.textured_field import BOUNDS, textured_map, training_views
 
 
@@ -85,8 +86,27 @@ def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no surface, landmarks or cameras"):
         bn.export_map(bare, tmp_path / "out", "ply")
     with pytest.raises(InputError, match="format 'obj', expected one of ply"):
-        bn.export_map(scene, tmp_path / "out", "obj")  # type: ignore[arg-type]
+        bn.export_map(scene, tmp_path / "out", "obj")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
         bn.export_map(scene, tmp_path / "full", "ply")
+
+
+def test_a_registered_exporter_gets_the_map(
+    scene: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(map_: Map, out: Path) -> list[Path]:
+        (out / "count.txt").write_text(str(len(map_.landmarks or ())))
+        return [out / "count.txt"]
+
+    monkeypatch.setitem(registered, ("exporters", "count"), write)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    (file,) = bn.export_map(scene, tmp_path / "out", "count", overwrite=True)
+    assert scene.landmarks is not None
+    assert file.read_text() == str(len(scene.landmarks))
+
+    monkeypatch.setitem(registered, ("exporters", "count"), lambda: None)
+    with pytest.raises(PluginError, match="not an exporter: it does not take"):
+        bn.export_map(scene, tmp_path / "out", "count", overwrite=True)

@@ -9,7 +9,7 @@ from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Flag, MapFolder, option, parse
 from bidnerf_core.cli.output import show
 from bidnerf_core.maps.map import load_map
-from bidnerf_core.results.export import ExportFormat, export_map
+from bidnerf_core.results.export import export_map
 
 
 def run(arguments: list[str]) -> None:
@@ -19,11 +19,12 @@ def run(arguments: list[str]) -> None:
 def export(
     map: MapFolder,
     to: Annotated[
-        ExportFormat,
+        str,
         option(
             "FORMAT",
             "ply: surface, landmarks and cameras as point clouds and meshes; colmap: a text model of cameras and landmarks;"
-            " transforms.json: cameras as nerfstudio reads them, with landmarks as its sparse points",
+            " transforms.json: cameras as nerfstudio reads them, with landmarks as its sparse points; or another one of"
+            " 'bidnerf plugins exporters'",
         ),
     ],
     out: Annotated[Path, option("DIR", "folder for the files")],

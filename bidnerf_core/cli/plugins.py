@@ -23,7 +23,7 @@ def plugins(
     ] = None,
     json: Annotated[Flag, option(None, "print a JSON list", "")] = False,
 ) -> None:
-    """List what is registered under a name: backends, readers, methods, features, faults, writers and importers."""
+    """List what is registered under a name: backends, readers, methods, features, faults, writers, importers and exporters."""
     groups = list(GROUPS) if group is None else [group]
     infos = [info for of in groups for info in list_plugins(of)]
     if json:

@@ -3,95 +3,126 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.maps.map import Map
+from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.results.colmap_poses import write_colmap_poses
 from bidnerf_core.results.pose_files import PosedImage, frame_of, transforms_json
 
-ExportFormat = Literal["ply", "colmap", "transforms.json"]
 GREY = 0.5
 """Colour of landmarks in a map without a surface."""
 FRUSTUM = 0.03
 """Length of the drawn frustum of a camera, as a share of the scene."""
 
+Exporter: TypeAlias = Callable[[Map, Path], Sequence[Path]]
+"""A function that writes a map, whose surface and landmarks are on the CPU, into an existing folder and returns the files.
 
-def export_map(scene: Map, out: str | Path, to: ExportFormat, overwrite: bool = False) -> list[Path]:
-    """Write a map into folder ``out`` in the format of other software, and return the files.
+It raises ``InputError``, before it writes anything, for a map that lacks what the format needs.
+"""
+
+
+def _defects(exporter: Any) -> Iterator[str]:
+    yield from interface_defects(exporter, (), {"__call__": ("scene", "out")})
+
+
+EXPORTERS: Plugins[Exporter] = Plugins("exporters", _defects, first=("ply", "colmap", "transforms.json"))
+"""The formats in which maps are exported, by name."""
+
+
+def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) -> list[Path]:
+    """Write a map into folder ``out`` in a format of other software, and return the files.
 
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
       each) and cameras.ply (a pyramid for each camera);
     - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks, without tracks;
-    - ``"transforms.json"``: the cameras as nerfstudio reads them, and landmarks.ply as its sparse points.
+    - ``"transforms.json"``: the cameras as nerfstudio reads them, and landmarks.ply as its sparse points;
+    - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians``.
 
     All are in the frame and the unit of the map, which their heads name. Images are named as the map knows them, without the endings
     of their files. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
     export, and for a folder that is not empty unless ``overwrite`` is set.
     """
-    if to not in get_args(ExportFormat):
-        raise InputError(f"format {to!r}, expected one of {', '.join(get_args(ExportFormat))}")
-    scene, out = scene.whole(), Path(out)
+    if to not in EXPORTERS:
+        raise UsageError(f"format {to!r}, expected one of {', '.join(EXPORTERS)}")
+    write, scene, out = EXPORTERS[to], scene.whole(), Path(out)
     surface = None if scene.surface is None else scene.surface.to("cpu")
     landmarks = None if scene.landmarks is None else scene.landmarks.to("cpu")
-    scene = replace(scene, surface=surface, landmarks=landmarks)
-    images = [
-        PosedImage(camera.name, number, camera.intrinsics, camera.pose, unit=scene.unit)
-        for number, camera in enumerate(scene.info.cameras)
-    ]
-    if to != "ply" and not images:
-        raise InputError(f"{scene.name}: has no cameras, but {to} needs some; ply does not")
-    if to == "ply" and not images and scene.surface is None and scene.landmarks is None:
-        raise InputError(f"{scene.name}: has no surface, landmarks or cameras to export")
     with output_folder(out, overwrite):
-        if to == "colmap":
-            write_colmap_poses(out / "images.txt", images)
-            head = (out / "points3D.txt").read_bytes()
-            write_file(out / "points3D.txt", head + _colmap_points(scene))
-        elif to == "transforms.json":
-            content = json.loads(transforms_json(images, out))
-            if scene.landmarks is not None:
-                content["ply_file_path"] = "landmarks.ply"
-                _write_landmarks(scene, images, out / "landmarks.ply")
-            write_file(
-                out / "transforms.json", (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
-            )
-        else:
-            _write_clouds(scene, images, out)
-    return sorted(file for file in out.iterdir() if file.suffix in (".ply", ".txt", ".json"))
+        return sorted(write(replace(scene, surface=surface, landmarks=landmarks), out))
 
 
-def _write_clouds(scene: Map, images: list[PosedImage], out: Path) -> None:
+def export_clouds(scene: Map, out: Path) -> list[Path]:
+    """The surface, the landmarks and the cameras as point clouds and meshes."""
+    images = _images(scene)
+    if not images and scene.surface is None and scene.landmarks is None:
+        raise InputError(f"{scene.name}: has no surface, landmarks or cameras to export")
+    files = []
     if scene.surface is not None:
         parts = scene.surface.surfels
         columns = {"x y z": parts.positions, "nx ny nz": parts.normals, "red green blue": parts.rgb}
-        write_file(out / "surface.ply", ply(columns, _head(scene, images, amount(len(parts), "surfel"))))
+        files.append(out / "surface.ply")
+        write_file(files[-1], ply(columns, _head(scene, images, amount(len(parts), "surfel"))))
     if scene.landmarks is not None:
-        _write_landmarks(scene, images, out / "landmarks.ply")
+        files.append(_write_landmarks(scene, images, out))
     if images:
         vertices, faces = _pyramids(images, FRUSTUM * scene.bounds.side)
-        head = _head(
-            scene,
-            images,
-            f"{amount(len(images), 'camera')}, five points each, the first of which is its centre",
-        )
-        write_file(out / "cameras.ply", ply({"x y z": vertices}, head, faces))
+        what = f"{amount(len(images), 'camera')}, five points each, the first of which is its centre"
+        files.append(out / "cameras.ply")
+        write_file(files[-1], ply({"x y z": vertices}, _head(scene, images, what), faces))
+    return files
 
 
-def _write_landmarks(scene: Map, images: list[PosedImage], file: Path) -> None:
+def export_colmap(scene: Map, out: Path) -> list[Path]:
+    """A text model of COLMAP: the cameras, with the landmarks as its points."""
+    write_colmap_poses(out / "images.txt", _needed_images(scene, "colmap"))
+    points = out / "points3D.txt"
+    write_file(points, points.read_bytes() + _colmap_points(scene))
+    return [out / "cameras.txt", out / "images.txt", points]
+
+
+def export_transforms(scene: Map, out: Path) -> list[Path]:
+    """A transforms.json: the cameras as nerfstudio reads them, with the landmarks as sparse points."""
+    images, files = _needed_images(scene, "transforms.json"), [out / "transforms.json"]
+    content = json.loads(transforms_json(images, out))
+    if scene.landmarks is not None:
+        files.append(_write_landmarks(scene, images, out))
+        content["ply_file_path"] = files[-1].name
+    write_file(files[0], (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+    return files
+
+
+def _images(scene: Map) -> list[PosedImage]:
+    return [
+        PosedImage(camera.name, number, camera.intrinsics, camera.pose, unit=scene.unit)
+        for number, camera in enumerate(scene.info.cameras)
+    ]
+
+
+def _needed_images(scene: Map, to: str) -> list[PosedImage]:
+    images = _images(scene)
+    if not images:
+        raise InputError(f"{scene.name}: has no cameras, but {to} needs some; ply does not")
+    return images
+
+
+def _write_landmarks(scene: Map, images: list[PosedImage], out: Path) -> Path:
     landmarks = scene.landmarks
     assert landmarks is not None
     columns = {"x y z": landmarks.positions, "red green blue": _colours(scene), "photos": landmarks.views}
-    write_file(file, ply(columns, _head(scene, images, amount(len(landmarks), "landmark"))))
+    write_file(out / "landmarks.ply", ply(columns, _head(scene, images, amount(len(landmarks), "landmark"))))
+    return out / "landmarks.ply"
 
 
 def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | None = None) -> bytes:
