@@ -176,9 +176,9 @@ BAD_DATA: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "no frames": (of_json(lambda content: content.update(frames=[])), ("frames is empty", "expected a list")),
     "no images": (lambda folder: shutil.rmtree(folder / "images"), ("images/r_", "expected that file")),
-    "truncated image": (cut(IMAGE), (IMAGE, "expected a whole image file")),
+    "truncated image": (cut(IMAGE), (IMAGE, "expected a complete image file")),
     "image of another size": (resize(IMAGE, (8, 9, 3)), ("r_0001.png is 9x8, expected 24x24",)),
-    "truncated depth": (cut(DEPTH), (DEPTH, "expected a whole image file")),
+    "truncated depth": (cut(DEPTH), (DEPTH, "expected a complete image file")),
     "depth of another shape": (resize(DEPTH, (8, 9)), (DEPTH, "is 9x8, its image 24x24")),
     "depth in colours": (resize(DEPTH, (24, 24, 3)), (DEPTH, "expected one channel")),
     "mirrored pose": (of_matrix(mirror), ("frame 1", "mirror image", "expected a rigid transform")),
@@ -242,7 +242,7 @@ def test_values_that_are_no_depth_are_mentioned_once(
     outcome = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
     assert outcome.status == 0
     assert outcome.err == (
-        f"bidnerf render: {data}/depth/t_0000.png: depth: counted as not measured: 3 x 65535, here and in the images that"
+        f"bidnerf render: {data}/depth/t_0000.png: depth: treated as not measured: 3 x 65535, here and in the images that"
         " follow\n"
     )
 
@@ -343,7 +343,7 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "missing field": (
         of_description(lambda content: content.pop("bounds")),
-        ("map.json", "no 'bounds'", "expected all fields of MapInfo"),
+        ("map.json", "'bounds' missing", "expected all fields of MapInfo"),
     ),
     "unknown setting": (add_setting("widht", 3), ("map.json: config", "no field 'widht'", "mean 'width'")),
     "setting of another type": (add_setting("width", "big"), ("config: width", "'big'", "expected int")),

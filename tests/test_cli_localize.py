@@ -88,7 +88,7 @@ def test_depth_without_a_measurement_is_told(
     empty = tmp_path / "t_0001.npy"
     np.save(empty, np.zeros((24, 24), dtype=np.uint16))
     err = bidnerf(*place, shared / "photos/t_0001.png", *FOCAL, "--depth", empty)[2]
-    assert "the depth image holds no measurement, so colour alone is used" in err
+    assert "the depth image holds no measurement, so only colour is used" in err
 
 
 def test_an_answer_is_the_same_alone_among_others_and_as_a_frame(
@@ -224,7 +224,7 @@ def test_a_folder_that_another_process_writes_into_is_refused(
     with output_folder(out, overwrite=False):
         status, said, err = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
         assert (status, said, err.count("\n")) == (1, "", 1)
-        assert "another bidnerf writes into it" in err
+        assert "another bidnerf process is writing here" in err
         assert out.is_dir()
     assert bidnerf("train", shared / "data", "--out", out, *tiny.options(2))[0] == 0
 

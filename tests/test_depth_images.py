@@ -37,7 +37,7 @@ def test_floats_that_stand_for_nothing(value: float, name: str, kind: str) -> No
     found = depth_image(raw, 1.0, "depth")
     assert found.metres.tolist() == [[1.5, 2.5], [0, 0]]
     assert found.replaced == {name: 1}
-    assert found.remark(unit_assumed=False) == f"counted as not measured: 1 x {name}"
+    assert found.remark(unit_assumed=False) == f"treated as not measured: 1 x {name}"
 
 
 def test_blenders_background_is_recognised_in_any_unit() -> None:
@@ -65,7 +65,7 @@ def test_a_unit_that_is_missing_is_assumed_and_said(kind: str, unit: float) -> N
     found = depth_image(np.array([[0, 1000, 2000, 3000]], dtype=kind), None, "depth")
     assert found.unit == unit
     assert found.median == pytest.approx(2000 * unit)
-    expected = f"depth_unit is not given, {unit:g} m a step is assumed: median depth {2000 * unit:g} m"
+    expected = f"depth_unit is not given, {unit:g} m per step is assumed: median depth {2000 * unit:g} m"
     assert found.remark(unit_assumed=True) == expected
     assert found.remark(unit_assumed=False) is None
 
@@ -73,10 +73,10 @@ def test_a_unit_that_is_missing_is_assumed_and_said(kind: str, unit: float) -> N
 def test_depth_without_any_measurement_has_no_median() -> None:
     found = depth_image(np.zeros((2, 3), dtype=np.uint16), None, "depth")
     assert found.median is None
-    said = "the depth image holds no measurement, so colour alone is used"
+    said = "the depth image holds no measurement, so only colour is used"
     assert found.remark(unit_assumed=True) == found.remark(unit_assumed=False) == said
     saturated = depth_image(np.full((2, 3), 65535, dtype=np.uint16), None, "depth")
-    assert saturated.remark(unit_assumed=True) == f"{said}; counted as not measured: 6 x 65535"
+    assert saturated.remark(unit_assumed=True) == f"{said}; treated as not measured: 6 x 65535"
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -90,7 +90,7 @@ def test_units_that_are_none(unit: Any) -> None:
     "raw", [np.ones((2, 2, 3)), np.ones(3), np.ones((2, 2), bool), np.ones((2, 2), "U1")]
 )
 def test_arrays_that_are_no_depth(raw: np.ndarray) -> None:
-    with pytest.raises(InputError, match="expected one channel of whole or floating-point numbers"):
+    with pytest.raises(InputError, match="expected one channel of integer or floating-point numbers"):
         depth_image(raw, 1.0, "depth")
 
 
@@ -157,7 +157,7 @@ def test_a_recording_mentions_each_kind_of_value_once(tmp_path: Path) -> None:
         for number in range(5):
             assert read(tmp_path / f"{number}.npy", 1.0).metres[0, 0] == 1
     assert [str(warning.message).partition(": ")[2] for warning in caught] == [
-        "depth: counted as not measured: 1 x NaN, here and in the images that follow",
-        "depth: counted as not measured: 1 x 1e+10 or more, here and in the images that follow",
+        "depth: treated as not measured: 1 x NaN, here and in the images that follow",
+        "depth: treated as not measured: 1 x 1e+10 or more, here and in the images that follow",
     ]
     assert all(warning.category is InputWarning for warning in caught)

@@ -206,9 +206,7 @@ def test_broken_files_of_sensors_are_refused(
 
 def test_depth_of_another_shape_than_its_sensors_is_refused(recording: Path) -> None:
     square = DepthCamera(Intrinsics(50.0, 50.0, 30.0, 30.0, 60, 60), SE3.identity())
-    with pytest.raises(
-        InputError, match=r"depth is 160x120, expected the aspect ratio of its camera's 60x60"
-    ):
+    with pytest.raises(InputError, match=r"depth is 160x120, expected the aspect ratio of its camera, 60x60"):
         first(recording, register_depth=square)
 
 
@@ -220,5 +218,5 @@ def test_the_option_of_the_command_line(option: str | None) -> None:
 def test_a_transform_that_loses_all_depth_is_named() -> None:
     there = SE3(torch.eye(3, dtype=torch.float64), torch.tensor([500.0, 0.0, 0.0], dtype=torch.float64))
     depth = seen(DEPTH, SE3.identity())
-    with pytest.raises(InputError, match=r"d\.png: nothing that was measured falls .* 500 m from"):
+    with pytest.raises(InputError, match=r"d\.png: no measurement falls .* 500 m from"):
         DepthCamera(DEPTH, there).registered(depth, COLOUR, "d.png")

@@ -95,7 +95,7 @@ def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -
     )
     remark = noise_remark(depth, camera, "kinect")
     assert remark is not None
-    assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; that of 'kinect' is usually 0\.\d+%", remark)
+    assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", remark)
     assert noise_remark(torch.zeros_like(depth), camera, "kinect") is None
 
 

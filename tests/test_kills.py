@@ -152,7 +152,7 @@ def test_a_map_that_another_process_writes_is_not_baked(bidnerf: Run, shared: Pa
     with locked(shared / "map"):
         status, said, err = bidnerf("bake", shared / "map", "--data", shared / "data", *BAKE)
     assert (status, said, err.count("\n")) == (1, "", 1)
-    assert "another bidnerf writes into it" in err
+    assert "another bidnerf process is writing here" in err
 
 
 def test_a_folder_is_not_removed_from_under_another_process(

@@ -184,7 +184,7 @@ def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_pat
         for second in (trained, lambda out, **_: bn.resume(out, tiny.views())):
             with pytest.raises(bn.InputError):
                 second(tmp_path / "map")
-        with pytest.raises(FileInUse, match="another bidnerf writes into it"):
+        with pytest.raises(FileInUse, match="another bidnerf process is writing here"):
             trained(tmp_path / "map", overwrite=True)
         refused.set()
         assert first.result().info.complete
@@ -204,7 +204,7 @@ def test_a_process_that_trains_into_the_folder_of_a_thread_is_refused(tmp_path: 
             ran.append(subprocess.run(command, capture_output=True, text=True, timeout=300))
 
     assert trained(tmp_path / "map", progress=compete).info.complete
-    assert (ran[0].returncode, "another bidnerf writes into it" in ran[0].stderr) == (1, True)
+    assert (ran[0].returncode, "another bidnerf process is writing here" in ran[0].stderr) == (1, True)
 
 
 def test_baking_stores_what_it_made_where_the_map_is(scene: bn.Map, tmp_path: Path) -> None:

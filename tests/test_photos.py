@@ -166,8 +166,8 @@ def test_what_was_assumed_of_depth_is_said_in_one_line(photo: Path, tmp_path: Pa
     steps[0, :5] = 65535
     path = save_depth(tmp_path / "d.png", steps)
     said = (
-        rf"{path}: depth_unit is not given, 0\.001 m a step is assumed: median depth 1\.42 m; "
-        "counted as not measured: 5 x 65535$"
+        rf"{path}: depth_unit is not given, 0\.001 m per step is assumed: median depth 1\.42 m; "
+        "treated as not measured: 5 x 65535$"
     )
     with pytest.warns(InputWarning, match=said):
         frame = Frame.open(photo, depth=path)
@@ -223,7 +223,7 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
 
 @pytest.mark.parametrize(("depth", "unit"), [(np.uint16, "0.001"), (np.float32, "1")])
 def test_arrays_without_a_unit_are_warned_of(depth: type, unit: str) -> None:
-    with pytest.warns(InputWarning, match=f"frame image: depth_unit is not given, {unit} m a step"):
+    with pytest.warns(InputWarning, match=f"frame image: depth_unit is not given, {unit} m per step"):
         Frame.from_numpy(noise(HEIGHT, WIDTH), CAMERA, depth=np.ones((HEIGHT, WIDTH), dtype=depth))
 
 

@@ -74,10 +74,10 @@ def test_missing_keys_take_their_defaults_and_whole_numbers_serve_as_floats() ->
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({}, "here: no 'need', expected all fields of Outer"),
+        ({}, "here: 'need' missing, expected all fields of Outer"),
         ([], "here: found [], expected an object with the fields of Outer"),
         ({"need": 1, "raet": 2}, "here: Outer has no field 'raet', did you mean 'rate'?"),
-        ({"need": 1, "derived": 2}, "here: Outer has no field 'derived', expected some of need, rate"),
+        ({"need": 1, "derived": 2}, "here: Outer has no field 'derived', expected any of need, rate"),
         ({"need": 1.5}, "here: need: found 1.5, expected int"),
         ({"need": True}, "here: need: found True, expected int"),
         ({"need": 2**63}, "here: need: found 9223372036854775808, expected an integer of at most 64 bits"),
@@ -116,8 +116,8 @@ class Colour(Enum):
     [
         (Outer(1, math.inf), "rate is inf, expected a finite number"),
         (Outer(1, rows=[[0.0], [0.0, math.nan]]), "rows[1][1] is nan, expected a finite number"),
-        (Outer(1, anything=Path()), "anything is a PosixPath, expected what JSON can hold"),
-        (Outer(1, anything={"k": Colour.RED}), "anything.k is a Colour, expected what JSON can hold"),
+        (Outer(1, anything=Path()), "anything is a PosixPath, expected a JSON-serializable value"),
+        (Outer(1, anything={"k": Colour.RED}), "anything.k is a Colour, expected a JSON-serializable value"),
         (Outer(1, anything={1: 2}), "anything has the key 1, expected text"),
     ],
     ids=lambda value: None if isinstance(value, str) else "",

@@ -144,7 +144,7 @@ RECORDINGS: dict[str, tuple[Callable[[Files], Files], str]] = {
     "pose of 6": (lambda f: metadata(f, poses=[[0] * 6] * 4), "pose 0: is not 7 numbers"),
     "quaternion": (lambda f: metadata(f, poses=[[1, 1, 0, 0, 0, 0, 0]] * 4), "pose 0: the quaternion has length 1.41"),
     "no photos": (without_photos, "rgbd/0.jpg: no such photo"),
-    "no metadata": (lambda f: {"icon": b""}, "scan.r3d/metadata: is not in the archive, which holds 1 file"),
+    "no metadata": (lambda f: {"icon": b""}, "scan.r3d/metadata: not found in the archive, which holds 1 file"),
     "no size": (lambda f: metadata(f, w=None), "no w and h"),
     "no K": (lambda f: metadata(f, K=None, perFrameIntrinsicCoeffs=None), "no K of 9 numbers"),
     "metadata": (lambda f: {**f, "metadata": b"{"}, "scan.r3d/metadata: not JSON"),
@@ -166,9 +166,9 @@ def test_an_archive_cut_in_half_and_one_that_is_none(views: list[View], tmp_path
     file = packed(tmp_path, record3d_files(views))
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
-    assert "scan.r3d: ends too early, as a copy that broke off does" in message(file)
+    assert "scan.r3d: ends too early, probably an incomplete copy" in message(file)
     file.write_bytes(b"no zip at all")
-    assert "scan.r3d: is no zip archive" in message(file)
+    assert "scan.r3d: is not a zip archive" in message(file)
 
 
 def test_members_that_unpack_to_too_much(

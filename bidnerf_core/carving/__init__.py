@@ -1,4 +1,6 @@
-"""Carving: where matter can be according to the views alone, before any field is trained. In doubt, matter is assumed."""
+"""Carving: where matter can be according to the views alone, before any field is trained. When in doubt,
+matter is assumed.
+"""
 
 from bidnerf_core.carving.bounds import estimate_bounds
 from bidnerf_core.carving.cells import occupied_cells, occupied_voxels

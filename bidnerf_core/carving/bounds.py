@@ -24,34 +24,35 @@ from bidnerf_core.frames.frame import View
 OUTLIERS = 1e-3  # fraction of the measured points, at either end of each axis, that may be wrong
 POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements to use: in all, and at least from each view
 SPARSE_MARGIN = 0.1  # of the box's size, at each end, where only a few points were measured
-FAR_MARGIN = 1.1  # a camera may be a little farther away than any of the views
+FAR_MARGIN = 1.1  # a camera may be slightly farther away than any of the views
 LEAST_NEAR = 0.01  # of far, where cameras are inside the box and nothing was measured
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
-INWARD = 0.8  # fraction of the cameras that must see the point that all of them look at
+INWARD = 0.8  # fraction of the cameras that must see the point they all look at
 FAR_BEYOND = 2.0  # times the largest known distance, where there is matter beyond the box
 LEAST_LANDMARKS = 50  # sightings of landmarks in all views, for a box around them
 LANDMARKS_BEYOND = 0.05  # fraction of the landmarks, at either end of each axis, that may lie beyond the box
-LANDMARKS_NEARER = 0.01  # fraction of the landmarks that is disregarded when the nearest one is determined
+LANDMARKS_NEARER = 0.01  # fraction of the landmarks that is ignored in finding the nearest one
 ROOM = 4.0  # assumed range of a hand-held camera's view, in multiples of the extent of its positions
 
-ONE_PLACE = 1.0  # extent (scene units) assumed for the positions where all of them coincide
+ONE_PLACE = 1.0  # extent (scene units) assumed if all positions coincide
 
 
 def estimate_bounds(
     views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> SceneBounds:
-    """Return the box that holds what ``views`` (poses in the world) show, its range of distances from their cameras, and how
-    finely they resolve it.
+    """Estimate the box of the scene that ``views`` (poses in the world) show, its range of distances from
+    their cameras, and how finely they resolve it.
 
-    With depth (dense in half of the views, or any if there are no silhouettes) the box holds the middle 99.8 % of the
-    measured points along each axis. With silhouettes (alpha) it is that of the visual hull. With colour only, it holds the
-    middle 90 % of the landmarks that the views see. Without landmarks it is a guess: for cameras that look inward, a cube
-    around the point they look at, as large as what an image shows there; for others (a room), the box of the cameras and of
-    what they see within ``ROOM`` times the extent of their positions. Unless half of the views have dense depth or
-    silhouettes, there may be matter beyond the box, and the scene is contracted. Images from exactly one place do not
-    determine a scale; the extent of their positions is then taken to be ``ONE_PLACE``. The footprint of a pixel is that at
-    the median distance of what gave the box: of measured depth, of landmarks, or else of the box's middle, where at least half
-    its longest side is assumed. Raises ``InputError`` where there are no views.
+    With depth (dense in half of the views, or any if there are no silhouettes) the box holds the middle 99.8
+    % of the measured points along each axis. With silhouettes (alpha) it is the box of the visual hull. With
+    colour only, it holds the middle 90 % of the landmarks that the views see. Without landmarks it is a
+    guess: for cameras that look inward, a cube around the point they look at, as large as the visible region
+    there; otherwise (a room), the box of the cameras and of everything they see within ``ROOM`` times the
+    extent of their positions. Unless half of the views have dense depth or silhouettes, there may be matter
+    beyond the box, and the scene is contracted. Images from exactly one place do not determine a scale; the
+    extent of their positions is then taken to be ``ONE_PLACE``. The footprint of a pixel refers to the median
+    distance of the data that gave the box: measured depth, landmarks, or else the box's middle, for which at
+    least half the longest side is assumed. Raises ``InputError`` if there are no views.
     """
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
@@ -77,7 +78,7 @@ def _with_far(
     views: Sequence[View], box: AxisBox, near: float, background: tuple[float, float, float], contracted: bool,
     footprint: float,
 ) -> SceneBounds:  # fmt: skip
-    """Return bounds that reach to the box's farthest corner or, where the scene is contracted, well beyond it."""
+    """Return bounds that reach to the box's farthest corner or, if the scene is contracted, well beyond it."""
     far = _farthest(views, box) * (FAR_BEYOND if contracted else FAR_MARGIN)
     return SceneBounds(corner(box[0]), corner(box[1]), near, far, background, contracted, footprint)
 
@@ -111,7 +112,9 @@ def _landmark_points(view: View) -> Float[Tensor, "n 3"]:
 
 
 def _measured_box(views: Sequence[View], margin: float) -> tuple[AxisBox, float]:
-    """Return the box of the measured points, and half the smallest distance from a camera to a point; both without outliers."""
+    """Return the box of the measured points, and half the smallest distance from a camera to a point, both
+    without outliers.
+    """
     share = max(POINTS_OF_VIEW, POINTS // len(views))
     parts = [measured_points(view, share) for view in views]
     points, distances = torch.cat([p for p, _ in parts]), torch.cat([d for _, d in parts])
@@ -175,7 +178,7 @@ def _places(views: Sequence[View]) -> Float[Tensor, "v 3"]:
 
 
 def _nearest(views: Sequence[View], box: AxisBox) -> float:
-    """Return the distance of the box from the nearest camera (metres); 0 where one is inside."""
+    """Return the distance of the box from the nearest camera (metres); 0 if a camera is inside."""
     outside = torch.maximum(box[0] - _places(views), _places(views) - box[1]).clamp(min=0)
     return torch.linalg.vector_norm(outside, dim=-1).amin().item()
 

@@ -1,4 +1,4 @@
-"""Axis-aligned boxes of the world, and rays of a view's pixels."""
+"""Axis-aligned boxes in the world, and rays of a view's pixels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ MARGIN = 0.03  # of the box's size, at each end
 def grown(
     lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = MARGIN
 ) -> AxisBox:
-    """Return the box with a margin of ``share`` of its size at each end, and of ``at_least`` metres where that is more.
+    """Return the box with a margin of ``share`` of its size at each end, or of ``at_least`` metres if that is
+    more.
 
     A flat box is given some thickness.
     """
@@ -31,7 +32,7 @@ def grown(
 
 
 def met(box: AxisBox, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> float:
-    """Return the fraction of the rays that meet the box."""
+    """Return the fraction of the rays that hit the box."""
     near, far = crossed_box(origins, directions, *box)
     return (far >= near.clamp(min=0)).double().mean().item()
 

@@ -1,4 +1,4 @@
-"""Carving: cells of a box are emptied where views see through them. A cell is represented by the sphere around it."""
+"""Carving: cells of a box are emptied if views see through them. A cell is represented by its circumscribed sphere."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 
 BLOCK = 8
-"""Cells along the side of a block. A block that a view does not see costs next to nothing to process for that view."""
+"""Cells along the side of a block. Processing a block for a view that does not see it costs next to nothing."""
 BLOCKS_AT_ONCE = 128
 """Blocks that are processed together: few enough to stay in the cache."""
 SENSOR_TOLERANCE = 0.05
-"""Relative depth error that training allows for: sensors err by a few per cent, and an emptied cell is never filled again."""
+"""Relative depth error that training allows for: sensors err by a few per cent, and an emptied cell is never
+filled again."""
 
 
 def occupied_voxels(
@@ -36,7 +37,7 @@ def occupied_voxels(
 def _within_contraction(
     views: Sequence[View], grid: VoxelGrid, bounds: SceneBounds, tolerance: float
 ) -> Bool[Tensor, "x y z"]:
-    """Carve the inner half of a grid of contracted space, the cube around the box. The grid's shape is divisible by 4."""
+    """Carve the inner half of a grid in contracted space, the cube around the box. The grid's shape is divisible by 4."""
     held = torch.ones(grid.shape, dtype=torch.bool)
     inner = VoxelGrid.cube(replace(bounds, contracted=False), grid.shape[0] // 2)
     quarter = grid.shape[0] // 4

@@ -1,6 +1,8 @@
-"""The free space of a view: how far each of its pixels sees no matter, and which spheres lie entirely within that space.
+"""The free space of a view: how far each of its pixels sees before any matter, and which spheres lie entirely
+within that space.
 
-In doubt, space counts as occupied: where nothing was measured, and wherever a neighbouring pixel sees less far.
+When in doubt, space counts as occupied: where nothing was measured, and wherever a neighbouring pixel sees
+less far.
 """
 
 from __future__ import annotations
@@ -29,14 +31,14 @@ class FreeSpace:
     reach: float  # metres: the largest free depth of any pixel
     edges: Float[
         Tensor, "4 3"
-    ]  # inward normals of planes through the camera's centre that enclose all of the view
+    ]  # inward normals of planes through the camera's centre that enclose the whole view
 
     @staticmethod
     def seen_by(view: View, tolerance: float = 0.02, footprint: int = 8) -> FreeSpace:
         free = _free_depth(view.frame, tolerance)
         factor = math.ceil(max(free.shape) / LONGEST_SIDE)
         levels = [_shrunk(free, factor)]
-        for _ in range(footprint):  # beyond the image's edge nothing is known
+        for _ in range(footprint):  # nothing is known beyond the image's edge
             levels.append(-functional.max_pool2d(-functional.pad(levels[-1], (1, 1, 1, 1))[None], 3, 1)[0])
         camera = _shrunk_camera(view.frame.intrinsics, factor, levels[0])
         return FreeSpace(camera, torch.stack(levels), free.amax().item(), _edges(view.frame.intrinsics))

@@ -1,4 +1,4 @@
-"""The box of the visual hull: the space that is consistent with silhouettes seen from many sides."""
+"""The box of the visual hull: the space consistent with silhouettes seen from many sides."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from bidnerf_core.frames.frame import View
 HULL = (64, 64, 64)
 CARVING_ROUNDS = 3  # each within the box that the previous one found
 HULL_VOTES = (0.5, 0.25, 0.1, 0.0)
-"""Thresholds on the number of views that see something at a cell, as fractions of the largest such number. Cells below it are
-periphery, which so few views see that hardly any could have emptied it."""
+"""Thresholds on the number of views that see something at a cell, as fractions of the largest such number.
+Cells below it are peripheral: so few views see them that hardly any could have emptied them."""
 EXPLAINED = 0.999  # fraction of the pixels with matter whose rays must meet the box
 RAYS_OF_VIEW = 500
 
@@ -32,7 +32,8 @@ def has_outline(view: View) -> bool:
 def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     """Return the box of the cells that no two views see through and at which many views see something.
 
-    The threshold on that number is the largest of ``HULL_VOTES`` for which the box still explains the silhouettes.
+    The threshold on that number is the largest of ``HULL_VOTES`` for which the box still explains the
+    silhouettes.
     """
     origins, directions = _rays_to_matter(views)
     for _ in range(CARVING_ROUNDS):

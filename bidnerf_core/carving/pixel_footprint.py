@@ -1,4 +1,4 @@
-"""How finely images resolve a scene: the width of what a pixel shows."""
+"""The resolution of images in a scene: the width covered by a pixel."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bidnerf_core.frames.frame import View
 
 
 def pixel_footprint(views: Sequence[View], distance: Callable[[View], float]) -> float:
-    """Return the width (metres) of what a pixel shows at the ``distance`` (metres) of each view: the median over the views."""
+    """Return the width (metres) that a pixel covers at each view's ``distance`` (metres): the median over the views."""
     cameras = [(view, view.frame.intrinsics) for view in views]
     return statistics.median(2 * distance(view) / (camera.fx + camera.fy) for view, camera in cameras)
 
@@ -32,6 +32,6 @@ def landmark_distance(view: View) -> float:
 
 
 def distance_of_middle(view: View, box: AxisBox) -> float:
-    """Return the distance (metres) of the box's middle, or half of the longest side where that is more."""
+    """Return the distance (metres) of the box's middle, or half of the longest side if that is more."""
     middle, half = (box[0] + box[1]) / 2, float((box[1] - box[0]).amax()) / 2
     return max(float(torch.linalg.vector_norm(view.T_ref_camera.translation.double() - middle)), half)

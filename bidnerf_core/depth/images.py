@@ -19,24 +19,24 @@ from bidnerf_core.io.images import decode, to_numpy
 from bidnerf_core.io.tensors import read_array
 
 FARTHEST = 1e9
-"""Metres. No sensor measures more."""
+"""Metres. No sensor measures farther."""
 NOTHING = 1e10
 """Floating-point values from here on mean "nothing", whatever the unit: Blender's 1e10, the largest float."""
 MILLIMETRE = 0.001
 """Metres."""
 INTEGER_UNIT, FLOAT_UNIT = MILLIMETRE, 1.0
-"""Metres per step where the user gives no unit."""
+"""Metres per step if the user gives no unit."""
 SPIKE, SPIKE_PIXELS = 0.05, 20
 """Share and number of pixels above which an image's largest value may be the sensor's limit, not a measurement ..."""
 NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
-"""... if it is a round number, as ranges in settings and data sheets are: a multiple of 0.5 m, from 4 m on ..."""
+"""... if it is a round number, as ranges in settings and data sheets are: a multiple of 0.5 m, at least 4 m ..."""
 LARGEST_OF_BITS = tuple(2**bits - 1 for bits in range(11, 17))
-"""... or has all bits set, for a sensor of 11 to 16 bits ..."""
+"""... or has all bits set, for a sensor with 11 to 16 bits ..."""
 STANDS_OUT = 4
-"""... and is at least this many times as frequent as any other. A wall that faces the camera has a single depth as well, but
-rarely a round one, and images of several flat surfaces have several."""
+"""... and is at least this many times as frequent as any other value. A wall facing the camera has a single
+depth as well, but rarely a round one, and several flat surfaces give several values."""
 SATURATED = np.iinfo(np.uint16).max
-"""A 16-bit sensor writes this for "too far" or "nothing"; 65.535 once it is converted to metres."""
+"""A 16-bit sensor writes this for "too far" or "nothing"; it becomes 65.535 once converted to metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class DepthImage:
 
     @property
     def median(self) -> float | None:
-        """The median of the measured distances (metres), or None where nothing was measured."""
+        """The median of the measured distances (metres), or None if nothing was measured."""
         measured = self.metres[self.metres > 0]
         return float(measured.median()) if measured.numel() else None
 
@@ -57,21 +57,22 @@ class DepthImage:
         """Return one line on the assumed unit, missing depth and dropped values, or None if there is nothing to report."""
         parts = []
         if self.median is None:
-            parts.append("the depth image holds no measurement, so colour alone is used")
+            parts.append("the depth image holds no measurement, so only colour is used")
         elif unit_assumed:
             middle = f"median depth {self.median:.4g} m"
-            parts.append(f"depth_unit is not given, {self.unit:g} m a step is assumed: {middle}")
+            parts.append(f"depth_unit is not given, {self.unit:g} m per step is assumed: {middle}")
         return "; ".join([*parts, *filter(None, [self.dropped])]) or None
 
     @property
     def dropped(self) -> str | None:
         """A clause that lists the values dropped, or None if there were none."""
         found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
-        return f"counted as not measured: {found}" if found else None
+        return f"treated as not measured: {found}" if found else None
 
 
 def read_depth_image(path: Path, unit: float | None) -> DepthImage:
-    """Read a grey image of whole or floating-point numbers, or the ``.npy`` of an array; see ``depth_image``.
+    """Read a grey image of integer or floating-point numbers, or the ``.npy`` file of an array; see
+    ``depth_image``.
 
     Raises ``InputError`` for anything else.
     """
@@ -80,24 +81,26 @@ def read_depth_image(path: Path, unit: float | None) -> DepthImage:
 
 
 def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> DepthImage:
-    """Convert an array (h, w) or (h, w, 1) of ``unit`` metres per step; None is 0.001 for integers and 1 for floats.
+    """Convert an array (h, w) or (h, w, 1) with ``unit`` metres per step; None means 0.001 for integers and 1
+    for floats.
 
-    Values that no sensor measures become 0: NaN, infinite and negative values, the largest of an integer type, 65535 and
-    65.535 of a floating-point one, and floats of more than 1e9 m (1e10, the largest float). So does the largest value of the
-    image where it is a sensor's limit: a round number (``LIMIT_STEP``, ``LARGEST_OF_BITS``) in a twentieth of all pixels or
-    more, far more frequent than any other, but not the only value measured. Raises ``InputError``, whose message begins with
-    ``what``, for arrays of another shape or type and a unit that is not positive.
+    Values that no sensor measures become 0: NaN, infinite and negative values, the largest value of an
+    integer type, 65535 and 65.535 in a floating-point one, and floats above 1e9 m (1e10, the largest float).
+    So does the largest value of the image if it is the sensor's limit: a round number (``LIMIT_STEP``,
+    ``LARGEST_OF_BITS``) in at least a twentieth of all pixels, far more frequent than any other, but not the
+    only value measured. Raises ``InputError``, whose message begins with ``what``, for arrays of another
+    shape or type and a unit that is not positive.
     """
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
     if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":
         found = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
-        raise InputError(f"{what} is {found}, expected one channel of whole or floating-point numbers")
+        raise InputError(f"{what} is {found}, expected one channel of integer or floating-point numbers")
     if unit is None:
         unit = FLOAT_UNIT if values.dtype.kind == "f" else INTEGER_UNIT
     given: Any = unit
     if not isinstance(given, Real) or not 0 < unit <= FARTHEST:
-        raise InputError(f"{what}: depth_unit is {unit!r}, expected a positive number of metres a step")
+        raise InputError(f"{what}: depth_unit is {unit!r}, expected a positive number of metres per step")
     metres = values.astype(np.float64) * unit
     absent = _absent(values, metres)
     unmeasured = np.logical_or.reduce([metres == 0, *absent.values()])
@@ -111,7 +114,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
 
 
 def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
-    """Return masks of the values that mean "not measured", by their names in messages; no pixel is in two of them."""
+    """Return masks of the values that mean "not measured", by their names in messages; the masks are disjoint."""
     if values.dtype.kind != "f":
         largest = np.iinfo(values.dtype).max
         saturated = values == largest
@@ -131,7 +134,7 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the mask of the pixels at the sensor's limit, by its name in messages; empty where there are none."""
+    """Return the mask of the pixels at the sensor's limit, by its name in messages; empty if there are none."""
     measured = metres[~unmeasured]
     if not measured.size:
         return {}
@@ -150,10 +153,11 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
 
 
 class DepthReader:
-    """Reads the depth images of a recording, and warns once about each kind of value that means "not measured".
+    """Reads the depth images of a recording, and warns once about each kind of value that means "not
+    measured".
 
-    ``documented`` are the kinds that the recording's format defines, by their names in ``DepthImage.replaced``; they cause
-    no warning.
+    ``documented`` are the kinds that the recording's format defines, by their names in
+    ``DepthImage.replaced``; they cause no warning.
     """
 
     def __init__(self, documented: Collection[str] = ()) -> None:

@@ -1,6 +1,7 @@
-"""The noise and the steps of measured depth, estimated from one depth image.
+"""The noise and step size of measured depth, estimated from one depth image.
 
-The noise is the distance of pixels from locally fitted planes; the steps are the spacing of the distinct values.
+The noise is the deviation of pixels from locally fitted planes; the step size is the spacing of the distinct
+values.
 """
 
 from __future__ import annotations
@@ -21,21 +22,22 @@ from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 WINDOW_SIDE = 8
 """Side, in pixels, of the square windows to which planes are fitted."""
 PLANAR = 0.25
-"""Quantile of the windows' residuals: this share is assumed planar. The others may show edges, curved surfaces and relief."""
+"""Quantile of the windows' residuals: this fraction is assumed planar. The others may show edges, curved
+surfaces and relief."""
 QUANTILE_BIAS = 1.11
-"""Ratio of the noise to that quantile where all windows are planar and all pixels independent."""
+"""Ratio of the noise to that quantile if all windows are planar and all pixels independent."""
 LEAST_WINDOWS = 20
-"""Minimum number of windows in a range of depths from which its noise is estimated."""
+"""Minimum number of windows in a depth range from which its noise is estimated."""
 DEPTH_RANGES = 8
-"""Maximum number of ranges of depths, with equal numbers of windows."""
+"""Maximum number of depth ranges, with equal numbers of windows."""
 ENOUGH_SPREAD = 1.5
 """Minimum ratio of the farthest to the nearest range for which the growth of the noise with depth is estimated."""
 REPEATED = 4
 """Minimum mean number of pixels per depth value; below it, depth is continuous or most of its possible values do not occur."""
 RANGE_VALUES, MOST_RANGES = 8, 40
-"""Minimum number of distinct values in a depth range, of which the median spacing is taken, and maximum number of ranges."""
+"""Minimum number of distinct values in a depth range for taking their median spacing, and maximum number of ranges."""
 LEAST_LINES, MOST_LINES = 8, 0.8
-"""Minimum number of distinct rows (and columns) of a resampled depth image, and their maximum share of all of them."""
+"""Minimum number of distinct rows (and columns) of a resampled depth image, and their maximum fraction of the total."""
 BETTER = 2.0
 """Factor by which the misfit of constant steps must exceed that of growing steps for growing steps to be assumed."""
 
@@ -43,10 +45,11 @@ BETTER = 2.0
 def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
     """Return the noise of a depth image (planar z, metres, 0: not measured), as a function of the depth.
 
-    Its relative noise is constant or grows linearly, ``linear + quadratic * z``; it is fitted to the larger of the robust
-    residuals of local planes and the rounding of stored values. None where too few windows of the image are measured without
-    gaps. Errors that neighbouring pixels share go unnoticed, such as those of a warped image, or what remains of a lidar's
-    after interpolation. Where hardly any window is planar, relief of the scene counts as noise.
+    Its relative noise is constant or grows linearly, ``linear + quadratic * z``; it is fitted to the larger
+    of the robust residuals of local planes and the rounding of stored values. Returns None if too few windows
+    are measured without gaps. Errors shared by neighbouring pixels go unnoticed, such as those of a warped
+    image, or of a lidar whose measurements were interpolated. If hardly any window is planar, relief of the
+    scene counts as noise.
     """
     if min(depth.shape) < WINDOW_SIDE:
         return None
@@ -58,7 +61,8 @@ def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -
 
 
 def _residuals(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> Float[Tensor, "n 2"]:
-    """Return the median depth (metres) of each window without gaps, and its relative noise about a plane.
+    """Return the median depth (metres) of each window without gaps, and its relative noise about the fitted
+    plane.
 
     The inverse depth of a plane is linear in the image coordinates, whatever its slant. A deviation e of 1/z corresponds to
     a relative deviation ``z e`` of z.
@@ -109,9 +113,10 @@ def _fitted(ranges: Float[Tensor, "b 2"]) -> DepthNoise:
 
 
 def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
-    """Return one line that compares the noise estimated from a depth image (metres) with that of the sensor of a name.
+    """Return one line that compares the noise estimated from a depth image (metres) with that of a named
+    sensor.
 
-    Returns None where the noise cannot be estimated from the image.
+    Returns None if the noise cannot be estimated from the image.
     """
     found = estimated_depth_noise(depth, intrinsics)
     if found is None:
@@ -122,7 +127,10 @@ def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: st
     of_disparity = (
         "; its steps grow with the square of the distance" if steps is not None and steps.of_disparity else ""
     )
-    return f"depth noise at {z:.3g} m is about {estimated:.2%}; that of {sensor!r} is usually {expected:.2%}{of_disparity}"
+    return (
+        f"depth noise at {z:.3g} m is about {estimated:.2%}; {sensor!r} usually has"
+        f" {expected:.2%}{of_disparity}"
+    )
 
 
 @dataclass(frozen=True)
@@ -130,7 +138,7 @@ class DepthSteps:
     """The spacing of adjacent depth values: the larger of a constant and a multiple of the squared depth."""
 
     constant: float  # metres: the unit in which depth is stored
-    quadratic: float  # metres per square metre; 0 where depth was not computed from whole steps of disparity
+    quadratic: float  # metres per square metre; 0 unless depth was computed from integer steps of disparity
 
     @property
     def of_disparity(self) -> bool:
@@ -142,16 +150,17 @@ class DepthSteps:
         return max(self.constant, self.quadratic * depth**2)
 
     def deviation(self, depth: float) -> float:
-        """Return the standard deviation (metres) of the rounding to whole steps, whose error is uniform."""
+        """Return the standard deviation (metres) of the rounding error, which is uniform within a step."""
         return self.step(depth) / math.sqrt(12)
 
 
 def depth_steps(depth: Float[Tensor, "h w"]) -> DepthSteps | None:
-    """Return the steps of a depth image (metres, 0: not measured), or None where its values are continuous or too few.
+    """Return the step size of a depth image (metres, 0: not measured), or None if its values are continuous
+    or too few.
 
-    Depth in whole millimetres has the same spacing everywhere. Where a disparity d is measured in whole steps, the spacing
-    of the depth ``f b / d`` is proportional to its square. The same holds for the rows of an exact image of a floor, which
-    cannot be distinguished from that.
+    Depth in whole millimetres has the same spacing everywhere. If a disparity d is measured in integer steps,
+    the spacing of the depth ``f b / d`` is proportional to its square. The same holds for the rows of an
+    exact image of a floor, which cannot be distinguished from that.
     """
     rows, columns = lines_of_sensor(depth)
     depth = depth[rows][:, columns]
@@ -164,11 +173,11 @@ def depth_steps(depth: Float[Tensor, "h w"]) -> DepthSteps | None:
 
 
 def lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[Tensor, "c"]]:
-    """Return the numbers of the rows and columns that do not repeat the one before.
+    """Return the indices of the rows and columns that do not repeat the one before.
 
-    Depth whose sensor has a lower resolution than the image was resampled to the nearest measurement: repeated pixels are not
-    separate measurements. All lines are returned where few repeat another, such as empty ones along a border, and where
-    hardly any would be left, as in an exact image of a wall.
+    If the sensor's resolution is lower than the image's, depth was resampled by nearest neighbour: repeated
+    pixels are not separate measurements. All lines are returned if few of them repeat another, such as empty
+    ones along a border, and if hardly any would be left, as in an exact image of a wall.
     """
     found = []
     for lines in (depth, depth.T):
@@ -185,7 +194,7 @@ def lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[
 
 
 def _spacings(values: Float[Tensor, "v"], counts: Tensor) -> Float[Tensor, "b 2"]:
-    """Return the median depth and the median spacing of the values in depth ranges where nearly all values occur."""
+    """Return the median depth and the median spacing of the values in depth ranges in which nearly all values occur."""
     ranges, found = min(MOST_RANGES, len(values) // RANGE_VALUES), []
     for some, pixels in zip(values.tensor_split(ranges), counts.tensor_split(ranges), strict=True):
         if int(pixels.sum()) >= REPEATED * len(some):

@@ -1,4 +1,4 @@
-"""Registration of depth to colour: a depth image as seen from the colour camera next to the depth camera."""
+"""Registration of depth to colour: the depth image as seen from the colour camera next to the depth camera."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ class DepthCamera:
 
     @staticmethod
     def read(path: Path) -> DepthCamera:
-        """Read a JSON file with the intrinsics as in ``transforms.json``, with ``w`` and ``h``, and ``T_colour_depth`` (4x4).
+        """Read a JSON file with intrinsics as in ``transforms.json``, including ``w`` and ``h``, and
+        ``T_colour_depth`` (4x4).
 
-        Raises ``InputError`` where one of them is missing or not usable.
+        Raises ``InputError`` if one of them is missing or invalid.
         """
         record = read_record(path)
         if record.size("w") is None or record.size("h") is None:
@@ -48,33 +49,34 @@ class DepthCamera:
         camera = read_camera(path, (0, 0))
         if not isinstance(camera, Intrinsics):
             raise record.error(
-                "is of a lens that is not perspective, expected the intrinsics of the depth camera"
+                "describes a lens that is not perspective, expected the intrinsics of the depth camera"
             )
         return DepthCamera(camera, rigid_of_rows(record, EXTRINSICS, rows))
 
     def registered(
         self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str
     ) -> Float[Tensor, "h w"]:
-        """Return planar z (metres) in the colour camera; error messages begin with ``file``.
+        """Register depth to the colour camera (planar z, metres); error messages begin with ``file``.
 
-        Depth of a lower resolution than the colour image is registered at its own resolution and then resampled, since its
-        points would otherwise be too far apart to occlude each other. Raises ``InputError`` for depth whose aspect ratio is
-        not the sensor's, and where none of it falls into the colour image.
+        Depth of a lower resolution than the colour image is registered at its own resolution and then
+        resampled, since its points would otherwise be too far apart to occlude each other. Raises
+        ``InputError`` for depth whose aspect ratio is not the sensor's, and if none of it falls into the
+        colour image.
         """
         height, width = depth.shape
         camera = Raster(width, height).upright(self.camera)
         if camera is None:
             given = f"{self.camera.width}x{self.camera.height}"
             raise InputError(
-                f"{file}: depth is {width}x{height}, expected the aspect ratio of its camera's {given}"
+                f"{file}: depth is {width}x{height}, expected the aspect ratio of its camera, {given}"
             )
         coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
         found = register_depth(depth, camera, coarse, self.T_colour_depth)
         if int((depth > 0).sum()) >= ENOUGH_REGISTERED and not bool((found > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
             raise InputError(
-                f"{file}: nothing that was measured falls into the colour image; {EXTRINSICS} has the depth camera {away:.3g} m"
-                " from the colour camera, expected metres and OpenCV axes"
+                f"{file}: no measurement falls into the colour image; {EXTRINSICS} puts the depth camera"
+                f" {away:.3g} m from the colour camera, expected metres and OpenCV axes"
             )
         return found if coarse == colour else resampled(found, colour.width, colour.height)
 
@@ -82,10 +84,11 @@ class DepthCamera:
 def register_depth(
     depth: Float[Tensor, "dh dw"], depth_camera: Intrinsics, colour_camera: Intrinsics, T_colour_depth: SE3
 ) -> Float[Tensor, "h w"]:
-    """Return planar z (metres) in the colour camera, 0 where no measurement falls.
+    """Register depth to the colour camera: planar z (metres), 0 where no measurement falls.
 
-    Each measurement is moved to the colour camera's frame and written to the pixel into which it projects. Of several in one
-    pixel the nearest is kept, which removes what the colour camera cannot see.
+    Each measurement is transformed to the colour camera's frame and written to the pixel into which it
+    projects. If several fall into one pixel, the nearest is kept, which removes what is occluded from the
+    colour camera.
     """
     measured = depth > 0
     rays = depth_camera.unproject(depth_camera.pixel_centres(torch.float64)[measured])
@@ -94,7 +97,7 @@ def register_depth(
 
 
 def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Tensor, "h w"]:
-    """Return planar z (metres) of the nearest of the points (camera frame) in each pixel, 0 where none falls."""
+    """Return planar z (metres) of the nearest point (camera frame) in each pixel, 0 where none falls."""
     row, column, inside = camera.cells(points)
     empty = torch.full((camera.height * camera.width,), torch.inf)
     place = (row * camera.width + column)[inside]
@@ -103,7 +106,9 @@ def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Ten
 
 
 def _ahead(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Bool[Tensor, "n"]:
-    """Return which points lie within the image's frustum; a polynomial lens model maps some others into the image as well."""
+    """Return which points lie within the image's frustum; a polynomial lens model maps some others into the
+    image as well.
+    """
     centres = camera.pixel_centres(torch.float64)
     border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
     edge = camera.unproject(border)[:, :2]

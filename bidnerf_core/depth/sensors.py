@@ -1,7 +1,8 @@
-"""Models of depth sensors: how accurate a measured depth is known to be before it is compared with anything.
+"""Models of depth sensors: their accuracy as known beforehand.
 
-All assumptions about the accuracy of measured depth are here. Standard deviations are one sigma. An error of the scale or
-the offset is the same in all pixels of an image and shifts the whole pose; noise is independent from pixel to pixel.
+All assumptions about the accuracy of measured depth are stated here. Standard deviations are one sigma. An
+error of the scale or the offset is the same in all pixels of an image and shifts the whole pose; noise is
+independent between pixels.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ class DepthNoise:
     """The standard deviation of a pixel's depth, a polynomial in the depth."""
 
     constant: float = 0.0  # metres
-    linear: float = 0.0  # metres per metre, so that it holds in any unit of length
+    linear: float = 0.0  # metres per metre, hence independent of the unit of length
     quadratic: float = 0.0  # metres per square metre; sensors that measure disparity have this kind of noise
 
     def __post_init__(self) -> None:
         if not all(0 <= value < math.inf for value in (self.constant, self.linear, self.quadratic)):
-            raise InputError(f"depth noise is {self}, expected finite coefficients of 0 or more")
+            raise InputError(f"the depth noise is {self}, expected finite coefficients of 0 or more")
 
     @overload
     def deviation(self, depth: float) -> float: ...
@@ -41,18 +42,19 @@ class DepthNoise:
 class DepthSensorModel:
     """The errors of one kind of depth sensor, as standard deviations.
 
-    Lengths in metres are stated only for sensors that are given by name. For an unknown sensor everything is relative, since
-    a scene may have any unit of length.
+    Lengths in metres are stated only for named sensors. For an unknown sensor everything is relative, since a
+    scene may have any unit of length.
     """
 
-    scale: float  # relative, of the factor that all depths of the sensor share
+    scale: float  # relative error of the factor shared by all depths of the sensor
     noise: DepthNoise
-    offset: float = 0.0  # metres, of the constant that all depths of the sensor share
+    offset: float = 0.0  # metres, error of the constant shared by all depths of the sensor
 
     def __post_init__(self) -> None:
         if not all(0 <= value < math.inf for value in (self.scale, self.offset)):
             raise InputError(
-                f"depth sensor has scale {self.scale} and offset {self.offset}, expected finite numbers of 0 or more"
+                f"the depth sensor has scale {self.scale} and offset {self.offset}, expected finite numbers"
+                " of 0 or more"
             )
 
 
@@ -60,12 +62,13 @@ UNKNOWN = DepthSensorModel(scale=0.01, noise=DepthNoise(linear=0.01))
 """An unspecified sensor: 1 % each for scale and noise, a round figure for consumer sensors at a few metres."""
 
 KINECT = DepthSensorModel(scale=0.027, offset=0.0, noise=DepthNoise(quadratic=0.001425))
-"""Microsoft's first Kinect, and other sensors by PrimeSense, as they leave the factory.
+"""Microsoft's first Kinect, and other sensors by PrimeSense, with factory calibration.
 
-The noise follows from half a pixel of disparity: 1.4 mm at 1 m, 36 mm at 5 m (Khoshelham and Elberink, "Accuracy and
-Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12, 2012). The scale is the root mean square of the
-corrections of 3.5 %, 3.1 % and 0 % that the TUM RGB-D benchmark publishes for its three Kinects (Sturm et al., "A Benchmark
-for the Evaluation of RGB-D SLAM Systems", IROS 2012). They are factors alone, without an offset.
+The noise follows from half a pixel of disparity: 1.4 mm at 1 m, 36 mm at 5 m (Khoshelham and Elberink,
+"Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12, 2012). The scale
+is the root mean square of the corrections of 3.5 %, 3.1 % and 0 % that the TUM RGB-D benchmark publishes for
+its three Kinects (Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012). They are
+scale factors only, without an offset.
 """
 
 REALSENSE = DepthSensorModel(
@@ -80,7 +83,8 @@ the error of the distance to 2 % within 2 m, which is taken as two standard devi
 """
 
 LIDAR = DepthSensorModel(scale=0.01, offset=0.01, noise=DepthNoise(constant=0.005, linear=0.0025))
-"""The lidar of Apple's phones and tablets, as ARKit returns it: few measured points, interpolated along the edges of the image.
+"""The lidar of Apple's phones and tablets, as ARKit returns it: few measured points, interpolated along image
+edges.
 
 Luetzenburg, Kroon and Bjørk, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences", Scientific
 Reports 11, 2021, found an accuracy of 1 cm on objects with sides of more than 10 cm, which is taken as the offset and, at
@@ -88,13 +92,14 @@ Reports 11, 2021, found an accuracy of 1 cm on objects with sides of more than 1
 """
 
 EXACT = DepthSensorModel(scale=0.0, noise=DepthNoise())
-"""A sensor without errors, with which the systematic part of a covariance is left out."""
+"""A sensor without errors, which leaves out the systematic part of a covariance."""
 
 RENDERED = DepthSensorModel(scale=0.0, noise=DepthNoise(linear=0.001))
-"""Depth computed from a model of the scene: exact but for rounding, such as to the whole millimetres of a PNG from 1 m on."""
+"""Depth computed from a model of the scene: exact up to rounding, such as to the whole millimetres of a PNG
+from 1 m on."""
 
 UNKNOWN_SENSOR = "unknown"
-"""The name of a sensor that is not known."""
+"""The name of an unspecified sensor."""
 
 DEPTH_SENSORS: dict[str, DepthSensorModel] = {
     UNKNOWN_SENSOR: UNKNOWN,

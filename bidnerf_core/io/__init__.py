@@ -1,1 +1,1 @@
-"""Reading what users name, and writing whole files: text, JSON, images, arrays."""
+"""Reading files that users name, and writing whole files: text, JSON, images, arrays."""

@@ -1,4 +1,4 @@
-"""Zip archives whose members are read one at a time, within limits: no archive is unpacked as a whole."""
+"""Zip archives whose members are read one at a time, within limits; no archive is unpacked as a whole."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io.files import PackedFile, open_binary
 
 LARGEST_MEMBER = 256 * 2**20
-"""Bytes of an unpacked member. A small archive can hold members that unpack to any size."""
+"""Largest size of an unpacked member in bytes. A small archive can hold members that unpack to any size."""
 MOST_MEMBERS = 1_000_000
 
 
 class Archive:
-    """The members of a zip archive by name. Raises ``InputError`` for a file that is no whole zip archive."""
+    """The members of a zip archive by name. Raises ``InputError`` if the file is not a complete zip archive."""
 
     def __init__(self, path: Path, expected: str = "a zip archive") -> None:
         self.path, self._expected = path, expected
@@ -27,7 +27,7 @@ class Archive:
             members = self._zip.infolist()
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError) as error:
             cut = begins == b"PK"
-            why = "ends too early, as a copy that broke off does" if cut else f"is no zip archive ({error})"
+            why = "ends too early, probably an incomplete copy" if cut else f"is not a zip archive ({error})"
             raise InputError(f"{path}: {why}, expected {expected}") from error
         if len(members) > MOST_MEMBERS:
             raise InputError(
@@ -44,15 +44,15 @@ class Archive:
         return name in self._members
 
     def file(self, name: str) -> PackedFile:
-        """Return a member, which is read when it is opened."""
+        """Return a member as a file; it is read when opened."""
         return PackedFile(f"{self.path}/{name}", partial(self.read, name))
 
     def read(self, name: str) -> bytes:
-        """Return the content of a member. Raises ``InputError`` where it is missing, damaged, encrypted or too large."""
+        """Return the content of a member. Raises ``InputError`` if it is missing, damaged, encrypted or too large."""
         where, member = f"{self.path}/{name}", self._members.get(name)
         if member is None:
             raise InputError(
-                f"{where}: is not in the archive, which holds {amount(len(self._members), 'file')}"
+                f"{where}: not found in the archive, which holds {amount(len(self._members), 'file')}"
             )
         if member.file_size > LARGEST_MEMBER:
             raise self._too_large(where, member.file_size)

@@ -1,4 +1,4 @@
-"""Opening files that a user names, and writing files whole or not at all."""
+"""Opening files that a user names, and writing files atomically."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if sys.platform != "win32":
     import fcntl
 
 LARGEST_TEXT = 128 * 2**20
-"""Bytes. Parsed text takes ten times as much memory as its file, so the size is checked before the file is read."""
+"""Bytes. Parsed text takes ten times as much memory as its file, so the size is checked before reading."""
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}")
 FILE_KINDS = {
     stat.S_IFDIR: "a folder",
@@ -35,7 +35,7 @@ FILE_KINDS = {
 class PackedFile:
     """A file inside another one, such as a member of a zip archive."""
 
-    where: str  # the archive and the name in it, as messages name it
+    where: str  # the archive and the name in it, for messages
     read: Callable[[], bytes]  # returns its content, or raises ``InputError``
 
     @property
@@ -51,10 +51,10 @@ class PackedFile:
 
 
 def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
-    """Open a regular file for reading. ``expected`` describes in a few words what it should be ("an image file").
+    """Open a regular file for reading. ``expected`` briefly describes what it should be ("an image file").
 
-    Raises ``InputError`` where there is no such file, where reading is not permitted, and for folders, pipes and devices:
-    reading from a pipe could block forever.
+    Raises ``InputError`` if there is no such file, if reading is not permitted, and for folders, pipes and
+    devices: reading from a pipe could block forever.
     """
     if isinstance(path, PackedFile):
         return io.BytesIO(path.read())
@@ -65,8 +65,8 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file, expected {expected}") from error
     except PermissionError as error:
-        raise InputError(f"{path}: permission denied, expected {expected} that may be read") from error
-    except (OSError, ValueError) as error:  # a ValueError is a NUL in the name
+        raise InputError(f"{path}: permission denied, expected a readable file: {expected}") from error
+    except (OSError, ValueError) as error:  # a NUL in the name raises ValueError
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be opened ({reason}), expected {expected}") from error
     kind = FILE_KINDS.get(stat.S_IFMT(mode), "no regular file")
@@ -74,7 +74,9 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
 
 
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
-    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and for more than ``most`` bytes."""
+    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and if it exceeds
+    ``most`` bytes.
+    """
     with open_binary(path, expected) as file:
         return read_open_file(file, path, expected, most)
 
@@ -92,24 +94,24 @@ def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGES
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a path that was read from a file is that of a file; False for names that the system rejects."""
+    """Return whether a path that was read from a file exists as a file; False for names that the system rejects."""
     return os.path.isfile(path)
 
 
 def temporary(path: Path) -> Path:
-    """Return a new name beside ``path`` that ``is_temporary`` recognises."""
+    """Return a new name next to ``path`` that ``is_temporary`` recognizes."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a name is that of a temporary file, left behind if its process was killed while writing."""
+    """Return whether a name belongs to a temporary file, left behind if its process was killed while writing."""
     return TEMPORARY.fullmatch(name) is not None
 
 
 def write_file(path: Path, content: bytes) -> None:
     """Write a file atomically: it appears under its name only once all of it is on disk.
 
-    Raises ``OSError``, which names the file; an earlier file of that name is then left untouched.
+    Raises ``OSError``, which names the file; an existing file of that name is then left untouched.
     """
     beside = temporary(path)
     try:
@@ -128,17 +130,17 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 class FileInUse(InputError):
-    """Another process is writing the file, or into the folder."""
+    """Another process is writing to the file or folder."""
 
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of a file or folder that exists.
+    """Hold the lock of an existing file or folder.
 
-    Raises ``FileInUse`` where another process holds it, or held it and removed the file or folder.
+    Raises ``FileInUse`` if another process holds it, or held it and removed the file or folder.
     """
     used = FileInUse(
-        f"{path}: another bidnerf writes into it, expected another place, or to wait for its end"
+        f"{path}: another bidnerf process is writing here; name another place, or wait until it ends"
     )
     try:
         number = os.open(path, os.O_RDONLY)
@@ -153,7 +155,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _is_still(path: Path, number: int) -> bool:
-    """Return whether a path names the file of an open descriptor."""
+    """Return whether a path still names the file of an open descriptor."""
     try:
         return os.path.samestat(os.fstat(number), path.stat())
     except FileNotFoundError:

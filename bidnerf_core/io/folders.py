@@ -1,4 +1,4 @@
-"""Folders that results are written into."""
+"""Output folders."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ def output_folder(
     is_leftover: Callable[[Path], bool] = lambda file: False,
     described: Callable[[Path], str | None] = lambda folder: None,
 ) -> Iterator[None]:
-    """Create a folder, and check before hours of work that it can be written and that nobody else writes into it.
+    """Create a folder, and check before hours of work that it is writable and that no other process writes to
+    it.
 
-    A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that ``is_leftover``
-    recognises, do not count. ``described`` returns what a folder holds, for the message. If the work fails before anything is
-    in the folder, the folder is removed again, with the parents that were created for it. Raises ``InputError``.
+    A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that
+    ``is_leftover`` recognizes, do not count. ``described`` returns what a folder holds, for the message. If
+    the work fails before anything is in the folder, the folder is removed again, with the parents that were
+    created for it. Raises ``InputError``.
     """
 
     def check() -> None:
@@ -37,7 +39,7 @@ def output_folder(
         try:
             yield
         except BaseException:
-            with contextlib.suppress(OSError):  # not empty, or never made
+            with contextlib.suppress(OSError):  # not empty, or never created
                 for folder in made:
                     folder.rmdir()
             raise
@@ -60,5 +62,5 @@ def _make_writable(out: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise InputError(
-            f"{out}: cannot be written ({error.strerror}), expected a folder that can be made and written"
+            f"{out}: cannot be written ({error.strerror}), expected a folder that can be created and written"
         ) from error

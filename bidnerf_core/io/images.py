@@ -1,4 +1,4 @@
-"""Image files and arrays of pixels as tensors. Every image file of the library is decoded here."""
+"""Image files and pixel arrays as tensors. Every image file that the library reads is decoded here."""
 
 from __future__ import annotations
 
@@ -27,31 +27,33 @@ ImageSource: TypeAlias = Path | PackedFile
 """An image file, or one inside an archive."""
 
 LARGEST_IMAGE = 178_000_000
-"""Pixels: what Pillow opens, and more than the 108 megapixels of phones. A small file can describe an image of any size, so the
-size is checked before memory is allocated."""
+"""Pixels: the most that Pillow opens, and more than the 108 megapixels of phones. A small file can describe
+an image of any size, so the size is checked before memory is allocated."""
 STRIP = 2**21
-"""Pixels that are converted at a time: a conversion takes many times as much memory as the bytes of the image."""
+"""Number of pixels converted at a time: a conversion takes many times as much memory as the bytes of the image."""
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
-"""The formats that are decoded, whatever a file's name. Pillow knows more, and reads EPS by starting another program."""
+"""The formats that are decoded, whatever a file's name. Pillow supports more, and reads EPS by starting
+another program."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
 """Brands in the first bytes of HEIF files (ISO/IEC 23008-12)."""
 MAGIC = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8")
-"""First bytes of PNG, JPEG, TIFF (both byte orders) and GIF; BMP, WebP, AVIF and HEIF name themselves further on."""
+"""First bytes of PNG, JPEG, TIFF (both byte orders) and GIF; BMP, WebP, AVIF and HEIF are identified by later bytes."""
 DEPTHS = (10, 12, 14)
-"""Bits of sensors whose values are stored in 16 bits: an image whose largest value fits one of them has that range."""
+"""Bit depths of sensors whose values are stored in 16 bits: the smallest that fits an image's largest value
+is assumed."""
 NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 CONVERTED = ("CMYK", "YCbCr", "HSV")
 """Colour spaces that Pillow converts to RGB."""
 
-# Pillow warns about large images, odd EXIF and palettes, which is of no use to whoever opens a photo. It is done once and with
-# the lowest precedence: filters belong to the whole process, so threads that changed and restored them while they read images
-# would leave those of each other behind.
+# Pillow warns about large images, odd EXIF and palettes, which is of no use to a user who opens a photo. The
+# filter is set once and with the lowest precedence: filters belong to the whole process, so threads that
+# changed and restored them while reading images would leave each other's filters behind.
 warnings.filterwarnings("ignore", module=r"PIL\.", append=True)
 FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
 COLOUR_ROUNDING = 1e-3
-"""How far a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
+"""Tolerance by which a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class ImageHeader:
 
 
 def read_header(path: ImageSource) -> ImageHeader:
-    """Read size and channels, but no pixels. Raises ``InputError`` where ``read_image`` would for the same reason."""
+    """Read size and channels, but no pixels. Raises ``InputError`` for the same defects as ``read_image``."""
     with open_image(path) as image:
         has_alpha = image.mode in ("LA", "RGBA", "PA") or (image.mode == "P" and image.has_transparency_data)
         return ImageHeader(image.width, image.height, has_alpha)
@@ -73,12 +75,13 @@ def read_header(path: ImageSource) -> ImageHeader:
 def read_image(
     path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
-    """Read colour in [0, 1] over ``background``, and alpha where there is such a channel.
+    """Read colour in [0, 1] composited over ``background``, and alpha if there is an alpha channel.
 
-    Grey becomes three channels, CMYK becomes RGB, and the range of 16 bits is that of the sensor: 10, 12 or 14 bits where no
-    value needs more. The raster is the stored one, whatever the EXIF orientation, reduced to ``size`` (width, height) as
-    ``reduced`` does: the image is read in strips, so that no more than its bytes and the result are in memory. Raises
-    ``InputError`` where the file is not a complete image of 1 to 4 channels of 8 or 16 bits, or is too large.
+    Grey becomes three channels, CMYK becomes RGB, and 16-bit values are scaled by the sensor's range: 10, 12
+    or 14 bits if no value needs more. The raster is the stored one, whatever the EXIF orientation, downscaled
+    to ``size`` (width, height) as by ``reduced``: the image is read in strips, so that only its bytes and the
+    result are in memory. Raises ``InputError`` if the file is not a complete image with 1 to 4 channels of 8
+    or 16 bits, or is too large.
     """
     rgb, alpha = None, None
     with open_image(path) as image:
@@ -91,7 +94,7 @@ def read_image(
                 cover = None if cover is None else reduced(cover, width, len(strip))
             rgb = _placed(rgb, laid.numpy(), top, height)
             alpha = None if cover is None else _placed(alpha, cover.numpy(), top, height)
-    assert rgb is not None  # no image is without rows
+    assert rgb is not None  # every image has rows
     found, mask = torch.from_numpy(rgb), None if alpha is None else torch.from_numpy(alpha)
     if size is None or size[1] == height:
         return found, mask
@@ -101,9 +104,11 @@ def read_image(
 def read_compact_image(
     path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
 ) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
-    """Read an image as ``read_image`` does, but leave colours as bytes (uint8) where the file has 8 bits and no alpha.
+    """Read an image like ``read_image``, but keep colours as bytes (uint8) if the file has 8 bits and no
+    alpha.
 
-    Images that are reduced to ``size`` (width, height) have bytes as well; a JPEG file is decoded no larger than needed.
+    Images downscaled to ``size`` (width, height) have bytes as well; a JPEG file is decoded no larger than
+    needed.
     """
     if size is not None:
         return _read_reduced(path, background, size)
@@ -125,7 +130,7 @@ def _read_reduced(
             pixels = None
             for top, strip in _strips(path, image):
                 pixels = _placed(pixels, strip, top, image.height)
-            assert pixels is not None  # no image is without rows
+            assert pixels is not None  # every image has rows
             small = reduced(torch.from_numpy(pixels), *size)
             return (small if small.ndim == 3 else small[..., None].expand(*small.shape, 3).contiguous()), None
     rgb, alpha = read_image(path, background, size)
@@ -133,9 +138,10 @@ def _read_reduced(
 
 
 def _decode_smaller(image: Image.Image, size: tuple[int, int]) -> None:
-    """Make a JPEG file decode to a half, a quarter or an eighth of its pixels along each side, if that is no less than ``size``.
+    """Let a JPEG file decode to a half, a quarter or an eighth of its size along each side, if that is no
+    less than ``size``.
 
-    Sizes that are not multiples keep their pixels, since their last column or row would count for more than it shows.
+    Sizes that are not multiples are kept, since their last column or row would be weighted too heavily.
     """
     factors = [f for f in (8, 4, 2) if image.width // f >= size[0] and image.height // f >= size[1]]
     fitting = [f for f in factors if image.width % f == 0 and image.height % f == 0]
@@ -148,13 +154,13 @@ def channels(
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Scale an array (h, w) or (h, w, 1 to 4) of unsigned integers to colour in [0, 1] and alpha.
 
-    ``full`` is the value of white, by default the largest of the array's type. ``finding`` is the beginning of the message of
-    the ``InputError`` that other arrays raise.
+    ``full`` is the value of white, by default the largest of the array's type. Other arrays raise
+    ``InputError``, whose message begins with ``finding``.
     """
     count = raw.shape[2] if raw.ndim == 3 else 1
     if raw.ndim not in (2, 3) or not 1 <= count <= 4 or raw.dtype.name not in FULL_SCALE:
         found = f"{'x'.join(map(str, raw.shape))} of {raw.dtype.name}"
-        raise InputError(f"{finding} {found}, expected grey, RGB or RGBA of 8 or 16 bit")
+        raise InputError(f"{finding} {found}, expected grey, RGB or RGBA with 8 or 16 bits per channel")
     scaled = raw.reshape(*raw.shape[:2], count).astype(np.float32)
     scaled /= full or FULL_SCALE[raw.dtype.name]
     return split_alpha(torch.from_numpy(scaled))
@@ -171,10 +177,10 @@ def split_alpha(
 
 
 def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"]:
-    """Scale an array of pixels, grey (h, w) or with 1 to 4 channels in the last axis, to [0, 1].
+    """Scale a pixel array, grey (h, w) or with 1 to 4 channels in the last axis, to [0, 1].
 
-    Takes uint8 in [0, 255], uint16 in [0, 65535], bool, and floats in [0, 1]. Raises ``InputError`` for other types and
-    shapes, for NaN, and for floats outside [0, 1]; ``what`` opens the message.
+    Accepts uint8 in [0, 255], uint16 in [0, 65535], bool, and floats in [0, 1]. Raises ``InputError``, whose
+    message begins with ``what``, for other types and shapes, for NaN, and for floats outside [0, 1].
     """
     raw = to_numpy(pixels)
     if raw.ndim not in (2, 3) or 0 in raw.shape or (raw.ndim == 3 and raw.shape[2] > 4):
@@ -184,7 +190,7 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
         )
     if raw.dtype.kind != "f" and raw.dtype.name not in FULL_SCALE:
         raise InputError(
-            f"{what} is of {raw.dtype.name}, expected uint8 in [0, 255], uint16 or floats in [0, 1]"
+            f"{what} has dtype {raw.dtype.name}, expected uint8 in [0, 255], uint16 or floats in [0, 1]"
         )
     if raw.dtype.kind == "f":
         _check_unit_range(raw, what)
@@ -198,7 +204,9 @@ def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
         try:
             return np.asarray(array)
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"got a {type(array).__name__}, expected an array of numbers") from error
+            raise InputError(
+                f"got an object of type {type(array).__name__}, expected an array of numbers"
+            ) from error
     values = array.detach().cpu()
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 
@@ -224,7 +232,7 @@ def over(
 
 
 def background_colour(background: Background) -> tuple[float, float, float]:
-    """Return the rgb triple that ``background`` stands for. Raises ``InputError`` where it is not a colour."""
+    """Return the rgb triple for ``background``. Raises ``InputError`` if it is not a colour."""
     expected = 'expected "white", "black" or three numbers in [0, 1]'
     if isinstance(background, str):
         if background not in NAMED_BACKGROUNDS:
@@ -237,31 +245,31 @@ def background_colour(background: Background) -> tuple[float, float, float]:
 
 
 def reduced(image: Shaped[Tensor, "h w *c"], width: int, height: int) -> Shaped[Tensor, "nh nw *c"]:
-    """Reduce an image of floats or bytes to a smaller size; each new pixel is the mean over the area that it covers."""
-    import cv2  # here, as most images keep their size
+    """Downscale an image of floats or bytes; each new pixel is the mean over the area that it covers."""
+    import cv2  # imported here, since most images keep their size
 
     small = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
     return torch.from_numpy(small.reshape(height, width, *image.shape[2:]))
 
 
 def resampled(image: Shaped[Tensor, "h w"], width: int, height: int) -> Shaped[Tensor, "nh nw"]:
-    """Give an image another size; each new pixel has the value of the nearest old one."""
+    """Resize an image by nearest-neighbour sampling."""
     rows = ((torch.arange(height) + 0.5) * image.shape[0] / height).long()
     columns = ((torch.arange(width) + 0.5) * image.shape[1] / width).long()
     return image[rows][:, columns]
 
 
 def decode(path: ImageSource) -> np.ndarray:
-    """Decode the first image of a file as it is stored: (h, w) or (h, w, channels) of the file's own type.
+    """Decode the first image of a file as stored: (h, w) or (h, w, channels) in the file's own type.
 
-    Raises ``InputError`` where the file is not a whole image, and for colour spaces other than grey and RGB.
+    Raises ``InputError`` if the file is not a complete image, and for colour spaces other than grey and RGB.
     """
     with open_image(path) as image:
         return _decoded(path, image)
 
 
 def _scaled_strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.ndarray, int | None]]:
-    """Yield strips as ``_strips`` does, each with the value of white; None is the largest of its type."""
+    """Yield strips like ``_strips``, each with the value of white; None is the largest of its type."""
     if not _is_deep(image):
         yield from ((top, strip, None) for top, strip in _strips(path, image))
         return
@@ -272,7 +280,7 @@ def _scaled_strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int,
 
 
 def _used_range(pixels: np.ndarray) -> int:
-    """Return the largest value of the sensor whose values are stored in 16 bits."""
+    """Return the full scale of the sensor whose values are stored in 16 bits."""
     colours = pixels[..., :-1] if pixels.ndim == 3 and pixels.shape[2] in (2, 4) else pixels
     largest = int(colours.max(initial=0))
     fits = [2**bits - 1 for bits in DEPTHS if largest < 2**bits]
@@ -280,7 +288,9 @@ def _used_range(pixels: np.ndarray) -> int:
 
 
 def _is_deep(image: Image.Image) -> bool:
-    """Return whether an open image has 16 bits a channel, of which Pillow keeps 8 where there are several channels."""
+    """Return whether an open image has 16 bits per channel, of which Pillow keeps only 8 if there are several
+    channels.
+    """
     return (
         image.mode.startswith("I;16")
         or (image.format == "PNG" and image.mode == "I")
@@ -296,31 +306,31 @@ def _is_deep_colour(image: Image.Image) -> bool:
 
 
 def _decoded(path: ImageSource, image: Image.Image) -> np.ndarray:
-    """Return the pixels of an open image as they are stored."""
+    """Return the pixels of an open image as stored."""
     pixels = None
     if _is_deep_colour(image):
         return _deep_colours(path)
     for top, strip in _strips(path, image):
         pixels = _placed(pixels, strip, top, image.height)
-    assert pixels is not None  # no image is without rows
+    assert pixels is not None  # every image has rows
     return pixels
 
 
 def _deep_colours(path: ImageSource) -> np.ndarray:
-    """Decode an image of 16 bits a channel by OpenCV."""
-    import cv2  # here, as most images have 8 bits
+    """Decode an image with 16 bits per channel using OpenCV."""
+    import cv2  # imported here, since most images have 8 bits
 
     with open_binary(path, "an image file") as file:
         found = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
         raise InputError(
-            f"{path}: not readable as an image of 16 bits a channel, expected a whole image file"
+            f"{path}: not readable as an image with 16 bits per channel, expected a complete image file"
         )
     return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
 def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the first row and the pixels of one strip of an open image after another, from top to bottom."""
+    """Yield the first row and the pixels of each strip of an open image, from top to bottom."""
     if image.mode == "LAB":
         raise InputError(f"{path}: image is {image.mode}, expected grey, RGB, RGBA or CMYK")
     rows = max(1, STRIP // image.width)
@@ -337,7 +347,9 @@ def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.nda
 
 
 def _placed(whole: np.ndarray | None, strip: np.ndarray, top: int, height: int) -> np.ndarray:
-    """Write a strip from row ``top`` on into an array of ``height`` rows, which is made for the first strip."""
+    """Write a strip, starting at row ``top``, into an array of ``height`` rows, which is allocated for the
+    first strip.
+    """
     if len(strip) == height:
         return strip
     if whole is None:
@@ -348,10 +360,10 @@ def _placed(whole: np.ndarray | None, strip: np.ndarray, top: int, height: int) 
 
 @contextlib.contextmanager
 def open_image(path: ImageSource) -> Iterator[Image.Image]:
-    """Open an image file; its pixels are decoded when they are first used, within the context.
+    """Open an image file; its pixels are decoded on first use, within the context.
 
-    Raises ``InputError`` where there is no such regular file, where it is not readable as an image, and where the image has
-    more than ``LARGEST_IMAGE`` pixels, which the header shows before memory is allocated.
+    Raises ``InputError`` if there is no such regular file, if it is not readable as an image, and if the
+    image has more than ``LARGEST_IMAGE`` pixels according to its header, before memory is allocated.
     """
     with open_binary(path, "an image file") as file:
         if is_heif(file.read(12)):
@@ -367,12 +379,13 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
             raise _too_large(path, "more than 178 megapixels") from error
         except Exception as error:  # decoders may raise anything, even SyntaxError
             raise InputError(
-                f"{path}: not readable as an image ({_why_unreadable(file, error)}), expected a whole image file"
+                f"{path}: not readable as an image ({_why_unreadable(file, error)}), expected a complete"
+                " image file"
             ) from error
 
 
 def _formats() -> list[str]:
-    """Return those of ``FORMATS`` that this installation of Pillow reads; each is registered by a module of its own."""
+    """Return the ``FORMATS`` that this installation of Pillow supports; each is registered by a module of its own."""
     Image.preinit()
     with contextlib.suppress(ImportError):  # Pillow from 11.3 on
         from PIL import AvifImagePlugin  # noqa: F401
@@ -383,7 +396,7 @@ def _why_unreadable(file: BinaryIO, error: Exception) -> str:
     if file.seek(0, os.SEEK_END) == 0:
         return "the file is empty"
     if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
-        return f"its content is of none of the formats {', '.join(FORMATS)}"
+        return f"its content is in none of the formats {', '.join(FORMATS)}"
     return reason(error)
 
 
@@ -397,12 +410,12 @@ def _too_large(path: ImageSource, size: str) -> InputError:
 
 
 def is_heif(head: bytes) -> bool:
-    """Return whether the first 12 bytes of a file are those of HEIF, such as an iPhone's HEIC, whatever its name."""
+    """Return whether the first 12 bytes of a file identify it as HEIF, such as an iPhone's HEIC, whatever its name."""
     return head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS
 
 
 def looks_like_image(path: Path) -> bool:
-    """Return whether the first bytes of a file are those of an image; none is decoded."""
+    """Return whether the first bytes of a file identify it as an image; nothing is decoded."""
     try:
         with open_binary(path, "an image file") as file:
             head = file.read(12)

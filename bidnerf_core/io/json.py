@@ -1,6 +1,7 @@
-"""JSON: one parser, objects with values read by type, and frozen dataclasses to and from plain values.
+"""JSON: one parser, objects with typed access to values, and conversion of frozen dataclasses to and from
+plain values.
 
-Everything that reads JSON uses ``parse_json``, so that damaged text of any origin gives the same one-line error.
+Everything that reads JSON uses ``parse_json``, so damaged text of any origin gives the same one-line error.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from bidnerf_core.io.files import read_file
 _T = TypeVar("_T")
 
 LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
-LARGEST_INTEGER = 2**63 - 1  # that tensors and files can hold
+LARGEST_INTEGER = 2**63 - 1  # the largest that tensors and files can hold
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -32,14 +33,15 @@ def read_json(path: Path, expected: str) -> Any:
 
 
 def parse_json(content: bytes | str, where: str, expected: str) -> Any:
-    """Return the value of JSON text (UTF-8). Raises ``InputError`` for text that is not JSON or cannot be written again.
+    """Parse JSON text (UTF-8). Raises ``InputError`` for text that is not JSON or could not be written again.
 
-    ``where`` begins the message (the file, or nothing), and ``expected`` describes in a few words what should be there.
+    ``where`` begins the message (the file, or nothing), and ``expected`` briefly describes what should be
+    there.
     """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
         found = json.loads(text)
-        if "\\ud" in text.lower():  # half of a surrogate pair, which no file or terminal can hold
+        if "\\ud" in text.lower():  # half of a surrogate pair, which no file or terminal can represent
             json.dumps(found, ensure_ascii=False).encode()
     except json.JSONDecodeError as error:
         reason = f"{error.msg} at line {error.lineno}, column {error.colno}"
@@ -75,12 +77,14 @@ class Record:
         return self.defaults.value(key) if found is None and self.defaults is not None else found
 
     def number(self, key: str) -> float | None:
-        """Return a finite number, or None where the key is missing."""
+        """Return a finite number, or None if the key is missing."""
         found = self.value(key)
         return None if found is None else self.checked_number(found, key)
 
     def size(self, key: str) -> int | None:
-        """Return a positive whole number of pixels, which some programs write as 800.0, or None where the key is missing."""
+        """Return a positive integer number of pixels, which some programs write as 800.0, or None if the key
+        is missing.
+        """
         found = self.number(key)
         if found is not None and (found < 1 or found != int(found)):
             raise self.error(f"{key} is {found:g}, expected a positive whole number of pixels")
@@ -106,12 +110,12 @@ class Record:
 
 
 def read_record(path: Path, expected: str = "a JSON object") -> Record:
-    """Read the JSON object in the file ``path``. Raises ``InputError``, with line and column where the JSON is malformed."""
+    """Read the JSON object in the file ``path``. Raises ``InputError``, with line and column if the JSON is malformed."""
     return parse_record(str(path), read_file(path, "a JSON file"), expected)
 
 
 def parse_record(where: str, content: bytes | str, expected: str = "a JSON object") -> Record:
-    """Parse a JSON object; ``where`` begins the message of the ``InputError`` that a malformed one raises."""
+    """Parse a JSON object. Malformed text raises ``InputError``, whose message begins with ``where``."""
     values = parse_json(content, where, expected)
     if not isinstance(values, dict):
         raise InputError(f"{where}: holds {_short(values)}, expected {expected}")
@@ -125,7 +129,9 @@ def _short(value: Any) -> str:
 
 
 def to_plain(value: Any, where: str = "") -> Any:
-    """Convert dataclasses to dicts and tuples to lists. Raises ``InputError`` for values that strict JSON cannot hold."""
+    """Convert dataclasses to dicts and tuples to lists. Raises ``InputError`` for values that strict JSON
+    cannot represent.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [f.name for f in dataclasses.fields(value) if f.init]
         return {name: to_plain(getattr(value, name), _inside(where, name)) for name in fields}
@@ -137,14 +143,15 @@ def to_plain(value: Any, where: str = "") -> Any:
         raise InputError(f"{where or 'value'} is {value}, expected a finite number")
     if value is None or type(value) in (bool, int, float, str):
         return value
-    raise InputError(f"{where or 'value'} is a {type(value).__name__}, expected what JSON can hold")
+    raise InputError(f"{where or 'value'} is a {type(value).__name__}, expected a JSON-serializable value")
 
 
 def from_plain(kind: type[_T], value: Any, where: str) -> _T:
-    """Return an instance of the dataclass ``kind``; missing keys take their defaults. Errors begin with ``where``.
+    """Build an instance of the dataclass ``kind``; missing keys take their defaults. Errors begin with
+    ``where``.
 
-    Raises ``InputError`` for an unknown key, for a required one that is missing, for a value of a type other than the declared
-    one, and for values that ``kind`` itself rejects.
+    Raises ``InputError`` for an unknown key, a missing required key, a value of the wrong type, and values
+    that ``kind`` itself rejects.
     """
     if not isinstance(value, dict):
         raise InputError(
@@ -174,12 +181,12 @@ def _check_keys(kind: type, value: dict[str, Any], where: str) -> None:
     known = {f.name: _is_required(f) for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in known:
-            hint = spelling_hint(key, known, f", expected some of {', '.join(known)}")
+            hint = spelling_hint(key, known, f", expected any of {', '.join(known)}")
             raise InputError(f"{where}: {kind.__name__} has no field {key!r}{hint}")
     missing = [key for key, required in known.items() if required and key not in value]
     if missing:
         raise InputError(
-            f"{where}: no {', '.join(map(repr, missing))}, expected all fields of {kind.__name__}"
+            f"{where}: {', '.join(map(repr, missing))} missing, expected all fields of {kind.__name__}"
         )
 
 

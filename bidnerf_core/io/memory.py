@@ -1,4 +1,4 @@
-"""The memory that this process may still take."""
+"""The memory still available to this process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CGROUP = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int | None:
-    """Return the bytes of memory that are available, or half of what the machine has where only that is known; else None."""
+    """Return the available memory in bytes, or half of the machine's total if only that is known; else None."""
     found = [_of_system(), _of_cgroup()]
     known = [size for size in found if size is not None]
     return min(known) if known else None
@@ -29,7 +29,7 @@ def _of_system() -> int | None:
 
 
 def _of_cgroup() -> int | None:
-    """Return what is left to a container."""
+    """Return the memory left in a container's limit."""
     with contextlib.suppress(OSError, ValueError):
         limit, used = ((CGROUP / name).read_text() for name in ("memory.max", "memory.current"))
         return max(0, int(limit) - int(used))

@@ -1,4 +1,6 @@
-"""PLY files: elements of named numbers, whose size is checked against the file before memory is allocated for them."""
+"""PLY files: elements with named numeric properties, whose size is checked against the file before memory is
+allocated.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from bidnerf_core.io.files import open_binary
 LARGEST_HEADER = 64 * 1024
 """Bytes."""
 SHORTEST_NUMBER = 2
-"""Bytes of a number in a text file, with the blank behind it."""
+"""Bytes per number in a text file, including the separating blank."""
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -27,11 +29,11 @@ ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One kind of element, as the header of a file declares it."""
+    """One kind of element, as declared in a file's header."""
 
     name: str
     count: int
-    properties: tuple[tuple[str, str], ...]  # name and NumPy's type, without the order of bytes
+    properties: tuple[tuple[str, str], ...]  # name and NumPy type, without byte order
     has_lists: bool = False
 
     @property
@@ -44,26 +46,26 @@ class PlyElement:
 class PlyHeader:
     """The header of a file."""
 
-    order: str  # of bytes, as NumPy writes it; "=" for a text file
+    order: str  # byte order, in NumPy's notation; "=" for a text file
     elements: tuple[PlyElement, ...]
     length: int  # bytes
 
     def element(self, name: str) -> PlyElement | None:
-        """Return the declaration of the elements of that name, or None where there are none."""
+        """Return the declaration of the elements with that name, or None if there are none."""
         return next((element for element in self.elements if element.name == name), None)
 
 
 def read_ply_header(path: Path, expected: str = "a PLY file") -> PlyHeader:
-    """Return the header of a PLY file. Raises ``InputError`` where it has none, or a malformed one."""
+    """Read the header of a PLY file. Raises ``InputError`` if it is missing or malformed."""
     with open_binary(path, expected) as file:
         return _header(file, path, expected)
 
 
 def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
-    """Return the elements of a PLY file by name, each as a structured array with a field per property.
+    """Read the elements of a PLY file by name, each as a structured array with one field per property.
 
-    Elements with lists, such as the faces of a mesh, and all elements behind the first of these are left out. Raises
-    ``InputError`` for a malformed header, and for more elements than a file of its size can hold.
+    Elements with lists, such as the faces of a mesh, and all elements after the first of these are left out.
+    Raises ``InputError`` for a malformed header, and for more elements than a file of its size can hold.
     """
     with open_binary(path, expected) as file:
         header = _header(file, path, expected)
@@ -77,8 +79,8 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
             size = SHORTEST_NUMBER * len(element.properties) if is_text else kind.itemsize
             if element.count * size > left + is_text:
                 raise InputError(
-                    f"{path}: declares {element.count:,} elements {element.name!r}, for which its {left:,} bytes of data"
-                    " are too few; is the file truncated?"
+                    f"{path}: declares {element.count:,} elements {element.name!r}, but its {left:,} bytes"
+                    " of data are too few for them; is the file truncated?"
                 )
             found[element.name] = (
                 _text_rows(file, element.count, kind, path)
@@ -94,7 +96,7 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
     end = start.find(b"end_header")
     stop = start.find(b"\n", end)
     if not start.startswith(b"ply") or end < 0 or stop < 0:
-        raise InputError(f"{path}: no header of a PLY file, expected {expected}")
+        raise InputError(f"{path}: no PLY header, expected {expected}")
     order, elements = "", list[PlyElement]()
     for line in start[:end].decode("latin-1").splitlines()[1:]:
         words = line.split()
@@ -113,12 +115,12 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
             else:
                 raise ValueError
         except (ValueError, KeyError, IndexError) as error:
-            raise InputError(f"{path}: a line {line[:60]!r} in its header, expected {expected}") from error
+            raise InputError(f"{path}: its header has the line {line[:60]!r}, expected {expected}") from error
     if not order:
         raise InputError(f"{path}: its header names no format, expected {expected}")
-    for element in elements:  # any number of them would fit into no bytes
+    for element in elements:  # otherwise any number of them would fit into no bytes
         if element.count and not element.properties and not element.has_lists:
-            raise InputError(f"{path}: its elements {element.name!r} have no properties, expected {expected}")
+            raise InputError(f"{path}: the elements {element.name!r} have no properties, expected {expected}")
     file.seek(stop + 1)
     return PlyHeader(order, tuple(elements), stop + 1)
 
@@ -135,7 +137,7 @@ def _with_property(element: PlyElement, words: list[str]) -> PlyElement:
 
 
 def _text_rows(file: BinaryIO, count: int, kind: np.dtype, path: Path) -> np.ndarray:
-    """Return the next ``count`` rows of numbers of a text file."""
+    """Read the next ``count`` rows of numbers from a text file."""
     width = len(kind.names or ())
     lines = [file.readline() for _ in range(count)]
     try:

@@ -1,4 +1,4 @@
-"""Text files of rows: words and numbers, separated by blanks; ``#`` begins a comment where the format has comments."""
+"""Text files of rows: words and numbers separated by blanks; ``#`` begins a comment if the format has comments."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import read_file
 
 LARGEST_ROWS = 256 * 2**20
-"""Bytes. A trajectory over a whole day at 100 Hz is about as large."""
+"""Bytes. A trajectory over a whole day at 100 Hz is about this large."""
 SHOWN = 60
-"""Characters of a row that a message shows."""
+"""Number of characters of a row shown in a message."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a file, without the blanks around it."""
+    """A line of a file, without surrounding blanks."""
 
     path: Path
     line: int  # counted from 1
     text: str
-    columns: str  # what it should hold, the end of each message: "timestamp tx ty tz"
+    columns: str  # expected content, which ends each message: "timestamp tx ty tz"
 
     @property
     def where(self) -> str:
-        """The file and the line, as messages begin."""
+        """The file and line, as messages begin."""
         return f"{self.path}: line {self.line}"
 
     @property
@@ -35,11 +35,12 @@ class Row:
         return self.text.split()
 
     def error(self, finding: str) -> InputError:
-        """Return the error about this row; a ``finding`` begins with a blank or a colon."""
+        """Return the error for this row; ``finding`` begins with a blank or a colon."""
         return InputError(f"{self.where}{finding}, expected {self.columns}")
 
     def numbers(self, words: Sequence[str] | None = None, count: int | None = None) -> list[float]:
-        """Return the ``words`` (all of the row if None) as finite numbers, which must be ``count`` if that is given.
+        """Parse the ``words`` (by default the whole row) as finite numbers, exactly ``count`` of them if
+        given.
 
         Raises ``InputError`` for anything else.
         """
@@ -52,14 +53,14 @@ class Row:
         return found
 
     def plain_numbers(self, words: Sequence[str]) -> list[float]:
-        """Return the ``words`` as numbers, which may be NaN or infinite. Raises ``InputError`` for other words."""
+        """Parse the ``words`` as numbers, which may be NaN or infinite. Raises ``InputError`` for other words."""
         try:
             return [float(word) for word in words]
         except ValueError as error:
             raise self.error(f": {error}") from error
 
     def integer(self, word: str) -> int:
-        """Return a word as a whole number of at most 64 bits. Raises ``InputError`` for anything else."""
+        """Parse a word as an integer of at most 64 bits. Raises ``InputError`` for anything else."""
         try:
             found = int(word)
         except ValueError as error:
@@ -70,15 +71,16 @@ class Row:
 
 
 def read_rows(path: Path, expected: str, columns: str, most: int = LARGEST_ROWS) -> list[Row]:
-    """Return the rows of a file that are more than a comment. Raises ``InputError`` as ``read_file``, and for what is no text.
+    """Read the non-empty rows of a file, without comments. Raises ``InputError`` as ``read_file`` does, and
+    for non-text files.
 
-    ``expected`` describes in a few words what the file should be, ``columns`` a row.
+    ``expected`` briefly describes the file, ``columns`` a row.
     """
     return parse_rows(read_file(path, expected, most), path, expected, columns)
 
 
 def parse_rows(content: bytes, path: Path, expected: str, columns: str) -> list[Row]:
-    """Return the rows of the content of the file ``path``, as ``read_rows`` does."""
+    """Parse rows from the content of the file ``path``, as ``read_rows`` does."""
     try:
         lines = content.decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
@@ -91,6 +93,8 @@ def parse_rows(content: bytes, path: Path, expected: str, columns: str) -> list[
 
 
 def read_lines(path: Path, expected: str, columns: str, most: int = LARGEST_ROWS) -> list[Row]:
-    """Return all lines of a file, empty ones and comments included, of text in any encoding. Raises ``InputError`` as ``read_file``."""
+    """Read all lines of a text file in any encoding, including empty ones and comments. Raises ``InputError``
+    as ``read_file`` does.
+    """
     lines = read_file(path, expected, most).decode("utf-8-sig", "replace").split("\n")
     return [Row(path, number, line.strip(), columns) for number, line in enumerate(lines, start=1)]

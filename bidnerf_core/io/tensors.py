@@ -1,4 +1,4 @@
-"""Files of arrays and tensors (NumPy, safetensors), whose size is checked before memory is allocated for them."""
+"""Files of arrays and tensors (NumPy, safetensors), whose size is checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ LARGEST_ARRAY = 800_000_000
 """Bytes: an image of 100 megapixels in double precision."""
 TENSOR_FILE = "a safetensors file"
 LARGEST_HEADER = 16 * 2**20
-"""Bytes of the header of a safetensors file, which takes about a hundred for each tensor."""
+"""Bytes of the header of a safetensors file, which takes about a hundred per tensor."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def read_array(path: Path, expected: str) -> np.ndarray:
     """Read the array of a ``.npy`` file. Raises ``InputError`` for anything else, including pickled objects.
 
-    ``expected`` describes in a few words what the file should be.
+    ``expected`` briefly describes what the file should be.
     """
     with open_binary(path, expected) as file:
         try:
@@ -49,7 +49,7 @@ def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, n
             with zipfile.ZipFile(file) as archive:
                 held = {name: f"{name}.npy" for name in names if f"{name}.npy" in archive.namelist()}
                 return {name: _member(archive, member) for name, member in held.items()}
-        except Exception as error:  # as above; zipfile has errors of its own as well
+        except Exception as error:  # as above; zipfile also raises errors of its own
             raise _unreadable(path, error, expected) from error
 
 
@@ -81,14 +81,14 @@ def _unreadable(path: Path, error: Exception, expected: str) -> InputError:
 
 
 def read_tensors(path: Path, expected: str = TENSOR_FILE) -> dict[str, Tensor]:
-    """Return the tensors of a safetensors file. Raises ``InputError`` as ``read_tensors_and_metadata`` does."""
+    """Read the tensors of a safetensors file. Raises ``InputError`` as ``read_tensors_and_metadata`` does."""
     return read_tensors_and_metadata(path, expected)[0]
 
 
 def read_tensors_and_metadata(
     path: Path, expected: str = TENSOR_FILE
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return the tensors of a safetensors file, and the texts that its header holds beside them.
+    """Read the tensors of a safetensors file, and the metadata in its header.
 
     Raises ``InputError`` if it is not such a file, or if its length contradicts its header.
     """
@@ -103,11 +103,11 @@ def read_tensors_and_metadata(
 
 
 def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]:
-    """Return the header of a safetensors file, whose length agrees with it, before memory is allocated for the tensors."""
+    """Return the header of a safetensors file, checked against the file's length before memory is allocated."""
     size = os.fstat(file.fileno()).st_size
     length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
     if not length <= min(size - 8, LARGEST_HEADER):
-        raise InputError(f"{path}: not readable (its header is cut off), expected {expected}")
+        raise InputError(f"{path}: not readable (its header is truncated), expected {expected}")
     try:
         header: dict[str, Any] = parse_json(file.read(length), str(path), expected)
         ends = [part["data_offsets"][1] for name, part in header.items() if name != "__metadata__"]
@@ -115,7 +115,9 @@ def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
         raise InputError(f"{path}: not readable (its header is damaged), expected {expected}") from error
     if described != size:
-        raise InputError(f"{path}: has {size} bytes, its header describes {described}; expected {expected}")
+        raise InputError(
+            f"{path}: has {size} bytes, but its header describes {described}; expected {expected}"
+        )
     file.seek(0)
     return header
 
@@ -123,7 +125,7 @@ def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]
 def load_part(
     path: Path, make: Callable[[dict[str, Tensor]], _Part], what: str, expected: str = TENSOR_FILE
 ) -> _Part:
-    """Return what ``make`` returns for the tensors of a file. Raises ``InputError`` where it rejects them."""
+    """Return the result of ``make`` for the tensors of a file. Raises ``InputError`` if ``make`` rejects them."""
     tensors = read_tensors(path, expected)
     try:
         return make(tensors)
@@ -133,5 +135,5 @@ def load_part(
 
 
 def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return contiguous copies on the CPU, as safetensors needs them."""
+    """Return contiguous copies on the CPU, as safetensors requires."""
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}

@@ -1,4 +1,4 @@
-"""Files that ``torch.save`` wrote, read without running code in them."""
+"""Files written by ``torch.save``, read without running any code in them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 
 CODE = re.compile(r"GLOBAL ([\w.]+)")
-"""How torch names what a file wanted to call."""
+"""How torch names the object that a file tried to call."""
 
 
 class _Ignored:
-    """Stands for a number of NumPy, which programs store among the settings of their optimizers; nothing of it is kept."""
+    """Placeholder for a NumPy number, which programs store among optimizer settings; its value is discarded."""
 
     def __init__(self, *parts: object) -> None:
         pass
@@ -32,14 +32,16 @@ STAND_INS = (
     "numpy._core.multiarray.scalar", "numpy.core.multiarray.scalar", "numpy.dtype", "numpy.dtypes.Float64DType",
     "numpy.dtypes.Float32DType", "_codecs.encode",
 )  # fmt: skip
-"""Names in pickles that become ``_Ignored`` rather than what they name."""
+"""Names in pickles that are replaced by ``_Ignored``."""
 
 
 def read_saved(path: Path, expected: str) -> Any:
-    """Return what ``torch.save`` wrote: tensors and numbers in dicts and lists. Numbers of NumPy come back as placeholders.
+    """Read a file written by ``torch.save``: tensors and numbers in dicts and lists. NumPy numbers come back
+    as placeholders.
 
-    ``expected`` says in a few words what the file should be. Raises ``InputError``, in one line, where there is no such file,
-    it is damaged, or it would run code. A tensor may be larger than what is stored of it, see ``check_sizes``.
+    ``expected`` briefly describes what the file should be. Raises a one-line ``InputError`` if there is no
+    such file, it is damaged, or it would run code. A tensor may be larger than its stored data, see
+    ``check_sizes``.
     """
     return _read(path, expected, mapped=False)
 
@@ -59,11 +61,11 @@ def _read(path: Path, expected: str, mapped: bool) -> Any:
     try:
         with torch.serialization.safe_globals([(_Ignored, name) for name in STAND_INS]):
             found = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-    except Exception as error:  # each kind of damage raises another exception
+    except Exception as error:  # each kind of damage raises a different exception
         code = CODE.search(str(error))
         if isinstance(error, pickle.UnpicklingError) and code:
             raise InputError(
-                f"{path}: it would run code ({code[1]}) and was not read, expected {expected}"
+                f"{path}: would run code ({code[1]}) and was not read, expected {expected}"
             ) from error
         raise InputError(
             f"{path}: not written by torch.save, or damaged ({type(error).__name__}); expected {expected}"
@@ -72,15 +74,17 @@ def _read(path: Path, expected: str, mapped: bool) -> Any:
 
 
 def check_sizes(path: Path, found: Any, expected: str) -> None:
-    """Raise ``InputError`` for a tensor in which a stored number stands for many, to be called before it is copied."""
+    """Raise ``InputError`` for a tensor in which one stored number stands for many. Call this before copying
+    the tensor.
+    """
     size = path.stat().st_size
     for tensor in _tensors(found):
         needed = tensor.numel() * tensor.element_size()
         held = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
         if needed > min(held, size):
             raise InputError(
-                f"{path}: a tensor {tuple(tensor.shape)} has {needed:,} bytes, for which its {size:,} bytes are too few;"
-                f" expected {expected}"
+                f"{path}: a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only"
+                f" {size:,}; expected {expected}"
             )
 
 

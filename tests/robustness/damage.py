@@ -198,7 +198,7 @@ def of_mode(chance: Random, content: bytes) -> bytes:
 
 
 def sixteen_bits(chance: Random, content: bytes) -> bytes:
-    """Return a PNG of 16 bits a channel with 2 to 4 channels."""
+    """Return a PNG of 16 bits per channel with 2 to 4 channels."""
     colour, count = chance.choice(((2, 3), (4, 2), (6, 4)))
     return png(
         24, 16, colour, zlib.compress(b"".join(b"\0" + chance.randbytes(48 * count) for _ in range(24)))
@@ -234,7 +234,7 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\
 IMAGES: dict[str, Damage] = BYTES | {
     "size in the header": size_in_header,
     "another mode": of_mode,
-    "16 bits a channel": sixteen_bits,
+    "16 bits per channel": sixteen_bits,
     "animated": animated,
     "one pixel or line": one_pixel,
     "compressed zeros": lambda chance, content: zeros_png(chance.choice((4000, 12_000))),

@@ -82,7 +82,9 @@ def test_a_map_is_replaced_only_where_that_is_wanted(
     assert load_map(out).bounds.near == 1.0
     capsys.readouterr()
     with locked(out):
-        assert "another bidnerf writes into it" in refused(capsys, write(), "--out", out, "--overwrite")
+        assert "another bidnerf process is writing here" in refused(
+            capsys, write(), "--out", out, "--overwrite"
+        )
 
 
 def test_wrong_usage_has_a_status_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,7 +69,7 @@ def _opened(path: Path) -> Iterator[Member]:
     try:
         archive = zipfile.ZipFile(path)
     except Exception as error:  # damaged archives raise errors of many types
-        raise InputError(f"{path}: is no zip archive ({error}), expected {EXPECTED}") from error
+        raise InputError(f"{path}: is not a zip archive ({error}), expected {EXPECTED}") from error
     with archive:
 
         def of_archive(name: str) -> bytes:
