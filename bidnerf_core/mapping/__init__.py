@@ -1,6 +1,6 @@
-"""Data baked from a field and its images: the surface, as surfels in a grid, and landmarks, as points with descriptors.
+"""Data baked from a field and its images: the surface (surfels in a grid) and landmarks (points with descriptors).
 
-``surface`` and ``landmarks`` hold what builds and reads them, ``geometry`` the least squares over points seen in images.
+``surface`` and ``landmarks`` build and read them; ``geometry`` has the least-squares problems over points seen in images.
 """
 
 from bidnerf_core.mapping.geometry.bundle_adjustment import Adjustment, PosePrior, adjusted

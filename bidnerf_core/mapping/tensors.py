@@ -20,7 +20,7 @@ from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FR
 Kinds = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Shape (-1: any length) and dtype of named tensors."""
 STEEPEST = 1000.0
-"""Limit of the slope of a surfel's colour, in full scales per cell of the grid."""
+"""Limit of a surfel's colour gradient, in full scales per cell of the grid."""
 SURFACE_KINDS: Kinds = {
     "positions": ((-1, 3), torch.float32),
     "normals": ((-1, 3), torch.float32),
@@ -55,7 +55,7 @@ LANDMARK_KINDS: Kinds = {
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
-    """Return all that a surface consists of, under the names and in the dtypes of ``SURFACE_KINDS`` and ``INDEX_KINDS``."""
+    """Return copies of a surface's tensors, by name and in the dtypes of ``SURFACE_KINDS`` and ``INDEX_KINDS``."""
     parts, index = surface.surfels, surface.index
     found = {
         "positions": parts.positions, "normals": parts.normals, "rgb": parts.rgb, "rgb_gradient": parts.rgb_gradient,
@@ -70,32 +70,32 @@ def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
-    """Return the surface from the tensors that ``surface_tensors`` returned.
+    """Return the surface that ``surface_tensors`` converted to ``tensors``.
 
-    Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
+    Raises ``KeyError`` for a missing tensor, ``ValueError`` for one with the wrong shape, dtype or content.
     """
     check_kinds(tensors, SURFACE_KINDS | INDEX_KINDS)
     count = len(tensors["positions"])
     if any(len(tensors[name]) != count for name in ("normals", "rgb", "rgb_gradient")) or not count:
-        raise ValueError("expected equally many positions, normals and colours of surfels, and at least one")
+        raise ValueError("expected as many normals and colours of surfels as positions, and at least one")
     entries = tensors["entries"]
     if not entries.numel() or not 0 <= int(entries.min()) <= int(entries.max()) < count:
-        raise ValueError(f"entries has indices of surfels that do not exist, expected 0 to {count - 1}")
+        raise ValueError(f"entries refers to surfels that do not exist, expected 0 to {count - 1}")
     if not float(tensors["cell"]) > 0:
-        raise ValueError(f"cell is {float(tensors['cell'])}, expected a length")
+        raise ValueError(f"cell is {float(tensors['cell'])}, expected a positive length")
     check_range(tensors, "positions", -LARGEST_LENGTH, LARGEST_LENGTH)
     check_range(tensors, "rgb", -COLOUR_ROUNDING, 1 + COLOUR_ROUNDING)
     steepest = STEEPEST / float(tensors["cell"])
     check_range(tensors, "rgb_gradient", -steepest, steepest)
     check_unit_length(tensors, "normals")
     if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
-        raise ValueError("no keyframe, or one that is not rigid")
+        raise ValueError("keyframes are missing, or one is not a rigid transform")
     surfels = Surfels(*(tensors[name] for name in ("positions", "normals", "rgb", "rgb_gradient")))
     return SurfaceMap(surfels, _index(tensors), tensors["keyframes"])
 
 
 def check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
-    """Raise ``KeyError`` for a missing tensor, ``ValueError`` for one of another shape or dtype, and for NaN and infinity."""
+    """Raise ``KeyError`` for a missing tensor, ``ValueError`` for a wrong shape or dtype, NaN or infinity."""
     for name, (shape, kind) in kinds.items():
         value = tensors[name]
         fits = len(shape) == value.dim() and all(
@@ -108,7 +108,7 @@ def check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
 
 
 def check_range(tensors: dict[str, Tensor], name: str, least: float, most: float) -> None:
-    """Raise ``ValueError`` for values outside ``least`` to ``most``, from which later computations would overflow."""
+    """Raise ``ValueError`` for values outside ``least`` to ``most``, which would make later computations overflow."""
     value = tensors[name]
     if value.numel() and not (float(value.min()) >= least and float(value.max()) <= most):
         raise ValueError(
@@ -117,27 +117,27 @@ def check_range(tensors: dict[str, Tensor], name: str, least: float, most: float
 
 
 def check_unit_length(tensors: dict[str, Tensor], name: str) -> None:
-    """Raise ``ValueError`` for vectors that are not of unit length up to rounding."""
+    """Raise ``ValueError`` for vectors that are not of unit length, up to rounding."""
     length = torch.linalg.vector_norm(tensors[name], dim=-1)
     if length.numel() and float((length - 1).abs().max()) > 1e-3:
         raise ValueError(f"{name} are not of unit length")
 
 
 def _index(tensors: dict[str, Tensor]) -> SurfelIndex:
-    """Return the index, checked so that no look-up reads outside of it."""
+    """Return the index, after checking that no look-up reads outside it."""
     shape: list[int] = tensors["shape"].tolist()
     if min(shape) < 1 or max(shape) > 2**31:
-        raise ValueError(f"shape is {shape}, expected numbers of cells")
+        raise ValueError(f"shape is {shape}, expected positive numbers of cells")
     (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), shape
     grid = VoxelGrid((x, y, z), float(tensors["cell"]), (nx, ny, nz))
     level, first = tensors["level"], tensors["first"]
     if not block_shape(grid) == tuple(level.shape) == tuple(first.shape):
-        raise ValueError(f"level and first are of other blocks than those of a grid of {shape} cells")
+        raise ValueError(f"level and first do not have the shape of the blocks of a grid of {shape} cells")
     if int(level.max()) > len(COARSER_FROM):
-        raise ValueError(f"level is up to {int(level.max())}, expected {len(COARSER_FROM)} at most")
+        raise ValueError(f"level has a maximum of {int(level.max())}, expected at most {len(COARSER_FROM)}")
     ends = first.long() + (CELLS_OF_BLOCK >> 3 * level.long())
     if int(first.min()) < 0 or int(ends.max()) > len(tensors["entries"]):
-        raise ValueError("first names entries that do not exist")
+        raise ValueError("first refers to entries that do not exist")
     return SurfelIndex(grid, first, level, tensors["entries"])
 
 
@@ -149,9 +149,9 @@ def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
 
 
 def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
-    """Return the landmarks from the tensors that ``landmark_tensors`` returned.
+    """Return the landmarks that ``landmark_tensors`` converted to ``tensors``.
 
-    Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
+    Raises ``KeyError`` for a missing tensor, ``ValueError`` for one with the wrong shape, dtype or content.
     """
     check_kinds(tensors, LANDMARK_KINDS)
     _check_contents(tensors)
@@ -176,10 +176,10 @@ def _check_contents(tensors: dict[str, Tensor]) -> None:
     if not float(tensors["usual_matches"]) >= 0:
         raise ValueError(f"usual_matches is {float(tensors['usual_matches'])}, expected 0 or more")
     if not 0 <= float(tensors["moving"]) <= 1:
-        raise ValueError(f"moving is {float(tensors['moving'])}, expected a share of the images")
+        raise ValueError(f"moving is {float(tensors['moving'])}, expected a fraction of the images, 0 to 1")
     if not bool((tensors["calibration_scatter"] > 0).all()):
         raise ValueError(
-            f"calibration_scatter is {tensors['calibration_scatter'].tolist()}, expected positive"
+            f"calibration_scatter is {tensors['calibration_scatter'].tolist()}, expected positive values"
         )
     check_range(tensors, "positions", -LARGEST_LENGTH, LARGEST_LENGTH)
     check_range(tensors, "deviations", 0.0, LARGEST_LENGTH)

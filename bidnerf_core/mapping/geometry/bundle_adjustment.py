@@ -1,7 +1,8 @@
-"""Bundle adjustment: estimate the poses of images and the points that they show together (Triggs et al. 2000).
+"""Bundle adjustment: jointly estimate the poses of images and the points that they observe (Triggs et al. 2000).
 
-The given poses are a prior, which also fixes what the images leave free: the position, orientation and scale of everything. The motions of the cameras while the rows of their images are exposed may be estimated too (Hedborg et al.,
-Rolling shutter bundle adjustment, CVPR 2012). Robust Levenberg-Marquardt; the points are eliminated by the Schur complement.
+The given poses are a prior, which also fixes the gauge: position, orientation and scale. The motion of each camera during its
+rolling shutter's readout may be estimated too (Hedborg et al., Rolling shutter bundle adjustment, CVPR 2012). The solver is
+robust Levenberg-Marquardt, with the points eliminated by the Schur complement.
 """
 
 from __future__ import annotations
@@ -22,31 +23,32 @@ from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.geometry.projection import by_update, projected
 
 ADJUSTMENT_STEPS = 30
-"""Largest number of steps; from poses that are off by a few pixels, about ten suffice."""
+"""Maximum number of steps; from poses that are off by a few pixels, about ten suffice."""
 SMALL_DECREASE = 1e-4
 """Relative decrease of the cost below which the iteration has converged."""
 LARGEST_DAMPING = 1e6
 """Damping (relative to the diagonal) beyond which no smaller step is tried."""
 RESIDUAL_SCALE, PRIOR_SCALE = 2.0, 5.0
-"""Scales of the Cauchy losses in standard deviations: that of a sighting, and that of a pose, which has six components. A pose that is plainly wrong is hardly held by its prior.
+"""Scales of the Cauchy losses of an observation and of a pose (six components), in standard deviations. The prior hardly
+constrains a pose that is plainly wrong.
 """
 ALMOST_SINGULAR = 1e-9
-"""Damping, relative to the mean diagonal, which makes the blocks of points without parallax invertible."""
+"""Damping relative to the mean diagonal, which makes the blocks of points without parallax invertible."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The given poses and how far off they are: independent of each other, along all axes alike."""
+    """The given poses and their errors, which are independent and isotropic."""
 
     T_world_camera: SE3  # (v), float64
     translation: float  # metres: standard deviation along each axis
     rotation: float  # radians: standard deviation about each axis
-    motion: MotionPrior = STILL  # how far the cameras may have moved while the rows of an image were exposed
+    motion: MotionPrior = STILL  # how far the cameras may have moved during the readout of an image
 
 
 @dataclass(frozen=True, eq=False)
 class Adjustment:
-    """Poses, points and motions that fit the sightings best."""
+    """Poses, points and camera motions that fit the observations best."""
 
     T_world_camera: SE3  # (v), of the middle rows
     points: Float[Tensor, "n 3"]  # metres, world
@@ -62,11 +64,11 @@ def adjusted(
     correlation: float = 1.0,
     tolerance: float = SMALL_DECREASE,
 ) -> Adjustment:
-    """Minimize the robust reprojection error plus the prior, starting from ``start``; poses in ``sightings`` are ignored.
+    """Minimize the robust reprojection error plus the prior from ``start``; the poses in ``sightings`` are ignored.
 
-    ``noise`` is the standard deviation of a sighting along each axis (pixels), and ``correlation`` the number of sightings that
-    count as one, because their errors are correlated. Images without sightings keep their given poses. ``tolerance`` is the
-    relative decrease of the cost that ends the iteration. Motions stay where they are if ``prior`` leaves none free.
+    ``noise`` is the standard deviation of an observation along each axis (pixels), and ``correlation`` the number of
+    observations that count as one because their errors are correlated. Images without observations keep their given poses.
+    The iteration ends at a relative decrease of the cost below ``tolerance``. Motions stay fixed unless ``prior`` frees them.
     """
     state, damping = start, 1e-4
     system = linearized(sightings, state, prior, noise, correlation)
@@ -96,7 +98,7 @@ def _retracted(
 class AdjustmentSystem:
     """Normal equations of images and points, in blocks.
 
-    An image has six unknowns, the right update of its pose (translation first), or twelve, with its motion.
+    An image has six unknowns, the right update of its pose (translation first), or twelve if its motion is estimated too.
     """
 
     cost: float
@@ -125,7 +127,7 @@ class AdjustmentSystem:
         return torch.from_numpy(of_images).reshape_as(self.image_gradient), of_points
 
     def _sparse(self, blocks: Float[Tensor, "m k 3"]) -> bsr_array:
-        """Return the matrix (k v, 3 n) of the sightings' blocks."""
+        """Return the sparse matrix (k v, 3 n) with the observations' blocks."""
         order = torch.argsort(self.image, stable=True)
         rows, columns = len(self.image_gradient), len(self.point_gradient)
         ends = np.concatenate([[0], torch.bincount(self.image, minlength=rows).cumsum(0).numpy()])
@@ -136,7 +138,7 @@ class AdjustmentSystem:
 def linearized(
     sightings: Sightings, state: Adjustment, prior: PosePrior, noise: float, correlation: float = 1.0
 ) -> AdjustmentSystem:
-    """Return the normal equations about a state, with weights of iteratively reweighted least squares."""
+    """Return the normal equations about a state, with the weights of iteratively reweighted least squares."""
     view, point, times = sightings.view, sightings.point, sightings.exposure_times
     T = state.T_world_camera[view]
     if bool(state.motion.any()):
@@ -153,7 +155,7 @@ def linearized(
     by_view = torch.from_numpy(by_update(by_local, local))
     by_point = torch.from_numpy(by_local) @ rotation
     if prior.motion != STILL:
-        # To first order in the motion, an update of the pose of the middle row is one of the pose at any other row.
+        # To first order in the motion, an update of the middle row's pose updates the pose of any other row alike.
         by_view = torch.cat([by_view, times[:, None, None] * by_view], dim=-1)
     views, count = len(state.motion), len(state.points)
     view_weighted, point_weighted = (by.mT * weight[:, None, None] for by in (by_view, by_point))
@@ -177,8 +179,8 @@ class _PriorTerm:
 
 
 def _prior_term(state: Adjustment, prior: PosePrior) -> _PriorTerm:
-    """Return the prior's part: the distances from the given poses in standard deviations, under a Cauchy loss, and the
-    motions under a quadratic one.
+    """Return the prior term: the deviations from the given poses under a Cauchy loss, and the motions under a quadratic
+    loss, in standard deviations.
     """
     given, T = prior.T_world_camera, state.T_world_camera
     away = (T.rotation.mT @ (T.translation - given.translation)[..., None])[..., 0]  # camera

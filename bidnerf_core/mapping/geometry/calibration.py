@@ -1,4 +1,4 @@
-"""Corrections of a camera's intrinsics, and how uncertain intrinsics are."""
+"""Corrections to a camera's intrinsics, and priors on them."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from bidnerf_core.errors import enumeration
 
 PRINCIPAL_POINT = "a principal point "
 STRETCH_TOLERANCE = 0.02
-"""Largest stretch, as a logarithm, that errors of lenses and landmarks bring about; with a larger one, an image was resized."""
+"""Largest stretch (logarithm) that lens and landmark errors produce; beyond it, the image was resized."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A correction of given intrinsics, which may be estimated along with the pose."""
+    """A correction to given intrinsics, which may be estimated along with the pose."""
 
     log_focal: float = 0.0  # logarithm of the ratio of the true to the given focal length
     shift_u: float = 0.0  # of the principal point, as a share of the given focal length
     shift_v: float = 0.0
     radial: float = 0.0  # first coefficient of radial distortion, added to the given distortion
     log_stretch: float = (
-        0.0  # logarithm of the ratio of fx to fy over that of the given ones: resized to another shape
+        0.0  # logarithm of the true fx / fy over the given fx / fy; not 0 if resized to another aspect ratio
     )
 
     @property
     def focal_factor(self) -> float:
-        """The true over the given focal length; for a stretched image, the geometric mean of both directions."""
+        """Ratio of the true to the given focal length; for a stretched image, the geometric mean of both axes."""
         return math.exp(self.log_focal)
 
     @property
@@ -52,13 +52,13 @@ class Calibration:
         )  # fmt: skip
 
     def pixels(self, flat: Float[Tensor, "m 2"], focal: float) -> Float[Tensor, "m 2"]:
-        """Return where points on the plane z = 1 appear: pixels from the given principal point, at the given focal length."""
+        """Return the projections of points on the plane z = 1, in pixels from the given principal point."""
         bent = flat * (1 + self.radial * flat.square().sum(-1, keepdim=True))
         shift = torch.tensor([self.shift_u, self.shift_v], dtype=flat.dtype)
         return (bent * self.across_and_down.to(flat.dtype) + shift) * focal
 
     def undistorted(self, image: Float[Tensor, "m 2"], focal: Float[Tensor, "m"]) -> Float[Tensor, "m 2"]:
-        """Return corrected observations on the plane z = 1, for observations made with the given intrinsics."""
+        """Convert observations on the plane z = 1 from the given intrinsics to the corrected ones."""
         shift = torch.tensor([self.shift_u, self.shift_v], dtype=image.dtype)
         seen = (image - shift) / self.across_and_down.to(image.dtype)
         flat = seen
@@ -73,9 +73,9 @@ class Calibration:
 
     @property
     def _focal_beside_stretch(self) -> float:
-        """What a stretch leaves of the change of the focal length (logarithm).
+        """Logarithm of the change of focal length that remains after a stretch.
 
-        An image that was resized in one direction keeps its focal length in the other, so the least change is the most probable.
+        An image resized along one axis keeps its focal length along the other, so the smallest change is the most probable.
         """
         if not self.is_stretched:
             return self.log_focal
@@ -83,7 +83,7 @@ class Calibration:
 
     @property
     def sentence(self) -> str:
-        """The considerable parts of the correction, in words."""
+        """The significant parts of the correction, as a phrase."""
         return (
             f"{enumeration(self.considerable)} than given"
             if self.considerable
@@ -92,7 +92,7 @@ class Calibration:
 
     @property
     def considerable(self) -> list[str]:
-        """The parts of the correction that are larger than errors of a good calibration, in words."""
+        """Phrases for the parts of the correction that exceed the errors of a good calibration."""
         values = [self._focal_beside_stretch, *astuple(self)[1:]]
         sizes = torch.tensor(values, dtype=torch.float64).abs() / CALIBRATED.deviations
         large = [*(sizes[:4] > 2).tolist(), self.is_stretched]
@@ -104,7 +104,7 @@ class Calibration:
 
     @property
     def parts(self) -> tuple[str, str, str, str, str]:
-        """Each part of the correction in words, in the order of the fields."""
+        """A phrase for each part of the correction, in the order of the fields."""
         longer, right, down, higher, wider = (
             word if value >= 0 else opposite
             for value, word, opposite in (
@@ -125,12 +125,12 @@ class Calibration:
 
 
 GIVEN = Calibration()
-"""Intrinsics as they are given."""
+"""No correction: the intrinsics as given."""
 
 
 @dataclass(frozen=True)
 class CalibrationPrior:
-    """Standard deviations of given intrinsics, in the units of ``Calibration``; a parameter with 0 is not estimated."""
+    """Standard deviations of given intrinsics, in the units of ``Calibration``; parameters with 0 are not estimated."""
 
     log_focal: float = 0.0
     shift: float = 0.0
@@ -149,11 +149,11 @@ FIXED = CalibrationPrior()
 CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002, stretch=0.001)
 """Intrinsics from a good calibration."""
 RIGHT = CalibrationPrior(log_focal=0.005, shift=0.005, radial=0.005, stretch=0.001)
-"""Intrinsics that are right as far as is known: most are calibrated well, but some part of a few is not."""
+"""Intrinsics believed to be right: most are well calibrated, but a few are off in some parameter."""
 USUALLY, MISTAKES, CROPS = 0.35, 0.05, 0.02
-"""Shares of cameras whose stated intrinsics are as inexact as usual, wrong, and those of a larger image; others are calibrated."""
+"""Fractions of cameras whose stated intrinsics are as in ``USUAL``, wrong, or from before a crop; the rest are calibrated."""
 USUAL = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01, stretch=0.001)
-"""Intrinsics as many devices state them: of another unit of the model, or at another focus and temperature."""
+"""Intrinsics as many devices state them: from another unit of the model, or at another focus or temperature."""
 MISTAKEN = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05, stretch=0.001)
 """Intrinsics that are wrong."""
 CROPPED = replace(USUAL, shift=0.1)
@@ -161,6 +161,6 @@ CROPPED = replace(USUAL, shift=0.1)
 NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 """Intrinsics from EXIF or a field of view, without distortion."""
 ANY = replace(NOMINAL, shift=CROPPED.shift)
-"""Intrinsics of which nothing is known except that the lens has the usual distortion; the image may be a crop."""
+"""Unknown intrinsics of a lens with ordinary distortion; the image may be a crop."""
 STRETCHED = replace(ANY, stretch=ANY.log_focal)
-"""Intrinsics of which as little is known, of an image that may have been resized to another aspect ratio."""
+"""Unknown intrinsics of an image that may also have been resized to another aspect ratio."""

@@ -1,4 +1,4 @@
-"""A camera's parameters under Gaussian priors, once the pose that follows them is eliminated from the normal equations."""
+"""A camera's parameters under Gaussian priors, with the pose eliminated from the normal equations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bidnerf_core.mapping.geometry.projection import Array
 from bidnerf_core.mapping.geometry.reprojection import RobustEquations, damped_solution
 
 TIED = 1e-9
-"""Standard deviation of parameters that a prior ties to its mean."""
+"""Standard deviation of parameters that a prior fixes at its mean."""
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,10 @@ class Conditional:
     """The most probable unknowns under each of ``k`` priors, and the evidence for the priors."""
 
     log_evidence: Array  # (k,) up to a constant
-    update: Array  # (k, 6) right update of the pose
+    update: Array  # (k, 6) right update of the pose (translation first)
     parameters: Array  # (k, p)
-    covariance: Array  # (k, 6, 6) of the pose, due to the parameters
-    by_fit: Array  # (k, 6, 6) the same with parameters as they appear, see ``EliminatedPose.given``
+    covariance: Array  # (k, 6, 6) part of the pose's covariance due to the parameters
+    by_fit: Array  # (k, 6, 6) the same for the apparent parameters, see ``EliminatedPose.given``
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class EliminatedPose:
     cost: float
     hessian: Array  # (p, p)
     gradient: Array  # (p,)
-    update: Array  # (6,) of the pose, with the parameters as they are
+    update: Array  # (6,) optimal update of the pose with the parameters held at ``here``
     follows: Array  # (6, p) derivative of the best pose with respect to the parameters
 
     @staticmethod
@@ -53,8 +53,8 @@ class EliminatedPose:
     def given(self, mean: Array, deviations: Array, spurious: Array) -> Conditional:
         """Return the unknowns under Gaussian priors, ``mean`` and ``deviations`` (k, p), and the evidence for each.
 
-        What the observations seem to say of the parameters has errors with the standard deviations ``spurious`` (p,): the
-        parameters as they appear have those besides the prior's. The evidence is that of Laplace's approximation.
+        ``spurious`` (p,) are standard deviations of systematic errors in the parameters that the observations suggest: the
+        apparent parameters scatter by them in addition to the prior. The evidence is in Laplace's approximation.
         """
         deviations = np.maximum(deviations, TIED)
         total = np.hypot(deviations, spurious)
@@ -78,6 +78,6 @@ class EliminatedPose:
         )  # fmt: skip
 
     def spread(self, variance: Array) -> Array:
-        """Return the covariance (k, 6, 6) of the pose that follows parameters with a ``variance`` (k, p, p)."""
+        """Propagate the covariance of the parameters, ``variance`` (k, p, p), to the pose: (k, 6, 6)."""
         found: Array = self.follows @ variance @ self.follows.T
         return (found + np.swapaxes(found, -1, -2)) / 2

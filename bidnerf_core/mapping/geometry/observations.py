@@ -1,4 +1,4 @@
-"""Observations of points: by the cameras of a rig whose pose is sought, and by posed cameras of which the points are."""
+"""Observations of points: of known points by a rig of unknown pose, and of unknown points by posed cameras."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from bidnerf_core.mapping.geometry.projection import NEAREST, reprojection_error
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoints:
-    """Points of the world and their observations by the cameras of a rig. Float64."""
+    """World points and their observations by the cameras of a rig. Float64."""
 
     points: Float[Tensor, "m 3"]  # metres, world
-    deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
+    deviations: Float[
+        Tensor, "m 2"
+    ]  # metres: standard deviations of the points across and along ``directions``
     directions: Float[Tensor, "m 3"]  # unit, world
     image: Float[Tensor, "m 2"]  # observed, on the plane z = 1 of the camera
     focal: Float[Tensor, "m"]  # pixels
@@ -27,7 +29,7 @@ class ObservedPoints:
     rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
     translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
     exposure_times: Float[Tensor, "m"]  # see the function ``exposure_times``
-    transposed_exposure_times: Float[Tensor, "m"]  # the same if the rows run along the other axis
+    transposed_exposure_times: Float[Tensor, "m"]  # the same for a shutter that rolls along the other axis
 
     def __len__(self) -> int:
         return len(self.points)
@@ -36,12 +38,12 @@ class ObservedPoints:
         return ObservedPoints(*(getattr(self, name)[index] for name in (f.name for f in fields(self))))
 
     def corrected(self, calibration: Calibration) -> ObservedPoints:
-        """Return the same pixels as observations of cameras whose calibration is corrected."""
+        """Return the observations with the cameras' calibration corrected."""
         undistorted = calibration.undistorted(self.image, self.focal)
         return replace(self, image=undistorted, focal=self.focal * calibration.focal_factor)
 
     def without_motion(self, T_world_rig: SE3, motion: Float[Tensor, "6"]) -> ObservedPoints:
-        """Return the points displaced so that a camera at rest at this pose observes them where the moving one did."""
+        """Return the points displaced so that a static camera at this pose observes them where the moving one did."""
         if not bool(motion.any()):
             return self
         rig = T_world_rig.inverse().apply(self.points)
@@ -57,12 +59,12 @@ class ObservedPoints:
         return reprojection_errors(self.in_camera(T_world_rig), self.image, self.focal)
 
     def normalized_residuals(self, T_world_rig: SE3, noise: float) -> Float[Tensor, "m 2"]:
-        """Return the residuals in standard deviations, which combine the keypoints' ``noise`` (pixels) with the points'."""
+        """Return the residuals in standard deviations, from the keypoints' ``noise`` (pixels) and the points' errors."""
         deviation = (noise**2 + self.point_variance(T_world_rig)).sqrt()
         return self.residuals(T_world_rig) / deviation[:, None]
 
     def point_variance(self, T_world_rig: SE3) -> Float[Tensor, "m"]:
-        """Return the variance (square pixels) that the points' own errors add to each residual, averaged over both axes.
+        """Return the variance (square pixels) that the points' errors add to each residual, averaged over both axes.
 
         Along the axis perpendicular to both the line of sight and ``directions``, this is the point's variance across. Along the
         other axis it is a mixture of the variances across and along, by the squared cosine and sine of the angle between the
@@ -81,12 +83,12 @@ class ObservedPoints:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Observations of numbered points by numbered images whose poses are known. Float64."""
+    """Observations of points by images with known poses, both by number. Float64."""
 
     point: Int[Tensor, "m"]
     view: Int[Tensor, "m"]  # number of the image
     rotation: Float[Tensor, "m 3 3"]  # R_camera_world, when the observation's row was exposed
-    centre: Float[Tensor, "m 3"]  # of the camera then, metres, world
+    centre: Float[Tensor, "m 3"]  # of the camera at that time, metres, world
     image: Float[Tensor, "m 2"]  # on the plane z = 1 of the camera
     focal: Float[Tensor, "m"]  # pixels; residuals are multiplied by it
     exposure_times: Float[Tensor, "m"]  # see the function ``exposure_times``

@@ -1,4 +1,4 @@
-"""The pinhole projection of points, with its derivatives: one for resection, triangulation and bundle adjustment."""
+"""Pinhole projection of points and its derivatives, for resection, triangulation and bundle adjustment."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 Array = np.ndarray
 
 NEAREST = 1e-9
-"""Depth (metres) up to which a point counts as behind the camera."""
+"""Depth (metres) below which a point counts as behind the camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
     """Points in the frames of their cameras, projected onto the plane z = 1."""
 
-    front: Array  # (m,) whether the point is in front of its camera; the rest means nothing if it is not
+    front: Array  # (m,) whether the point is in front of its camera; if not, the other fields are meaningless
     flat: Array  # (m, 2) on the plane z = 1
     z: Array  # (m,) metres; 1 behind the camera
 
@@ -51,7 +51,7 @@ def reprojection_errors(
 
 
 def by_update(by_point: Array, points: Array) -> Array:
-    """Return derivatives (m, k, 6) with respect to a right update of a pose (translation first), for those by the points.
+    """Return derivatives (m, k, 6) with respect to a right update of a pose (translation first), given those by the points.
 
     ``points`` (m, 3) are given in the frame of that pose. A point there moves by -rho + p x phi under T exp(rho, phi), and
     r (p x phi) = (r x p) phi.
@@ -60,6 +60,6 @@ def by_update(by_point: Array, points: Array) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return ``np.cross`` along the last axis; NumPy's takes five times as long for small arrays."""
+    """Return the cross product along the last axis; ``np.cross`` takes five times as long for small arrays."""
     (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)

@@ -21,27 +21,29 @@ from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.projection import Array, by_update, projected
 
 SCALE = 2.0
-"""Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""
+"""Scale of the Cauchy loss: the residual, in standard deviations, at which the weight is one half."""
 BEHIND = 30.0
 """Residual of a point behind the camera, in standard deviations; its weight is 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobustEquations:
-    """A robust cost at some values of the unknowns, with its derivatives."""
+    """A robust cost and its derivatives at given values of the unknowns."""
 
     cost: float
     gradient: Array  # (p,)
     hessian: Array  # (p, p)
-    curvature: Array  # (p, p) of the robust cost itself; the Hessian is that of the reweighted squares
-    spread: float  # robust standard deviation of the normalized residuals: 1 where the noise is right
-    single: Array  # (m, p) gradients of the cost of single observations
+    curvature: (
+        Array  # (p, p) Hessian of the robust cost itself; ``hessian`` is that of the reweighted squares
+    )
+    spread: float  # robust standard deviation of the normalized residuals: 1 if the noise is right
+    single: Array  # (m, p) gradients of the individual observations' costs
     excess: float  # variance of a residual's gradient over its curvature: 1 for a Gaussian likelihood
-    count: float  # of residuals, those with correlated errors counted as one
-    prior: Array  # (p, p) information of priors
+    count: float  # effective number of residuals, given that their errors are correlated
+    prior: Array  # (p, p) information matrix of the priors
 
     def weighted(self, share: float) -> RobustEquations:
-        """Return the equations of observations of which one counts as ``share``, because their errors are correlated."""
+        """Return the equations with each observation weighted by ``share``, because their errors are correlated."""
         return replace(
             self, cost=share * self.cost, gradient=share * self.gradient, hessian=share * self.hessian,
             curvature=share * self.curvature, count=share * self.count,
@@ -64,9 +66,9 @@ class RobustEquations:
     def covariance(self) -> Array:
         """The covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3).
 
-        The scatter of few gradients is much too small in some direction. It is drawn towards that of residuals with the same
-        distribution, the more so the fewer residuals there are for its entries (Ledoit and Wolf 2004). The
-        residuals have as many fewer degrees of freedom as there are unknowns.
+        The scatter of a few gradients is far too small in some directions. It is shrunk towards the scatter of identically
+        distributed residuals, more strongly the fewer residuals there are per entry (Ledoit and Wolf 2004). The number of
+        degrees of freedom is the number of residuals less the unknowns.
         """
         inverse, unknowns = self.inverse_curvature, len(self.gradient)
         alike = unknowns**2 / (unknowns**2 + self.count)
@@ -79,7 +81,7 @@ class RobustEquations:
     def covariance_by_last(self, first: int) -> Array:
         """Return the part (6, 6) of the pose's covariance that is due to the unknowns from number ``first`` on.
 
-        The pose is that of the first six unknowns. All before ``first`` adapt to the others.
+        The pose is the first six unknowns. All unknowns before ``first`` adapt to the others.
         """
         before, after = self.hessian[:first, :first], self.hessian[:first, first:]
         adapt = -damped_solution(before, 1e-9, after)[:6]
@@ -94,7 +96,7 @@ class RobustEquations:
         values, vectors = np.linalg.eigh(unit[:, None] * self.curvature * unit)
         least = 0.2 * np.linalg.eigvalsh(unit[:, None] * self.hessian * unit)
         inverse = vectors @ np.diag(1 / np.maximum(values, least).clip(min=1e-12)) @ vectors.T
-        # What the residuals do not determine at all overflows, so the covariance is not finite.
+        # Directions that the residuals do not determine overflow, so the covariance is not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             found: Array = unit[:, None] * inverse * unit
             return found
@@ -108,7 +110,7 @@ def damped_solution(hessian: Array, damping: float, right: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The unknowns: the rig's pose, and the parameters of its camera that may be estimated along with it."""
+    """The unknowns: the rig's pose, and the camera parameters that may be estimated along with it."""
 
     rotation: Array  # (3, 3) R_world_rig
     position: Array  # (3,) metres
@@ -130,10 +132,10 @@ class State:
         return torch.from_numpy(self.camera[5:].copy())
 
     def retracted(self, step: Array, free: Array) -> State:
-        """Return the state after a step of the pose and of the ``free`` ones among the parameters of the camera."""
+        """Return the state after a step of the pose and of the ``free`` camera parameters."""
         camera = self.camera.copy()
         camera[free] += step[6:]
-        # To first order, moving along the camera's axes equals the exponential map's translation.
+        # To first order, a translation along the camera's axes equals that of the exponential map.
         position = self.position + self.rotation @ step[:3]
         return State(self.rotation @ rotation_matrix(step[3:6]), position, camera)
 
@@ -143,7 +145,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class LinearizedErrors:
-    """Reprojection errors in pixels about a state; they do not depend on the noise, which may change without them."""
+    """Reprojection errors in pixels, linearized about a state; they do not depend on the noise."""
 
     state: State
     front: Array  # (m,) whether the point is in front of the camera
@@ -164,13 +166,13 @@ class ReprojectionErrors:
         self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
 
     def exposed_at(self, times: Float[Tensor, "m"]) -> ReprojectionErrors:
-        """Return the errors of the same observations with other times of exposure."""
+        """Return the errors of the same observations with other exposure times."""
         found = copy.copy(self)
         found._exposure_times = times.numpy()
         return found
 
     def linearized(self, state: State, free: Array) -> LinearizedErrors:
-        """Return the errors at a state, and their Jacobian with respect to the pose and the camera's ``free`` parameters."""
+        """Return the errors at a state and their Jacobian with respect to the pose and the ``free`` camera parameters."""
         rig = (self._points - state.position) @ state.rotation
         motion = state.camera[5:]
         if motion.any():
@@ -201,7 +203,7 @@ class ReprojectionErrors:
         return LinearizedErrors(state, seen.front, off, jacobian)
 
     def system(self, here: LinearizedErrors, noise: float) -> RobustEquations:
-        """Return the normal equations for keypoints of this noise (pixels)."""
+        """Return the normal equations for keypoints with this noise (pixels)."""
         deviation = np.sqrt(noise**2 + self._variance)[:, None]
         residual = np.where(here.front[:, None], here.off / deviation, BEHIND)
         squared = (residual**2).sum(1)

@@ -1,7 +1,7 @@
 """Resection: estimate the pose of a camera or a rig from known points, by robust Levenberg-Marquardt in pixels.
 
-The calibration of the camera, and its motion while the rows of a rolling shutter are exposed, may be estimated along with
-the pose, as far as priors leave them open. The general solver on batches of poses is ``localization/solvers/levenberg_marquardt``.
+The camera's calibration, and its motion during a rolling shutter's readout, may be estimated along with the pose, under priors.
+The general solver for batches of poses is ``localization/solvers/levenberg_marquardt``.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from bidnerf_core.mapping.geometry.reprojection import (
 )
 
 RESECTION_STEPS = 20
-"""Largest number of steps; from a good start, four or five suffice."""
+"""Maximum number of steps; from a good start, four or five suffice."""
 SMALL_STEP = 1e-4
-"""Squared length of a step, in standard deviations of the unknowns, below which the iteration has converged."""
+"""Squared length of a step, in standard deviations of the unknowns, at which the iteration has converged."""
 NOISE_TOLERANCE = 0.01
-"""Relative change of the estimated noise below which it has converged."""
+"""Relative change of the estimated noise at which it has converged."""
 LEAST_NOISE = 0.05
-"""Lower limit of the estimated noise, pixels: no detector is more accurate."""
+"""Lower limit of the estimated noise (pixels): no detector is more accurate."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReprojectionFit:
-    """A pose with its uncertainty, and the calibration and the motion that were estimated with it."""
+    """An estimated pose with its covariance, and the calibration and motion estimated along with it."""
 
     T_world_rig: SE3
     calibration: Calibration
     motion: Float[Tensor, "6"]  # from the first row of the image to the last, see ``rolling_shutter``
     noise: float  # pixels: robust standard deviation of a residual along each axis
-    # Of the right update (translation, rotation), with the uncertainty of the calibration and of the motion.
+    # Covariance of the right update (translation, rotation), including uncertainty of the calibration and the motion.
     covariance: Float[Tensor, "6 6"]
     calibration_deviations: Float[Tensor, "5"]  # standard deviations, in the order of ``Calibration``
     system: RobustEquations  # at the minimum
@@ -53,26 +53,26 @@ class ReprojectionFit:
 
     @cached_property
     def covariance_by_motion(self) -> Float[Tensor, "6 6"]:
-        """The part of the pose's covariance due to the motion, to which the other unknowns adapt."""
+        """The part of the pose's covariance that is due to the motion, to which the other unknowns adapt."""
         return torch.from_numpy(self.system.covariance_by_last(self.first_of_motion))
 
     @cached_property
     def motion_posterior(self) -> Float[Tensor, "k k"]:
-        """The covariance of the motion, from the curvature of the cost; 0x0 for a camera at rest."""
+        """The covariance of the motion, from the curvature of the cost; 0x0 for a static camera."""
         first = self.first_of_motion
         return torch.from_numpy(self.system.inverse_curvature[first:, first:].copy())
 
     def log_occam_factor(self, prior: MotionPrior) -> float:
-        """Return the logarithm of the Occam factor of an estimated motion: how much the observations narrow its prior.
+        """Return the log Occam factor of an estimated motion: how much the observations narrow its prior.
 
-        The likelihood of the fit times this factor is the evidence for a motion (MacKay 2003, ch. 28), in Laplace's
-        approximation; the evidence for no motion is the likelihood of the fit without one.
+        In Laplace's approximation, the evidence for a motion is the likelihood of the fit times this factor (MacKay 2003,
+        ch. 28); the evidence for a static camera is the likelihood of the fit without motion.
         """
         narrowed = self.motion_posterior / torch.outer(prior.deviations, prior.deviations)
         return 0.5 * (float(torch.logdet(narrowed)) - self.motion_in_deviations(prior))
 
     def motion_in_deviations(self, prior: MotionPrior) -> float:
-        """Return the squared size of the motion, in standard deviations of its prior."""
+        """Return the squared norm of the motion, in standard deviations of its prior."""
         return float((self.motion / prior.deviations).square().sum())
 
 
@@ -85,12 +85,12 @@ def resect(
     correlation: float = 1.0,
     motion: MotionPrior = STILL,
 ) -> ReprojectionFit:
-    """Minimize the Cauchy loss of the reprojection errors, in standard deviations of keypoint and landmark together.
+    """Minimize the Cauchy loss of the reprojection errors, normalized by the noise of keypoints and landmarks.
 
     ``noise`` is a first guess at the keypoints' noise (pixels), which is re-estimated after every accepted step until it
-    settles. ``calibration`` is where its estimation starts; parameters that ``prior`` leaves out stay there.
-    ``correlation`` is the number of observations that count as one, because their errors are correlated: it weighs them
-    against the priors and scales the covariance. ``motion``: how far the camera may have moved while its rows were exposed.
+    converges. ``calibration`` is the initial value; parameters that ``prior`` does not free keep it. ``correlation`` is the
+    number of observations that count as one because their errors are correlated: it weights them against the priors and
+    scales the covariance. ``motion`` is the prior on the camera's motion during the readout.
     """
     errors = ReprojectionErrors(data, start)
     deviations = torch.cat([prior.deviations, motion.deviations]).numpy()
@@ -114,11 +114,11 @@ def minimized(
     known_noise: bool = False,
     steps: int = RESECTION_STEPS,
 ) -> tuple[LinearizedErrors, RobustEquations, float]:
-    """Minimize the robust cost with a prior about zero on the parameters of the camera.
+    """Minimize the robust cost with a zero-mean prior on the camera parameters.
 
-    Returns the errors at the minimum, the equations there with the prior, and the noise (pixels). ``deviations`` (11,): those of
-    the prior; parameters with 0 stay where ``start`` has them. Unless the noise is known, it is estimated too, as in ``resect``.
-    ``steps``: how many are taken at most.
+    ``deviations`` (11,) are the prior's; parameters with 0 keep their values of ``start``. Unless the noise is known, it is
+    estimated too, as in ``resect``. At most ``steps`` steps are taken. Returns the errors at the minimum, the equations there
+    including the prior, and the noise (pixels).
     """
     free = deviations.nonzero()[0]
 
@@ -151,10 +151,10 @@ def minimized(
 def log_likelihood_ratio(
     data: ObservedPoints, fit: ReprojectionFit, other: ReprojectionFit, correlation: float = 1.0
 ) -> float:
-    """Return the logarithm of the likelihood ratio of the observations, with one fit to them over another.
+    """Return the log-likelihood ratio of the observations under ``fit`` over ``other``.
 
-    Both are compared by the loss of ``resect``, with the deviations of the fit with less noise, which is the better
-    explanation: those of points depend on the pose, and larger ones would make large residuals more likely at no cost.
+    Both are evaluated by the loss of ``resect``, with the standard deviations of the fit with less noise: the points'
+    deviations depend on the pose, and a worse fit's larger ones would make its large residuals more likely at no cost.
     """
     better = min(fit, other, key=lambda fit: fit.noise)
     errors = ReprojectionErrors(data, better.T_world_rig)
@@ -169,7 +169,7 @@ def log_motion_evidence(
     motion: MotionPrior,
     correlation: float,
 ) -> float:
-    """Return the logarithm of the Bayes factor of a motion against none."""
+    """Return the log Bayes factor of a moving over a static camera."""
     return log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
 
 

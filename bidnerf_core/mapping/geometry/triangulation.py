@@ -11,13 +11,13 @@ from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.geometry.projection import projected
 
 TRIANGULATION_STEPS = 8
-"""Number of Gauss-Newton steps; from the linear solution, four or five are enough."""
+"""Number of Gauss-Newton steps; from the linear solution, four or five suffice."""
 DAMPING = 1e-6
 """Damping relative to the mean diagonal, which keeps the equations solvable for rays without parallax."""
 
 
 def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
-    """Return, for each of ``count`` points, the point nearest to all its rays, by linear least squares."""
+    """Return the point nearest to all rays of each of ``count`` points (metres, world), by linear least squares."""
     d = sightings.directions()
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
     matrix = _summed(across, sightings.point, count)
@@ -30,7 +30,7 @@ def refined_points(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels.
 
-    Returns the points and the inverses of their normal matrices, which are the covariances for a noise of one pixel.
+    Returns the points and their covariances for a noise of one pixel (the inverses of their normal matrices).
     """
     for _ in range(TRIANGULATION_STEPS):
         matrix, gradient = _normal_equations(sightings, points, scale)
@@ -68,12 +68,12 @@ def observations_per_point(sightings: Sightings, count: int) -> Int[Tensor, "n"]
 
 
 def fitting(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Return which observations lie within ``tolerance`` pixels of the projection of their point."""
+    """Return a mask of the observations within ``tolerance`` pixels of the projection of their point."""
     return torch.linalg.vector_norm(sightings.residuals(points), dim=-1) <= tolerance
 
 
 def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
-    """Return a robust standard deviation of observations along each axis (pixels), corrected for the points being fitted."""
+    """Return a robust standard deviation of the observations along each axis (pixels), corrected for the fitted points."""
     if not len(sightings):
         return 1.0
     seen = observations_per_point(sightings, len(points))

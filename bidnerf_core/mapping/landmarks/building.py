@@ -1,4 +1,4 @@
-"""Building landmarks: match the keypoints of posed images, join them into tracks, and triangulate or place them by depth."""
+"""Building landmarks: match the keypoints of posed images, join them into tracks, and triangulate or back-project them."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ from bidnerf_core.registry import PluginError
 from bidnerf_core.settings import Above, Range, Settings
 
 LEAST_VISIBLE_POINTS = 20
-"""Least number of points from which the pose of an image is estimated."""
+"""Minimum number of points from which the pose of an image is estimated."""
 ENOUGH_IMAGES = 8
-"""Least number of images from which the 6x6 covariance is estimated."""
+"""Minimum number of images from which the 6x6 covariance is estimated."""
 WEIGHT_ROUNDS = 10
-"""Number of rounds of reweighting; after five, the weights hardly change."""
+"""Number of reweighting iterations; after five, the weights hardly change."""
 _Item = TypeVar("_Item")
 Result = TypeVar("Result")
 TOLERANCES = (10.0, 4.0, 2.0)
@@ -69,9 +69,9 @@ def pose_scatter(
 ) -> Float[Tensor, "6 6"]:
     """Return the covariance of the right updates from given to resected poses; zero if there are too few images.
 
-    ``noise`` is that of the keypoints, pixels. An image also helped to triangulate the points that it is resected from, so that
-    the variance of its pose is underestimated: with k views of a point it is 1 - 1/k of the true variance, against 1 + 1/k for a
-    new image. The updates are rescaled accordingly.
+    ``noise`` is that of the keypoints (pixels). The points from which an image is resected were triangulated from it as well,
+    so its pose scatters too little: with k views of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image.
+    The updates are rescaled accordingly.
     """
     return update_scatter(list(pose_updates(tracked, positions, noise).values()))
 
@@ -87,7 +87,7 @@ def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor
 def pose_updates(
     tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], noise: float
 ) -> dict[int, Float[Tensor, "6"]]:
-    """Return the right updates from given to resected poses of the images with enough points, by number of the image.
+    """Return the right updates from given to resected poses, by image number, for images with enough points.
 
     They are corrected for each image's influence on its points, see ``pose_scatter``.
     """
@@ -105,7 +105,7 @@ def pose_updates(
 
 
 def observed_at_rest(sightings: Sightings, positions: Float[Tensor, "n 3"], T: SE3) -> ObservedPoints:
-    """Return the points displaced so that a camera at rest at the pose ``T`` observes them where the moving one did."""
+    """Return the points displaced so that a static camera at ``T`` observes them where the moving one did."""
     count = len(sightings)
     zeros = torch.zeros((count, 3), dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
@@ -118,8 +118,8 @@ def observed_at_rest(sightings: Sightings, positions: Float[Tensor, "n 3"], T: S
 def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
     """Return an M-estimate of the covariance about zero (Maronna 1976).
 
-    Weights bound the influence of each value. The scale is such that half of the squared Mahalanobis distances are below the
-    median of the chi-squared distribution.
+    Weights bound the influence of each value. The scale makes the median of the squared Mahalanobis distances that of the
+    chi-squared distribution.
     """
     channels = values.shape[1]
     scale = values.square().median(0).values.clamp(min=1e-30)
@@ -136,13 +136,13 @@ def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
 
 @dataclass(frozen=True)
 class LandmarkConfig(Settings):
-    """Settings of building landmarks."""
+    """Settings for building landmarks."""
 
-    neighbours: Annotated[int, Range(1, 1000)] = 8  # number of images that each image is matched with
-    # least angle between the rays of a point, degrees; below it, measured depth places the point
+    neighbours: Annotated[int, Range(1, 1000)] = 8  # number of images with which each image is matched
+    # minimum angle between the rays of a point, degrees; below it, the point is placed by measured depth
     parallax: Annotated[float, Above(0.0, 89.0)] = 2.0
-    singles: bool = True  # make landmarks of keypoints in a single image where their depth was measured
-    most: Annotated[int, Range(1, 10**8)] = 200_000  # largest number of landmarks, 168 bytes each with SIFT
+    singles: bool = True  # make landmarks of keypoints seen in a single image if their depth was measured
+    most: Annotated[int, Range(1, 10**8)] = 200_000  # maximum number of landmarks, 168 bytes each with SIFT
 
 
 DEFAULT_LANDMARKS = LandmarkConfig()
@@ -155,9 +155,9 @@ def build_landmarks(
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
-    """Build landmarks from ``views``, whose poses are T_world_camera, and from their measured depth where they have it.
+    """Build landmarks from ``views``, whose poses are T_world_camera, and from their measured depth where available.
 
-    ``progress`` is called with the number of images and image pairs done and their total, and ``report`` with a sentence if
+    ``progress`` is called with the number of images and image pairs done and the total, and ``report`` with a sentence if
     landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
     """
     return tracked_views(views, features, config, progress).landmarks(config, report)
@@ -165,30 +165,30 @@ def build_landmarks(
 
 @dataclass(frozen=True, eq=False)
 class TrackedViews:
-    """The keypoints of posed images, joined into tracks, with the depth that was measured at each keypoint."""
+    """The keypoints of posed images, joined into tracks, with the depth measured at each keypoint."""
 
     observations: TrackedKeypoints
     depth: Float[Tensor, "k"]  # metres, of all keypoints by number; 0 where none was measured
-    features: str | Features = USUAL_FEATURES  # what detected the keypoints: by name, if it is registered
+    features: str | Features = USUAL_FEATURES  # the detector of the keypoints: its name, if it is registered
 
     @property
     def detector(self) -> Features:
-        """What detected the keypoints."""
+        """The detector of the keypoints."""
         return find_features(self.features) if isinstance(self.features, str) else self.features
 
     def detector_of(self, view: View, number: int) -> Features:
-        """Return the detector for a query with image ``number``, whose ``view`` is given: its keypoints are known."""
+        """Return a detector for queries with ``view``, which is image ``number``: it reuses the known keypoints."""
         return FoundOnce(self.detector, [(view.frame.rgb, self.observations.images[number].keypoints)])
 
     def landmarks(
         self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None
     ) -> LandmarkMap:
-        """Return the landmarks that the tracks give. Raises ``InputError`` if there are none."""
+        """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
         found = _located(self.observations, self.depth, config)
         if not len(found):
             images = len(self.observations.images)
             raise InputError(
-                f"no landmark found in {images} images: expected texture that several images show from different places"
+                f"no landmarks found in {images} images: expected texture that several images show from different places"
             )
         moving = float((self.motion != 0).any(1).double().mean())
         name = self.features if isinstance(self.features, str) else ""
@@ -196,12 +196,12 @@ class TrackedViews:
         return replace(_bounded(found, config.most, report), moving=moving, features=name)
 
     def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
-        """Return the triangulated landmarks that each image shows; training uses their depth where none was measured."""
+        """Return the triangulated landmarks seen in each image; training uses their depth where none was measured."""
         kept, positions, covariance = _triangulated(self.observations, radians(config.parallax))
         return seen_landmarks(kept, positions, noise(kept.sightings, positions) ** 2 * covariance)
 
     def triangulated(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
-        """Return the keypoints that agree on a triangulated point, and those points (metres, world)."""
+        """Return the inlier keypoints of the triangulated points, and these points (metres, world)."""
         kept, positions, _ = _triangulated(self.observations, radians(config.parallax))
         return kept, positions
 
@@ -217,11 +217,11 @@ class TrackedViews:
 
     @property
     def motion(self) -> Float[Tensor, "v 6"]:
-        """The motions of the cameras while the rows of their images were exposed."""
+        """The motion of each image's camera during its readout."""
         return self.observations.motion
 
     def at(self, T_world_camera: SE3, motion: Float[Tensor, "v 6"] | None = None) -> TrackedViews:
-        """Return the same tracks in images with other poses (v), and with other motions if these are given."""
+        """Return the tracks with other poses of the images (v), and with other motions if given."""
         motion = self.motion if motion is None else motion
         images = [
             replace(p, T_world_camera=T_world_camera[i], motion=motion[i])
@@ -230,16 +230,16 @@ class TrackedViews:
         return replace(self, observations=replace(self.observations, images=images))
 
     def at_distance(self, distance: float) -> TrackedViews:
-        """Return the tracks with all keypoints at one ``distance`` (metres) from their cameras, as if it were measured."""
+        """Return the tracks with a measured ``distance`` (metres) from the camera for every keypoint."""
         rays = torch.cat([image.rays for image in self.observations.images])
         return replace(self, depth=distance / torch.linalg.vector_norm(rays, dim=-1))
 
     def matched_anew(
         self, config: LandmarkConfig, progress: Callable[[int, int], None] = lambda done, total: None
     ) -> TrackedViews:
-        """Return the tracks that the same keypoints give when they are matched by the present poses.
+        """Return tracks of the same keypoints, matched again with the present poses.
 
-        ``progress`` is called with the number of image pairs done, first with 0, and their total.
+        ``progress`` is called with the number of image pairs done, starting at 0, and the total.
         """
         images = self.observations.images
         pairs = _pairs([image.T_world_camera for image in images], config)
@@ -247,7 +247,7 @@ class TrackedViews:
         return replace(self, observations=_joined(images, pairs, _Counter(progress, len(pairs))))
 
     def without(self, images: Sequence[int]) -> TrackedViews:
-        """Return the tracks without the keypoints of some images."""
+        """Return the tracks without the keypoints of the given images."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))
         return replace(self, observations=self.observations[left])
 
@@ -260,8 +260,8 @@ def tracked_views(
 ) -> TrackedViews:
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
 
-    ``features`` is the name of a detector, which is stored with the landmarks and finds them in queries, or a detector itself.
-    Raises ``InputError`` if there are no views, for an unknown name, and for keypoints of which nothing can be made.
+    ``features`` is a detector or its name, which is stored with the landmarks so that queries use the same detector. Raises
+    ``InputError`` if there are no views, for an unknown name, and for unusable keypoints.
     """
     detector = find_features(features) if isinstance(features, str) else features
     if not views:
@@ -272,7 +272,7 @@ def tracked_views(
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
         raise PluginError(
-            f"descriptors have {enumeration([*map(str, lengths)])} channels in different images, expected one number"
+            f"descriptors have {enumeration([*map(str, lengths)])} channels in different images, expected the same number"
         )
     depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
     return TrackedViews(_joined(images, pairs, counter), torch.cat(depth), features)
@@ -295,7 +295,7 @@ def _joined(images: Sequence[PosedKeypoints], pairs: list[list[int]], counter: _
 
 
 def posed_keypoints(views: Sequence[View], features: Features) -> list[PosedKeypoints]:
-    """Detect the keypoints of ``views``, which are not matched."""
+    """Detect the keypoints of ``views`` without matching them."""
     return list(_mapped(lambda view: _detected(view, features), views))
 
 
@@ -313,7 +313,7 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
 def _located(
     observations: TrackedKeypoints, depth: Float[Tensor, "k"], config: LandmarkConfig
 ) -> LandmarkMap:
-    """Return the triangulated landmarks, then those that measured depth places, made from the remaining keypoints."""
+    """Return the triangulated landmarks, followed by those placed by the measured depth of the remaining keypoints."""
     kept, positions, covariance = _triangulated(observations, radians(config.parallax))
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
@@ -329,16 +329,16 @@ def _located(
 
 
 def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
-    """Return which keypoints show a point that another keypoint shows too."""
+    """Return a mask of the keypoints whose point has another keypoint."""
     return torch.bincount(observations.point)[observations.point] > 1
 
 
 def _triangulated(
     observations: TrackedKeypoints, least: float
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return the consistent keypoints, the points that they show, and the points' covariance for a noise of one pixel.
+    """Return the inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel.
 
-    ``least`` is the smallest parallax (radians) of a point.
+    ``least`` is the minimum parallax (radians) of a point.
     """
     observations, _ = observations[_tracked(observations)].compacted()
     count = observations.count
@@ -353,7 +353,7 @@ def _triangulated(
 
 
 def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Return which keypoints fit their points, for points that at least two keypoints fit."""
+    """Return a mask of the keypoints that fit their points, for points with at least two such keypoints."""
     fit = fitting(sightings, points, tolerance)
     seen = observations_per_point(sightings[fit], len(points))
     pairs = seen[sightings.point] == 2
@@ -362,22 +362,22 @@ def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: floa
 
 
 def _bounded(landmarks: LandmarkMap, most: int, report: Callable[[str], None]) -> LandmarkMap:
-    """Return at most ``most`` landmarks: those that were seen in the most images."""
+    """Return at most ``most`` landmarks: those seen in the most images."""
     if len(landmarks) <= most:
         return landmarks
-    report(f"{len(landmarks)} landmarks found, {most} kept: those that the most images show")
+    report(f"{len(landmarks)} landmarks found, {most} kept: those seen in the most images")
     order = landmarks.views.argsort(descending=True, stable=True)[:most]
     return landmarks[order.sort().values]
 
 
 def _mapped(work: Callable[[_Item], Result], items: Sequence[_Item]) -> Iterator[Result]:
-    """Yield ``work`` of each item, in order, computed by as many threads as torch uses."""
+    """Apply ``work`` to each item and yield the results in order, with as many threads as torch uses."""
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         yield from pool.map(work, items)
 
 
 class _Counter:
-    """Counts the progress of several loops towards one total."""
+    """A progress counter shared by several loops."""
 
     def __init__(self, progress: Callable[[int, int], None], total: int) -> None:
         self._progress, self._total, self._done = progress, total, 0

@@ -1,4 +1,4 @@
-"""Keypoints of an image and their descriptors, by which they are matched with other images.
+"""Keypoints of an image and their descriptors, by which they are matched across images.
 
 Any detector that turns an image into ``Keypoints``, a learned one included, can serve as ``Features``.
 """
@@ -23,11 +23,11 @@ from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings
 
 NORM = 512.0
-"""Length of a quantised descriptor, as is customary for SIFT: it makes good use of the range of a byte."""
+"""Norm of a quantised descriptor, as usual for SIFT: it makes good use of the range of a byte."""
 MANY = 2**16
-"""Descriptors that are converted to floats at a time: all of a large map would take gigabytes."""
+"""Number of descriptors converted to floats at a time; all of a large map would take gigabytes."""
 STRIP = 2**22
-"""Pixels that are converted to grey at a time."""
+"""Number of pixels converted to grey at a time."""
 FIRST_CENTRE = 0.5
 """Offset from OpenCV's pixel coordinates to ours: the centre of the first pixel is (0, 0) there, (0.5, 0.5) here."""
 
@@ -49,7 +49,7 @@ class Keypoints:
 
 @runtime_checkable
 class Features(Protocol):
-    """Detects and describes keypoints; all its descriptors must have the same number of channels.
+    """A detector that finds and describes keypoints, always with the same number of descriptor channels.
 
     It must be safe to call from several threads at once. ``quantized`` turns float descriptors into bytes.
     """
@@ -59,31 +59,31 @@ class Features(Protocol):
 
 @runtime_checkable
 class LimitedFeatures(Features, Protocol):
-    """An optional part of ``Features``: a detector that is faster where fewer keypoints are wanted."""
+    """Optional extension of ``Features``: a detector that is faster when fewer keypoints are wanted."""
 
     def at_most(self, count: int) -> Features:
-        """Return the detector with another largest number of keypoints."""
+        """Return the detector with a maximum of ``count`` keypoints."""
         ...
 
 
 @dataclass(frozen=True)
 class Sift(Settings):
-    """SIFT (Lowe 2004) by OpenCV, with the root normalisation of Arandjelovic and Zisserman 2012."""
+    """OpenCV's SIFT (Lowe 2004), with the root normalisation of Arandjelovic and Zisserman 2012."""
 
-    # largest number of keypoints: those of highest contrast are kept
+    # maximum number of keypoints: those with the highest contrast are kept
     count: Annotated[int, Range(1, 10**6)] = 2000
-    # least contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
+    # minimum contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
     contrast: Annotated[float, Range(0.0, 0.999)] = 0.01
-    # Pixels along the longer side above which an image is reduced first: a phone's twelve megapixels hold no more
-    # keypoints of the sizes that maps are made of, and take half a minute.
+    # maximum pixels along the longer side; larger images are downscaled first: a phone's twelve megapixels contain no more
+    # keypoints of the sizes that maps use, and take half a minute
     largest: Annotated[int, Range(16, 10**5)] = 800
 
     def at_most(self, count: int) -> Sift:
         return replace(self, count=count)
 
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
-        # The precise upscaling maps index x to 2 x: without it all keypoints of the first octave are a quarter of a
-        # pixel off. A detector object is not safe to share between threads, and costs nothing to make.
+        # Precise upscaling maps index x to 2 x; without it, all keypoints of the first octave are a quarter of a pixel
+        # off. A detector object is not thread-safe, and is cheap to create.
         sift = cv2.SIFT.create(
             nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
         )
@@ -99,7 +99,7 @@ class Sift(Settings):
 
 
 SIFT = Sift()
-"""SIFT (Lowe 2004) by OpenCV, with root normalisation."""
+"""OpenCV's SIFT (Lowe 2004), with root normalisation."""
 
 
 def _defects(features: Any) -> Iterator[str]:
@@ -107,18 +107,18 @@ def _defects(features: Any) -> Iterator[str]:
 
 
 USUAL_FEATURES = "sift"
-"""The name of the detector that is used where none is named."""
+"""The name of the default detector."""
 FEATURES: Plugins[Features] = Plugins("features", _defects, first=(USUAL_FEATURES,))
 """The detectors by name."""
 
 
 def find_features(name: str, wanted_by: str = "") -> Features:
-    """Return a detector by name. Raises ``PluginError``, an ``InputError``, for an unknown name and a broken plugin."""
+    """Return a detector by name. Raises ``PluginError`` (an ``InputError``) for an unknown name or a broken plugin."""
     return FEATURES.load(name, wanted_by)
 
 
 def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
-    """Return the keypoints of an image. Raises ``PluginError`` where the detector returns anything but keypoints in it."""
+    """Return the keypoints of an image. Raises ``PluginError`` if the detector returns anything but keypoints within it."""
     found, who = features(rgb), f"detector {getattr(features, '__name__', type(features).__name__)}"
     if not isinstance(found, Keypoints):
         raise PluginError(
@@ -137,18 +137,18 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         )
     if found.descriptors.dtype != torch.uint8:
         raise PluginError(
-            f"{who}: descriptors are of {found.descriptors.dtype}, expected torch.uint8; quantized makes bytes of floats"
+            f"{who}: descriptors have dtype {found.descriptors.dtype}, expected torch.uint8; quantized converts floats"
         )
     size = torch.tensor([rgb.shape[1], rgb.shape[0]])
     if not bool(((found.pixels >= 0) & (found.pixels <= size)).all()):
         raise PluginError(
-            f"{who}: keypoints lie outside the image of {size[0]}x{size[1]} pixels, expected none"
+            f"{who}: keypoints lie outside the image of {size[0]}x{size[1]} pixels, expected all inside"
         )
     return found
 
 
 def visible_keypoints(keypoints: Keypoints, hidden: Bool[Tensor, "h w"] | None) -> Keypoints:
-    """Return the keypoints whose neighbourhoods reach into no hidden pixel of their image."""
+    """Return the keypoints whose neighbourhoods contain no hidden pixels of the image."""
     if hidden is None or not len(keypoints):
         return keypoints
     visible = np.ascontiguousarray((~hidden.cpu().numpy()).astype(np.uint8))
@@ -170,14 +170,14 @@ class _Strongest:
 
 
 def strongest(features: Features, count: int) -> Features:
-    """Return a detector that finds at most ``count`` keypoints, the strongest."""
+    """Return a detector of at most the ``count`` strongest keypoints."""
     return features.at_most(count) if isinstance(features, LimitedFeatures) else _Strongest(features, count)
 
 
 class FoundOnce:
-    """A detector that remembers the keypoints of each image for as long as it lives, which is one query.
+    """A detector that caches the keypoints of each image during one query.
 
-    ``known``: images whose keypoints are known already. Threads may share it.
+    ``known`` are images with known keypoints. Threads may share the detector.
     """
 
     def __init__(self, features: Features, known: Iterable[tuple[Tensor, Keypoints]] = ()) -> None:
@@ -193,20 +193,20 @@ class FoundOnce:
 
 
 def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Return square roots of L1-normalised, non-negative descriptors; their Euclidean distance is the Hellinger distance."""
+    """Return the square roots of L1-normalised, non-negative descriptors; Euclidean distance is then Hellinger distance."""
     total = descriptors.sum(-1, keepdim=True).clamp(min=torch.finfo(descriptors.dtype).tiny)
     return (descriptors / total).sqrt()
 
 
 def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
-    """Return descriptors of unit length as bytes; if any channel is negative, all are shifted, which keeps distances."""
+    """Return unit descriptors as bytes; if any channel is negative, all are shifted, which preserves distances."""
     negative = len(descriptors) > 0 and float(descriptors.min()) < 0
     scaled = descriptors * (NORM / 2 if negative else NORM) + (128 if negative else 0)
     return scaled.round().clamp(0, 255).to(torch.uint8)
 
 
 def unrelated_distance(descriptors: UInt8[Tensor, "n d"]) -> float:
-    """Return the distance (root mean square) of two descriptors that have nothing in common, which is the scale of a detector."""
+    """Return the root mean square distance between unrelated descriptors, which is the scale of a detector's distances."""
     total, squares, count = (
         torch.zeros(descriptors.shape[1], dtype=torch.float64),
         0.0,
@@ -219,10 +219,10 @@ def unrelated_distance(descriptors: UInt8[Tensor, "n d"]) -> float:
 
 
 def byte_of_zero(descriptors: UInt8[Tensor, "n d"]) -> int:
-    """Return the byte that stands for 0 in a channel of descriptors of one length: 0 for SIFT, 128 for those with negative channels.
+    """Return the byte that represents 0 in descriptors of equal norm: 0 for SIFT, 128 for those with negative channels.
 
-    It is the centre of the sphere on which they lie: of the bytes ``z``, that for which the squares of the lengths of
-    ``descriptors - z`` vary least.
+    It is the centre of the sphere on which they lie: the byte ``z`` that minimizes the variance of the squared norms of
+    ``descriptors - z``.
     """
     parts = [part.double() for part in descriptors.split(MANY)]
     sums = torch.cat([part.sum(1) for part in parts]) if parts else torch.zeros(0, dtype=torch.float64)
@@ -255,7 +255,7 @@ def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     """Return the brightness of an image as bytes (h, w)."""
     strips = (
         rgb.detach().cpu().split(max(1, STRIP // rgb.shape[1]))
-    )  # of a phone's photo, a copy takes a gigabyte
+    )  # copying a whole phone photo takes a gigabyte
     clean = (part.float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_().to(torch.uint8) for part in strips)
     return np.concatenate([cv2.cvtColor(part.contiguous().numpy(), cv2.COLOR_RGB2GRAY) for part in clean])
 

@@ -1,4 +1,4 @@
-"""Placing points by the depth that was measured at their keypoints."""
+"""Back-projection of keypoints by their measured depth."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from bidnerf_core.mapping.landmarks.tracks import TrackedKeypoints
 DEPTH_EDGE = 0.05
 """Largest relative change of the depth around a keypoint; more indicates a depth edge."""
 LEAST_MEASURED = 6
-"""Least number of the nine pixels around a keypoint that must have measured depth."""
+"""Minimum number of the nine pixels around a keypoint that must have measured depth."""
 ENOUGH_DEPTHS = 30
-"""Least number of triangulated observations with depth from which the depth noise is estimated."""
+"""Minimum number of triangulated observations with depth from which the depth noise is estimated."""
 OUTLIER_DEVIATIONS = 3.0
-"""Distance from the mean of its track, in standard deviations, beyond which a depth is an outlier."""
+"""Distance from the track's mean, in standard deviations, beyond which a depth is an outlier."""
 
 
 def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
     """Return the median depth (metres) of the 3x3 pixels around each of ``pixels`` (u, v).
 
-    It is 0 at depth edges and where too few of the pixels have measured depth.
+    It is 0 at depth edges and where too few pixels have measured depth.
     """
     if frame.depth is None or not len(pixels):
         return torch.zeros(len(pixels), dtype=torch.float64)
@@ -48,9 +48,9 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
 def keypoint_depth_noise(
     sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]
 ) -> float:
-    """Return a robust relative standard deviation of measured depth, by comparison with triangulated points.
+    """Return a robust relative standard deviation of measured depth, from triangulated points.
 
-    With too few of them, it is that of an unknown sensor.
+    If there are too few, return that of an unknown sensor.
     """
     known = depth > 0
     if int(known.sum()) < ENOUGH_DEPTHS:
@@ -62,7 +62,7 @@ def keypoint_depth_noise(
 def depth_ratio(
     sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]
 ) -> float | None:
-    """Return the median ratio of measured depth to that of triangulated points; None with too few of them."""
+    """Return the median ratio of measured depth to the depth of triangulated points; None if there are too few."""
     z = sightings.in_camera(points)[:, 2]
     known = (depth > 0) & (z > 0)
     return float((depth[known] / z[known]).median()) if int(known.sum()) >= ENOUGH_DEPTHS else None
@@ -105,7 +105,7 @@ def _information(
 def _weighted(
     values: Float[Tensor, "m 3"], information: Float[Tensor, "m 3 3"], point: Int[Tensor, "m"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return the weighted mean of the values of each point, and its covariance."""
+    """Return each point's weighted mean of its values, and its covariance."""
     count = int(point.max()) + 1 if len(point) else 0
     total = torch.zeros((count, 3, 3), dtype=values.dtype).index_add_(0, point, information)
     weighted = (information @ values[..., None])[..., 0]

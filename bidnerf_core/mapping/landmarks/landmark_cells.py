@@ -1,4 +1,4 @@
-"""Cells of neighbouring landmarks, by which those that a camera may see are found without a look at every landmark."""
+"""Cells of neighbouring landmarks, for finding those in a camera's view without testing every landmark."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from torch import Tensor
 from bidnerf_core.geometry.se3 import SE3
 
 MOST_IN_CELL = 128
-"""Largest number of landmarks in a cell."""
+"""Maximum number of landmarks in a cell."""
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkCells:
-    """Leaves of a k-d tree over landmarks, each with the ball that holds them and the cone of directions that saw them."""
+    """Leaves of a k-d tree over landmarks, each with its bounding ball and the cone of viewing directions."""
 
-    order: Int[Tensor, "n"]  # numbers of the landmarks, cell by cell
-    first: Int[Tensor, "c"]  # place of a cell's first landmark in ``order``
+    order: Int[Tensor, "n"]  # indices of the landmarks, cell by cell
+    first: Int[Tensor, "c"]  # position of a cell's first landmark in ``order``
     counts: Int[Tensor, "c"]
     centres: Float[Tensor, "c 3"]
     radii: Float[Tensor, "c"]  # metres
     directions: Float[Tensor, "c 3"]  # unit
-    cones: Float[Tensor, "c"]  # radians: greatest angle between ``directions`` and a camera
-    sizes: Float[Tensor, "c"]  # metres: of the largest landmark
+    cones: Float[Tensor, "c"]  # radians: largest angle between ``directions`` and a camera
+    sizes: Float[Tensor, "c"]  # metres: size of the largest landmark
 
     @staticmethod
     def of(
@@ -59,10 +59,10 @@ class LandmarkCells:
     def seen_from(
         self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float, size: float = 0.0
     ) -> Int[Tensor, "m"]:
-        """Return the numbers of the landmarks in all cells that may show in an image, in no particular order.
+        """Return the indices of the landmarks in all cells that may be visible in an image, in no particular order.
 
-        In the image is what has ``|x| <= slopes[0] z`` and ``|y| <= slopes[1] z`` in the camera's frame, and is seen from at
-        most ``oblique`` (radians) outside the cone of its directions. Landmarks smaller than ``size`` z do not show.
+        A landmark is visible if ``|x| <= slopes[0] z`` and ``|y| <= slopes[1] z`` in the camera's frame, the camera is at
+        most ``oblique`` (radians) outside the cone of its directions, and it is not smaller than ``size`` z.
         """
         local = T_world_camera.inverse().to(torch.float32).apply(self.centres)
         beyond = (local[:, :2].abs() - slopes * local[:, 2:]) / (1 + slopes.square()).sqrt()
@@ -80,7 +80,7 @@ class LandmarkCells:
 
 
 def _leaves(node: object) -> Iterator[tuple[int, int]]:
-    """Yield where the leaves of scipy's k-d tree begin and end."""
+    """Yield the start and end of each leaf of scipy's k-d tree."""
     left: list[object] = [node]
     while left:
         node = left.pop()

@@ -1,4 +1,4 @@
-"""Landmarks: points of the scene with descriptors by which images recognise them."""
+"""Landmarks: points of the scene with descriptors, by which they are recognised in images."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, unrelated_di
 from bidnerf_core.mapping.landmarks.landmark_cells import LandmarkCells
 
 FEW = 20_000
-"""The number of landmarks up to which looking at all of them is faster than looking for cells in view."""
+"""The number of landmarks up to which testing all of them is faster than finding the cells in view."""
 
 
 @dataclass(frozen=True)
 class HeldOutTrial:
-    """How images of the map were localized by landmarks that were built without them."""
+    """Accuracy with which images of the map were localized by landmarks built without them."""
 
     images: int = 0
     found: int = 0  # of these images
@@ -39,29 +39,31 @@ class LandmarkMap:
     positions: Float[Tensor, "n 3"]
     deviations: Float[Tensor, "n 2"]  # metres: standard deviation across and along ``directions``
     descriptors: UInt8[Tensor, "n d"]  # mean over the views; see ``mapping.landmarks.features``
-    directions: Float[Tensor, "n 3"]  # unit, from the landmark: the mean direction to the cameras that saw it
-    cones: Float[Tensor, "n"]  # radians: greatest angle between ``directions`` and such a camera
+    directions: Float[
+        Tensor, "n 3"
+    ]  # unit, from the landmark: the mean direction to the cameras that observed it
+    cones: Float[Tensor, "n"]  # radians: largest angle between ``directions`` and such a camera
     sizes: Float[Tensor, "n"]  # metres: diameter of the keypoint, measured at its distance
-    views: Int[Tensor, "n"]  # how many images saw it, int32
+    views: Int[Tensor, "n"]  # number of images that observed it, int32
     noise: float  # pixels: standard deviation of a keypoint along each axis, in the images of the map
-    # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those that
-    # the landmarks imply, refinement by the training included: the error that the source of the poses adds.
+    # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those by
+    # resection, including pose refinement in training: the error of the pose source.
     pose_covariance: Float[Tensor, "6 6"]  # float64
-    # The number of keypoints that count as one measurement in an image with ``usual_matches`` of them, because their errors are
-    # correlated; see ``correlation_of``.
+    # Number of keypoints that count as one measurement, because their errors are correlated, in an image with
+    # ``usual_matches`` of them; see ``correlation_of``.
     correlation: float = KEYPOINTS_PER_INDEPENDENT
-    usual_matches: float = 0.0  # median of the images of the map; 0 where it is not known
-    # Standard deviations of the corrections of intrinsics that images of the map seem to need, although their intrinsics are
-    # right: logarithm of the focal length, principal point (u, v) as a share of it, radial distortion. Float64.
+    usual_matches: float = 0.0  # median over the images of the map; 0 if unknown
+    # Standard deviations of the spurious corrections to right intrinsics that are estimated from images of the map:
+    # logarithm of the focal length, principal point (u, v) as a fraction of it, radial distortion. Float64.
     calibration_scatter: Float[Tensor, "4"] = field(
         default_factory=lambda: torch.full((4,), 0.02, dtype=torch.float64)
     )
     trial: HeldOutTrial = HeldOutTrial()
     moving: float = (
-        0.0  # share of the map's images whose cameras moved while rows were exposed, see ``rolling_shutter``
+        0.0  # fraction of the map's images whose cameras moved during readout, see ``rolling_shutter``
     )
     cameras: tuple[Intrinsics, ...] = ()  # of the images, where known
-    features: str = USUAL_FEATURES  # the name of the detector whose keypoints they are; "" where it has none
+    features: str = USUAL_FEATURES  # name of the detector of the keypoints; "" if it has none
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -72,16 +74,16 @@ class LandmarkMap:
     def to(self, device: torch.device | str) -> LandmarkMap:
         """Return the landmarks on another device; ``self`` if they are already there.
 
-        Only descriptors are compared there. Keypoints, RANSAC and the resection of a pose are computed on the CPU, by OpenCV,
-        poselib and scipy, for which ``LandmarkMatcher`` keeps a copy of the other tensors.
+        Only descriptor matching runs there. Keypoint detection, RANSAC and resection run on the CPU, by OpenCV, poselib and
+        scipy, for which ``LandmarkMatcher`` keeps a copy of the other tensors.
         """
         return moved(self, working_device(device))
 
     def correlation_of(self, matches: int) -> float:
-        """Return the number of keypoints that count as one in an image with this number of ``matches``.
+        """Return the number of keypoints that count as one measurement in an image with this number of ``matches``.
 
-        Keypoints share errors with their neighbours, with more of them the denser they are: errors of images with few matches
-        are smaller than a constant number implies. On several captures it grew with the square root of the matches.
+        Errors are correlated between neighbouring keypoints, of which there are more in images with many matches. On several
+        captures, the number grew with the square root of the matches.
         """
         if self.usual_matches <= 0:
             return self.correlation
@@ -89,12 +91,12 @@ class LandmarkMap:
 
     @cached_property
     def unrelated_distance(self) -> float:
-        """The usual distance between descriptors of different landmarks, in whose unit limits of distances are given."""
+        """The root mean square distance between descriptors of different landmarks, the unit of distance thresholds."""
         return unrelated_distance(self.descriptors)
 
     @cached_property
     def cells(self) -> LandmarkCells | None:
-        """The cells of the landmarks on the CPU, which take a second for a million; None for few landmarks."""
+        """The cells of the landmarks, on the CPU (a second for a million landmarks); None for few landmarks."""
         return (
             LandmarkCells.of(self.positions, self.directions, self.cones, self.sizes)
             if len(self) > FEW
@@ -104,7 +106,7 @@ class LandmarkMap:
     def seen_from(
         self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float, size: float = 0.0
     ) -> Int[Tensor, "m"]:
-        """Return the numbers of landmarks of which none else shows in an image; see ``LandmarkCells.seen_from``."""
+        """Return the indices of a superset of the landmarks visible in an image; see ``LandmarkCells.seen_from``."""
         if self.cells is None:
             return torch.arange(len(self))
         return self.cells.seen_from(T_world_camera, slopes, oblique, size)
@@ -133,6 +135,6 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 
 
 def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
-    """Return the landmarks of all ``maps``, whose descriptors must have one length, with the other fields of the first."""
+    """Return the landmarks of all ``maps`` (descriptors of the same length), with the other fields of the first map."""
     joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
     return replace(maps[0], **joined)

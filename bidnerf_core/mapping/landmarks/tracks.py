@@ -1,4 +1,4 @@
-"""Tracks: keypoints of several images that show one point of the scene, from matches of likely pairs to landmarks."""
+"""Tracks: keypoints in several images of the same point of the scene, from matching likely pairs to landmarks."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from bidnerf_core.mapping.landmarks.features import MANY, Keypoints, byte_of_zer
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 EPIPOLAR_BAND = 2.0
-"""Largest distance (pixels) of a match from the epipolar line."""
+"""Maximum distance (pixels) of a match from the epipolar line."""
 TRACK_RATIO = 0.95
-"""Largest ratio of a match's descriptor distance to that of the next best among all keypoints of the image."""
+"""Maximum ratio of the best to the second-best descriptor distance among all keypoints of the image."""
 RATIO_IN_BAND = 0.85
-"""Largest ratio of a match's descriptor distance to that of the next best near the epipolar line."""
+"""Maximum ratio of the best to the second-best descriptor distance near the epipolar line."""
 DUPLICATE_DISTANCE = 4.0
-"""Distance (pixels) below which keypoints are duplicates: SIFT returns one for each dominant orientation. Within the radius of
-what a keypoint describes, others describe much the same.
+"""Distance (pixels) below which keypoints are duplicates: SIFT returns one for each dominant orientation. Keypoints within the
+radius of a keypoint's neighbourhood also have similar descriptors.
 """
 LEAST_BASELINE = 1e-12
 """Distance (metres) between two cameras below which epipolar lines are undefined."""
 
 
 def likely_pairs(views: Sequence[View], neighbours: int) -> Int[Tensor, "p 2"]:
-    """Return pairs (i < j) of each view with ``neighbours`` views likely to show the same things, without duplicates."""
+    """Return pairs (i < j) of each view with ``neighbours`` views that probably overlap it, without duplicates."""
     return likely_pairs_of_poses([view.T_ref_camera for view in views], neighbours)
 
 
@@ -58,14 +58,14 @@ def _ranks(count: int, others: int) -> list[int]:
 
 
 ROWS = 1024
-"""Views whose dissimilarity to all others is computed at a time: no matrix of all pairs is ever in memory."""
+"""Number of views whose dissimilarity to all others is computed at a time, to avoid a matrix of all pairs."""
 
 
 def _by_similarity(poses: Sequence[SE3]) -> Iterator[Int[Tensor, "r v"]]:
-    """Yield, for some views after others, the order of all views from the most similar pose to the least.
+    """Yield, block by block of views, the order of all views from the most to the least similar pose.
 
-    The dissimilarity is the distance of the centres relative to the mean of all, plus 1 - cosine between the optical axes;
-    a view itself comes last.
+    The dissimilarity is the distance between the centres relative to the mean over all pairs, plus 1 - cosine between the
+    optical axes; a view itself comes last.
     """
     centres = torch.stack([pose.translation.cpu().double() for pose in poses])
     axes = torch.stack([pose.rotation[:, 2].cpu().double() for pose in poses])
@@ -85,22 +85,22 @@ class PosedKeypoints:
     rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
     focal: float  # pixels
     T_world_camera: SE3  # float64; of the middle row
-    exposure_times: Float[Tensor, "n"]  # of the keypoints, see ``rolling_shutter``, float64
-    motion: Float[Tensor, "6"] = AT_REST  # while the rows were exposed; epipolar lines ignore it
+    exposure_times: Float[Tensor, "n"]  # of the keypoints, float64; see ``rolling_shutter``
+    motion: Float[Tensor, "6"] = AT_REST  # during the readout; epipolar lines ignore it
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of keypoints of two images that look alike and lie on each other's epipolar lines."""
+    """Pairs of keypoints of two images that are similar and lie on each other's epipolar lines."""
 
     pairs: Int[Tensor, "p 2"]
-    ambiguity: Float[Tensor, "p"]  # ratio of the descriptor distance to that of the next best
+    ambiguity: Float[Tensor, "p"]  # ratio of the best to the second-best descriptor distance
 
 
 def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
     """Return the pairs of keypoints of ``a`` and ``b`` that are mutual nearest neighbours near the epipolar lines.
 
-    A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them finds
+    A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them matches
     one near the line by chance.
     """
     if not len(a.keypoints) or not len(b.keypoints):
@@ -123,14 +123,16 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
 def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
     """Return whether each keypoint of ``b`` lies near the epipolar half-line of each keypoint of ``a``.
 
-    The half-line begins at the image of the ray's point at infinity. If the cameras are at the same place, it reduces to
-    that point.
+    The half-line starts at the image of the ray's point at infinity. If the camera centres coincide, it reduces to that
+    point.
     """
     T_b_a = b.T_world_camera.inverse() @ a.T_world_camera
     rays, base = T_b_a.rotate(a.rays), T_b_a.translation
     front = rays[:, 2:].sign()
     start = rays[:, :2] / rays[:, 2:].abs().clamp(min=1e-9) * front
-    step = (base[:2] - base[2] * start) * front  # where the image moves as the point comes nearer
+    step = (
+        base[:2] - base[2] * start
+    ) * front  # direction in which the projection moves as the point comes nearer
     size = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
     forward = step / size.clamp(min=1e-300)
     sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
@@ -142,7 +144,7 @@ def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
         torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen
         for axis in (sideways, forward)
     )
-    # The point at infinity of a ray that points behind the other camera has no image, so the whole line is admitted.
+    # If a ray points behind the other camera, its point at infinity has no projection, so the whole line is allowed.
     least = torch.where(front > 0, -band, -torch.inf).float()
     return (across.abs_() <= band) & (along >= least)
 
@@ -151,14 +153,14 @@ def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[i
     """Join matches (image, image, keypoints) into tracks and return the track of each keypoint, numbered across all images.
 
     The least ambiguous matches are joined first. A match that would put two keypoints of one image into the same track is
-    left out, because a single wrong match would spoil two good tracks. ``sizes`` are the numbers of keypoints per image.
+    dropped, because a single wrong match would spoil two good tracks. ``sizes`` are the numbers of keypoints per image.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
     ends = np.concatenate(
         [np.zeros((0, 2), np.int64)] + [m.pairs.numpy() + first[[i, j]] for i, j, m in matches]
     )
     ambiguity = np.concatenate([np.zeros(0)] + [m.ambiguity.numpy() for _, _, m in matches])
-    # Most keypoints match no other: only those that do are joined.
+    # Most keypoints have no match, so only those with one are considered.
     matched, ends = np.unique(ends, return_inverse=True)
     ends = ends.reshape(-1, 2)
     image = np.searchsorted(first, matched, side="right") - 1
@@ -184,7 +186,7 @@ def _root(parent: list[int], number: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class TrackedKeypoints:
-    """Keypoints and the points that they show. One numbering, image by image, covers the keypoints of all images."""
+    """Keypoints and the points that they observe. Keypoints are numbered consecutively over all images."""
 
     images: Sequence[PosedKeypoints]
     point: Int[Tensor, "m"]
@@ -194,7 +196,7 @@ class TrackedKeypoints:
         return TrackedKeypoints(self.images, self.point[index], self.number[index])
 
     def compacted(self) -> tuple[TrackedKeypoints, Int[Tensor, "n"]]:
-        """Renumber the remaining points from 0, and return their former numbers as well."""
+        """Renumber the remaining points from 0, and also return their former numbers."""
         found, point = self.point.unique(return_inverse=True)
         return TrackedKeypoints(self.images, point, self.number), found
 
@@ -210,7 +212,7 @@ class TrackedKeypoints:
 
     @property
     def motion(self) -> Float[Tensor, "v 6"]:
-        """The motion of each image's camera while its rows were exposed."""
+        """The motion of each image's camera during its readout."""
         return torch.stack([p.motion for p in self.images])
 
     @cached_property
@@ -241,9 +243,9 @@ def fused_landmarks(
     covariance: Float[Tensor, "n 3 3"],
     noise: float,
 ) -> LandmarkMap:
-    """Return landmarks at ``positions`` (metres, world) with their covariance; each of them needs an observation.
+    """Return landmarks at ``positions`` (metres, world) with their covariance; each needs at least one observation.
 
-    ``noise`` is that of a keypoint, in pixels. The poses of the images are taken as exact: ``pose_covariance`` is 0.
+    ``noise`` is that of a keypoint (pixels). The images' poses are taken as exact: ``pose_covariance`` is 0.
     """
     count, sightings = len(positions), observations.sightings
     away = sightings.centre - positions[sightings.point]
@@ -269,7 +271,7 @@ def fused_landmarks(
 def seen_landmarks(
     observations: TrackedKeypoints, positions: Float[Tensor, "n 3"], covariance: Float[Tensor, "n 3 3"]
 ) -> list[SeenLandmarks]:
-    """Return the landmarks at ``positions`` (metres, world) that each image shows, with the deviation of their distance."""
+    """Return the landmarks, at ``positions`` (metres, world), seen in each image, with the deviation of their distance."""
     sightings, image = observations.sightings, observations.image
     away = positions[sightings.point] - sightings.centre
     distance = torch.linalg.vector_norm(away, dim=-1)
@@ -292,7 +294,7 @@ def _across_and_along(
 def _mean_descriptors(
     descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int
 ) -> UInt8[Tensor, "n d"]:
-    """Return mean descriptors, rescaled to the mean length, since a shorter descriptor is nearer to all others."""
+    """Return mean descriptors, rescaled to the mean norm, since a shorter descriptor is closer to all others."""
     total, lengths = torch.zeros((count, descriptors.shape[1])), torch.zeros((count, 1))
     zero = byte_of_zero(descriptors)
     for rows in torch.arange(len(descriptors)).split(MANY):

@@ -1,8 +1,8 @@
-"""Vocabularies of descriptors, and the vectors to which they pool the descriptors of an image.
+"""Visual vocabularies, and the VLAD vectors into which they pool the descriptors of an image.
 
-A VLAD vector (Jegou et al. 2010, "Aggregating local descriptors into a compact image representation") sums, for each word of a
-vocabulary, the differences of the descriptors nearest to it, so that an image is one vector whatever its number of keypoints.
-Maps store landmarks and no images: what each camera of a map sees of them stands for its image.
+For each word of a vocabulary, a VLAD vector (Jegou et al. 2010, "Aggregating local descriptors into a compact image
+representation") sums the residuals of the descriptors nearest to it, so an image becomes one vector whatever its number of
+keypoints. Maps store landmarks instead of images: the landmarks visible to each of a map's cameras represent its image.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 WORDS = 32
 SAMPLE = 20_000
-"""Largest number of descriptors that a vocabulary is made of."""
+"""Maximum number of descriptors from which a vocabulary is built."""
 SAMPLED = 20
 """Number of descriptors per cell in the sample on which k-means runs."""
 ROUNDS = 6
 """Iterations of Lloyd's algorithm; the cells need to be balanced, not optimal."""
 BLOCK = 2**20
-"""Number of distances to centres of cells that are computed at a time, which bounds the memory."""
+"""Number of distances to cell centres computed at a time, which bounds the memory."""
 VIEWPOINTS = 48
-"""Largest number of cameras of a map that are pooled; of more, evenly spaced ones."""
+"""Maximum number of cameras of a map that are pooled; if there are more, evenly spaced ones are chosen."""
 VISIBLE_BEYOND_DEG = 10.0
-"""Angle beyond the cone of directions from which a landmark was seen within which it still counts as visible."""
+"""Margin around a landmark's cone of viewing directions within which it still counts as visible."""
 FEWEST = 8
-"""Number of landmarks below which what a camera sees is not pooled."""
+"""Minimum number of visible landmarks for a camera to be pooled."""
 
 
 def k_means(
     descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
 ) -> Float[Tensor, "c d"]:
-    """Return the centres of k-means cells (Lloyd 1982) on a sample; a centre that loses all its members stays in place."""
+    """Return the centres of k-means clusters (Lloyd 1982) of a sample; the centre of an emptied cluster stays in place."""
     sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLED * count]
     values = descriptors[sample.to(descriptors.device)].float()
     centres = values[:count].clone()
@@ -54,41 +54,41 @@ def k_means(
 
 
 def nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
-    """Return the number of the centre nearest to each descriptor."""
+    """Return the index of the centre nearest to each descriptor."""
     rows = max(1, BLOCK // len(centres))
     return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(rows)])
 
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """Words of descriptors, and the pooling of descriptors by them."""
+    """Visual words, by which the descriptors of an image are pooled."""
 
     words: Float[Tensor, "w d"]
 
     @staticmethod
     def of(descriptors: Sequence[UInt8[Tensor, "n d"]], seed: int = 0) -> Vocabulary:
-        """Return the vocabulary of some maps, each of which contributes equally many of its descriptors."""
+        """Build a vocabulary from an equal number of descriptors from each map."""
         generator = torch.Generator().manual_seed(seed)
         share = -(-SAMPLE // len(descriptors))
         some = torch.cat([one[torch.randperm(len(one), generator=generator)[:share]] for one in descriptors])
         return Vocabulary(k_means(some, min(WORDS, len(some)), generator))
 
     def pooled(self, descriptors: UInt8[Tensor, "n d"], word: Tensor | None = None) -> Float[Tensor, "p"]:
-        """Return the VLAD vector of descriptors, of unit length; ``word`` is the nearest word of each, where that is known."""
+        """Return the VLAD vector of descriptors, of unit length; ``word`` is each one's nearest word, if known."""
         word = self.nearest(descriptors) if word is None else word
         sums = torch.zeros_like(self.words).index_add_(0, word, descriptors.float() - self.words[word])
         roots = sums.sign() * sums.abs().sqrt()  # so that repeated structures do not dominate
         return normalize(normalize(roots, dim=1).flatten(), dim=0)
 
     def nearest(self, descriptors: UInt8[Tensor, "n d"]) -> Tensor:
-        """Return the number of the word nearest to each descriptor."""
+        """Return the index of the word nearest to each descriptor."""
         return nearest_centre(descriptors, self.words)
 
 
 def pooled_views(
     vocabulary: Vocabulary, landmarks: LandmarkMap, cameras: Sequence[tuple[Intrinsics, SE3]]
 ) -> Float[Tensor, "v p"]:
-    """Return the VLAD vectors of what cameras of a map (T_world_camera) see of its landmarks, and of all of them as the last."""
+    """Return the VLAD vectors of the landmarks visible to a map's cameras (T_world_camera), and of all landmarks last."""
     word = vocabulary.nearest(landmarks.descriptors)
     found = []
     for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / VIEWPOINTS))]:
@@ -99,7 +99,7 @@ def pooled_views(
 
 
 def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Bool[Tensor, "n"]:
-    """Return which landmarks show in the image of a camera, unless something hides them."""
+    """Return a mask of the landmarks visible to a camera, ignoring occlusion."""
     pose = T_world_camera.to(torch.float32)
     x, y, z = pose.inverse().apply(landmarks.positions).unbind(-1)
     inside = (x.abs() * camera.fx <= z * camera.width / 2) & (y.abs() * camera.fy <= z * camera.height / 2)

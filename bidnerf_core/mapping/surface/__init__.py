@@ -1,1 +1,1 @@
-"""The surface of a map: oriented discs (surfels) and an index of them, baked from a field's rendered depth or from measured depth."""
+"""The surface of a map: oriented discs (surfels) and their index, baked from rendered or measured depth."""

@@ -1,4 +1,4 @@
-"""Baking: the surface of any field, from depth that was rendered or measured from many places."""
+"""Baking the surface of any field from depth rendered or measured at many poses."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ Camera = tuple[Intrinsics, SE3]
 """Intrinsics and T_world_camera."""
 
 KEYFRAME_SIDE = 400
-"""Largest number of pixels along the longer side of a rendered keyframe."""
+"""Maximum number of pixels along the longer side of a rendered keyframe."""
 MOST = 100
-"""Largest number of keyframes that are rendered, from cameras at regular intervals."""
+"""Maximum number of rendered keyframes, from cameras at regular intervals."""
 SPACING_POINTS = 5000
-"""Points of a scan whose nearest neighbours tell how far its points are apart."""
+"""Number of points of a scan from whose nearest neighbours the point spacing is estimated."""
 NOISE_RAYS = 4096
-"""Rays on which the colour noise is measured."""
+"""Number of rays on which the colour noise is measured."""
 
 
 def rendered_views(
     field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[View]:  # fmt: skip
-    """Return images with depth that ``field`` renders from ``cameras``, for a map that came without photos."""
+    """Render images with depth of ``field`` from ``cameras``, for a map without photos."""
     chosen = cameras[:: max(1, math.ceil(len(cameras) / MOST))]
     views = list[View]()
     for number, (intrinsics, T) in enumerate(chosen):
@@ -63,7 +63,7 @@ def rendered_views(
 
 @torch.no_grad()
 def colour_noise(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float:
-    """Return the root mean square difference between rendered and photographed colours, over pixels of all views."""
+    """Return the root mean square difference between rendered and photographed colours over pixels of all views."""
     count, generator = max(NOISE_RAYS, len(views)), torch.Generator().manual_seed(0)
     pixels = draw(views, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
@@ -72,17 +72,17 @@ def colour_noise(field: RadianceField, bounds: SceneBounds, views: Sequence[View
 
 @dataclass(frozen=True)
 class BakeConfig(Settings):
-    """Settings of baking."""
+    """Settings for baking."""
 
-    # number of rays rendered, shared out equally among the views
+    # number of rendered rays, divided equally among the views
     rays: Annotated[int, Range(1000, 10**9)] = 300_000
-    # number of pixels of measured depth that are used, shared out equally among the views
+    # number of pixels of measured depth used, divided equally among the views
     measured: Annotated[int, Range(1000, 10**9)] = 2_000_000
-    # largest number of cells that the scene's box is divided into; those far from the surface take no memory
+    # maximum number of cells in the scene's box; those far from the surface take no memory
     cells: Annotated[int, Range(1000, MOST_CELLS)] = MOST_CELLS
-    megabytes: Annotated[float, Above(0)] = 200.0  # largest memory of the surface, which makes cells coarser
+    megabytes: Annotated[float, Above(0)] = 200.0  # memory limit of the surface, which makes cells coarser
     opacity: Annotated[float, Above(0, 0.999)] = 0.9  # opacity below which a ray meets no surface
-    # number of other views in which a point must lie on the surface
+    # minimum number of other views in which a point must lie on the surface
     agreement: Annotated[int, Range(0, WITNESSES)] = 2
 
 
@@ -94,16 +94,15 @@ def bake(
     config: BakeConfig = BakeConfig(),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SurfaceMap:
-    """Return the surface that the measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree on.
+    """Bake the surface on which measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree.
 
-    Points on which several of these images agree are kept, fused into surfels and indexed by a grid whose cells are as fine
-    as the images and their noise allow (see ``cell_size``). Measured depth is more accurate than a field that was trained on
-    it, so render depth only where none was measured. Raises ``InputError`` if there is no image, or no point on which they
-    agree.
+    Points confirmed by several of these images are fused into surfels and indexed by a grid whose cells are as fine as the
+    images and their noise allow (see ``cell_size``). Measured depth is more accurate than a field trained on it, so render
+    depth only where none was measured. Raises ``InputError`` if there are no images, or no points on which they agree.
     """
     total = len(views) + len(cameras)
     if not total:
-        raise InputError("nothing to bake a surface from: expected at least one camera or view")
+        raise InputError("no images to bake a surface from: expected at least one camera or view")
     images = [measured_image(view, config.measured / total) for view in views]
     for number, (intrinsics, T) in enumerate(cameras, start=1):
         images.append(rendered_image(field, bounds, intrinsics, T, config.rays / total))
@@ -112,7 +111,7 @@ def bake(
 
 
 def surface_of(images: Sequence[PosedDepthImage], bounds: SceneBounds, config: BakeConfig) -> SurfaceMap:
-    """Return the surface that images with depth show, see ``bake``."""
+    """Bake the surface from images with depth, see ``bake``."""
     cell = max(finest_cell(images, config.opacity), VoxelGrid.filling(bounds, config.cells).cell)
     tolerance = 2 * max(cell, comparison_noise(images, config.opacity))
     points, rgb = _agreed_points(images, tolerance, config)
@@ -131,9 +130,9 @@ def surface_of_points(
     points: Float[Tensor, "p 3"], rgb: Float[Tensor, "p 3"], bounds: SceneBounds, cameras: Sequence[Camera],
     config: BakeConfig = BakeConfig(),
 ) -> SurfaceMap:  # fmt: skip
-    """Return the surface that points on matter (metres, world) show, such as those of a scan; ``cameras`` become its keyframes.
+    """Bake the surface from points on it (metres, world), such as a scan's; ``cameras`` become its keyframes.
 
-    Its cells are as fine as the points are dense. Raises ``InputError`` where no point lies within the bounds.
+    The cells follow the density of the points. Raises ``InputError`` for fewer than two points within the bounds.
     """
     inside = VoxelGrid.covering(bounds, VoxelGrid.filling(bounds, config.cells).cell).contains(points)
     points, rgb = points[inside].float(), rgb[inside].float()
@@ -153,9 +152,7 @@ def surface_of_points(
 def _agreed_points(
     images: Sequence[PosedDepthImage], tolerance: float, config: BakeConfig
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return the points (metres, world) that other images show at the same place, to within ``tolerance`` (metres), and
-    their colours.
-    """
+    """Return the points (metres, world) that other images confirm to within ``tolerance`` (metres), and their colours."""
     points, colours = [], []
     for number, posed in enumerate(images):
         solid = posed.solid(config.opacity)

@@ -1,4 +1,4 @@
-"""Sphere tracing of a baked surface (Hart 1996): where rays meet it, or how closely they pass by."""
+"""Sphere tracing of a baked surface (Hart 1996): where rays hit it, or how closely they pass it."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from bidnerf_core.devices import constant, may_wait
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap
 
 ROUND = 6
-"""Number of steps after which rays that have met the surface or left the grid are dropped."""
+"""Number of steps after which rays that have hit the surface or left the grid are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """Where each ray met the surface or, if it met nothing, came closest to it in terms of angle."""
+    """The point at which each ray hit the surface or, if it missed, came closest to it in angle."""
 
     met: Bool[Tensor, "r"]
-    along: Float[Tensor, "r"]  # metres along the ray to that place
-    index: Int[Tensor, "r"]  # the surfel there
+    along: Float[Tensor, "r"]  # metres along the ray to that point
+    index: Int[Tensor, "r"]  # the surfel nearest to it
 
 
 def cast(
@@ -31,11 +31,11 @@ def cast(
     steps: int = 36,
     radius: float | None = None,
 ) -> Cast:
-    """Trace rays (metres, world; unit directions) until they are within ``radius`` of a surfel (metres; by default that of the
-    surface's discs). A step is as long as the clearance, and a cell at least.
+    """Trace rays (metres, world; unit directions) until they are within ``radius`` (metres; by default the surfels' radius)
+    of a surfel. A step is as long as the clearance, but at least a cell.
 
-    A ray that does not cross the grid counts as closest where it is nearest to the grid's centre. Rays must be on the surface's
-    device. Where the host must not wait, rays that are done are not dropped but traced to the end, without effect.
+    For a ray that misses the grid, the closest point is that nearest to the grid's centre. Rays must be on the surface's
+    device. Where the host must not wait for the device, finished rays are traced to the end, without effect.
     """
     radius = surface.surfel_radius if radius is None else radius
     rays, cell = surface.grid.rays(origins, directions), surface.grid.cell
@@ -68,8 +68,8 @@ def cast(
 def trace(
     surface: SurfaceMap, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"], steps: int = 48
 ) -> Float[Tensor, "*r"]:
-    """Return the distance (metres) at which each ray comes within a cell of the surface inside the grid, infinite where it
-    does not. ``directions`` are unit.
+    """Return the distance (metres) at which each ray comes within a cell of the surface inside the grid; infinite if it
+    never does. ``directions`` are unit vectors.
     """
     shape, (origins, directions) = directions.shape[:-1], (x.reshape(-1, 3) for x in (origins, directions))
     found = cast(surface, origins, directions, steps, surface.grid.cell)

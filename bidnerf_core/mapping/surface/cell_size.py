@@ -1,4 +1,4 @@
-"""The size of a surface's cells: as fine as the images resolve, but no finer than their accuracy and a memory limit allow."""
+"""The cell size of a surface: as fine as the images resolve and their accuracy and a memory limit allow."""
 
 from __future__ import annotations
 
@@ -21,52 +21,52 @@ from bidnerf_core.mapping.surface.surface_map import surfel_bytes
 from bidnerf_core.mapping.surface.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
 
 PIXEL = 0.7
-"""Cell as a share of a pixel's footprint: pixels of several images lie between each other's and together resolve more."""
+"""Cell as a fraction of a pixel's footprint; several images together resolve more than one."""
 LAYER = 2.0
-"""Least cell in standard deviations of depth: in finer ones, the points of one plane would make several layers of surfels."""
+"""Minimum cell in standard deviations of depth; with finer ones, a plane would become several layers of surfels."""
 PER_CELL = 1.32
-"""Least mean number of points in the cells that hold any. Points scattered at random leave 5/9 of the cells empty then; with
-fewer points, surfels are farther from each other on average than the radius of their discs, which is 1.5 cells.
+"""Minimum mean number of points per occupied cell. Randomly scattered points then leave 5/9 of the cells empty; with fewer, the
+mean distance between surfels exceeds the radius of their discs, which is 1.5 cells.
 """
 COMPARED_IMAGES, CELL_POINTS = 40, 400
-"""Images, and points of each, from which the noise is estimated."""
+"""Number of images, and of points in each, from which the noise is estimated."""
 GROSS = 5.0
-"""Differences of more than this multiple of the median are occlusions and gross errors, not noise."""
+"""Multiple of the median above which differences are occlusions or gross errors instead of noise."""
 MOST_NOISE = 2.0
-"""Upper limit of the noise, in standard deviations of an unknown sensor: images that differ by more contradict each other."""
+"""Upper limit of the noise, in standard deviations of an unknown sensor; images that differ by more are inconsistent."""
 COARSER = 2**0.25
-"""Factor by which cells grow until there are enough points in them, or until they take little enough memory."""
+"""Factor by which cells grow until they contain enough points and fit into memory."""
 
 
 def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the least cell (metres) that the images justify, by their resolution and by the noise of measured depth.
+    """Return the finest cell (metres) that the images' resolution and the noise of measured depth justify.
 
-    Rendered images are thinned out too much to distinguish noise from the structure of the scene.
+    Rendered images are too sparsely sampled to distinguish noise from scene structure.
     """
     measured = [posed for posed in images if posed.measured]
     return max(PIXEL * footprint(images, opacity), LAYER * depth_noise(measured, opacity))
 
 
 def footprint(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the side (metres) of what a pixel of the full images covers at the median distance; 0 where nothing is seen."""
+    """Return the footprint (side, metres) of a full-resolution pixel at the median distance; 0 if no surface is visible."""
     return _median([float(d.median()) / posed.full_focal for posed, d in _depths(images, opacity)])
 
 
 def spacing(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the side (metres) of what a pixel of the images as they are, thinned out, covers at the median distance."""
+    """Return the footprint (side, metres) of a pixel of the subsampled images at the median distance."""
     return _median([float(d.median()) / posed.focal for posed, d in _depths(images, opacity)])
 
 
 def depth_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the standard deviation (metres) of one image's depth, from how much images differ on the same points.
+    """Return the standard deviation (metres) of an image's depth, from differences between images of the same points.
 
-    It contains errors of the poses. It is 0 where no two images show the same points.
+    It includes pose errors. It is 0 if no two images show the same points.
     """
     return _spread(images, opacity, lambda posed, points: posed.smoothly_beyond(points, opacity))
 
 
 def comparison_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return ``depth_noise`` as ``agreed`` meets it: against the nearest pixels of images that were thinned out."""
+    """Return ``depth_noise`` for the comparison in ``agreed``, with the nearest pixels of subsampled images."""
     return _spread(images, opacity, PosedDepthImage.beyond)
 
 
@@ -92,10 +92,10 @@ def _spread(
 def chosen_grid(
     points: Float[Tensor, "p 3"], bounds: SceneBounds, finest: float, coarsest: float, megabytes: float
 ) -> VoxelGrid:
-    """Return the grid whose cells (metres) are ``finest``, or coarser where points (metres, world) are few or memory is short.
+    """Return a grid with cells of ``finest`` metres, or coarser if points (metres, world) or memory are scarce.
 
-    For want of points, cells grow no larger than ``coarsest``, at which each holds a pixel. An ``InputWarning`` states by how
-    much the limit of ``megabytes`` made them larger. Raises ``InputError`` where no cell is large enough for that limit.
+    If points are scarce, cells grow up to ``coarsest`` at most, at which each contains a pixel. If the limit of ``megabytes``
+    makes them larger, an ``InputWarning`` states by how much. Raises ``InputError`` if no cell size satisfies that limit.
     """
     grid = VoxelGrid.covering(bounds, finest)
     while grid.cell < coarsest and len(points) < PER_CELL * len(grid.numbers(points).unique()):
@@ -109,7 +109,7 @@ def chosen_grid(
         size = "too many cells" if math.isinf(needed) else f"{needed / 1e6:.0f} MB"
         warnings.warn(
             f"the surface would take {size} with cells of {wished.cell:.3g}; cells of {grid.cell:.3g} keep it within"
-            f" {megabytes:g} MB, of which 'bake --megabytes' allows more",
+            f" {megabytes:g} MB; raise this limit with 'bake --megabytes'",
             InputWarning,
             stacklevel=2,
         )
@@ -117,7 +117,7 @@ def chosen_grid(
 
 
 def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
-    """Return the memory that a surface of these points (metres, world) takes; infinite where it has too many cells."""
+    """Return the memory (bytes) of a surface from these points (metres, world); infinite if it has too many cells."""
     if math.prod(-(-count // BLOCK_SIDE) * BLOCK_SIDE for count in grid.shape) > MOST_CELLS:
         return math.inf
     surfels = len(grid.numbers(points).unique())
@@ -127,7 +127,7 @@ def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
 def _depths(
     images: Sequence[PosedDepthImage], opacity: float
 ) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:
-    """Return the images that show a surface, with its depths (metres)."""
+    """Return the images that show a surface, with the depths of their pixels on it (metres)."""
     found = [(posed, posed.image.depth[posed.solid(opacity)]) for posed in images]
     return [(posed, depths) for posed, depths in found if len(depths)]
 

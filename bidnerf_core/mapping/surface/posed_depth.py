@@ -1,4 +1,4 @@
-"""Images with depth and a known pose, and how well they agree with each other on where the surface is."""
+"""Depth images with known poses, and the consistency checks between them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 
 WITNESSES = 8
-"""Largest number of other images with which each point is compared."""
+"""Maximum number of other images with which each point is compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +29,16 @@ class PosedDepthImage:
     intrinsics: Intrinsics
     T_world_camera: SE3
     image: RenderedImage
-    full_focal: float  # pixels, before the image was thinned out
-    measured: bool = False  # by a sensor: opacity is 1 where it measured, and 0 where nothing is known
+    full_focal: float  # pixels, before the image was subsampled
+    measured: bool = False  # by a sensor: opacity is 1 where it measured, and 0 elsewhere
 
     @property
     def focal(self) -> float:
-        """The focal length (pixels) of the image as it is."""
+        """The focal length (pixels) of the subsampled image."""
         return mean_focal(self.intrinsics)
 
     def solid(self, opacity: float) -> Bool[Tensor, "h w"]:
-        """Return the pixels that show a surface of at least this opacity."""
+        """Return a mask of the pixels that show a surface with more than this opacity."""
         return (self.image.opacity > opacity) & (self.image.depth > 0)
 
     def points(self, pixels: Bool[Tensor, "h w"]) -> Float[Tensor, "p 3"]:
@@ -47,9 +47,7 @@ class PosedDepthImage:
         return self.T_world_camera.to(torch.float32).apply(rays * self.image.depth[pixels][:, None])
 
     def beyond(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
-        """Return how far behind each point (metres, world) its line of sight ends (metres of depth); NaN where the image
-        does not show it.
-        """
+        """Return how far beyond each point (metres, world) its line of sight ends (metres of depth); NaN outside the image."""
         local = self.T_world_camera.to(torch.float32).inverse().apply(points)
         u, v = self.intrinsics.project(local).unbind(-1)
         height, width = self.image.depth.shape
@@ -57,12 +55,12 @@ class PosedDepthImage:
         index = torch.where(within, v.floor() * width + u.floor(), 0).long()
         depth = self.image.depth.view(-1)[index]
         nothing = self.image.opacity.view(-1)[index] < 0.5
-        # Without depth, a rendered image shows the background, and a measured one may show anything.
+        # Without depth, a rendered pixel shows the background, but a measured one may show anything.
         behind = torch.where(nothing, torch.nan if self.measured else torch.inf, depth) - local[:, 2]
         return torch.where(within, behind, torch.nan)
 
     def smoothly_beyond(self, points: Float[Tensor, "p 3"], opacity: float) -> Float[Tensor, "p"]:
-        """Return ``beyond`` with depth interpolated between pixels; NaN where one of the four shows no surface."""
+        """Return ``beyond`` with depth interpolated between four pixels; NaN where one of them shows no surface."""
         local = self.T_world_camera.to(torch.float32).inverse().apply(points)
         height, width = self.image.depth.shape
         place = 2 * self.intrinsics.project(local) / local.new_tensor([width, height]) - 1
@@ -73,21 +71,21 @@ class PosedDepthImage:
 
 
 def mean_focal(intrinsics: Intrinsics) -> float:
-    """Return the focal length of square pixels of the same area (pixels)."""
+    """Return the geometric mean of the focal lengths (pixels)."""
     return math.sqrt(intrinsics.fx * intrinsics.fy)
 
 
 def rendered_image(
     field: RadianceField, bounds: SceneBounds, intrinsics: Intrinsics, T_world_camera: SE3, pixels: float
 ) -> PosedDepthImage:
-    """Return what the field shows from a pose, in about ``pixels`` pixels."""
+    """Render the field from a pose at a resolution of about ``pixels`` pixels."""
     small, T = _shrunk(intrinsics, pixels), T_world_camera
     image = render_image(field, small, T, bounds)
     return PosedDepthImage(small, T.to("cpu", torch.float64), image, mean_focal(intrinsics))
 
 
 def measured_image(view: View, pixels: float) -> PosedDepthImage:
-    """Return a view's colours and measured depth, thinned out to about ``pixels``."""
+    """Return a view's colours and measured depth, subsampled to about ``pixels`` pixels."""
     frame = view.frame
     small = _shrunk(frame.intrinsics, pixels)
     scale = torch.tensor([frame.intrinsics.width / small.width, frame.intrinsics.height / small.height])
@@ -100,7 +98,7 @@ def measured_image(view: View, pixels: float) -> PosedDepthImage:
 
 
 def _shrunk(intrinsics: Intrinsics, pixels: float) -> Intrinsics:
-    """Return the same camera with about ``pixels`` pixels, or as it is where it has fewer."""
+    """Return the camera scaled down to about ``pixels`` pixels; unchanged if it has fewer."""
     return intrinsics.scaled(min(1.0, math.sqrt(pixels / (intrinsics.width * intrinsics.height))))
 
 
@@ -111,8 +109,8 @@ def agreed(
     tolerance: float,
     needed: int,
 ) -> Bool[Tensor, "p"]:
-    """Return which points of image ``number`` are shown, to within ``tolerance`` (metres), by at least ``needed`` other images
-    and by no fewer than look through them.
+    """Return a mask of the points of image ``number`` that at least ``needed`` other images confirm, to within ``tolerance``
+    (metres), and that no more images see through.
     """
     agree, against = (torch.zeros(len(points), dtype=torch.int32) for _ in range(2))
     others = witnesses(number, images)
@@ -124,7 +122,7 @@ def agreed(
 
 
 def witnesses(number: int, images: Sequence[PosedDepthImage]) -> list[int]:
-    """Return the images with the most similar poses: they are the likeliest to show the same points."""
+    """Return the images with the most similar poses, which are the most likely to show the same points."""
     here = images[number].T_world_camera
     centres = torch.stack([s.T_world_camera.translation for s in images])
     axes = torch.stack([s.T_world_camera.rotation[:, 2] for s in images])

@@ -1,4 +1,4 @@
-"""The baked surface: surfels, small discs fused from points, and an index that finds the one nearest to a point."""
+"""The baked surface: surfels (small discs fused from points), with an index for nearest-neighbour look-up."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
 
 SURFEL_NEIGHBOURS = 12
-"""Number of surfels to which the plane and the colour gradient of each surfel are fitted."""
+"""Number of neighbours to which each surfel's plane and colour gradient are fitted."""
 RADIUS = 0.7
 """Radius of a surfel, as a fraction of its distance from its fourth neighbour."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Points of a surface with its normals and colours there. World frame, metres."""
+    """Points of a surface with normals and colours. World frame, metres."""
 
     positions: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # unit; their sign has no meaning
@@ -35,12 +35,12 @@ class Surfels:
 
 
 def surfel_bytes(count: int) -> int:
-    """Return the memory that ``count`` surfels take: 18 numbers of 4 bytes each."""
+    """Return the memory (bytes) of ``count`` surfels: 18 numbers of 4 bytes each."""
     return 72 * count
 
 
 def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[Tensor, "n"], list[Tensor]]:
-    """Return which cells hold points, in ascending order, and the means of the points' ``values`` in each of them."""
+    """Return the occupied cells, in ascending order, and the means of the points' ``values`` in each."""
     found, place, counts = cells.unique(return_inverse=True, return_counts=True)
     means = [
         torch.zeros((len(found), v.shape[-1]), dtype=v.dtype).index_add_(0, place, v) / counts[:, None]
@@ -50,7 +50,7 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
 
 
 def fused_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
-    """Return surfels of merged points: fit a plane to the neighbours of each point and move it onto that plane."""
+    """Make surfels of merged points: fit a plane to the neighbours of each point and project it onto that plane."""
     near = _neighbours(positions, SURFEL_NEIGHBOURS)
     offsets = positions[near] - positions[:, None]
     mean = offsets.mean(1)
@@ -62,7 +62,7 @@ def fused_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) ->
 
 
 def _neighbours(positions: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n k"]:
-    """Return the indices of each point's nearest points, itself among them."""
+    """Return the indices of each point's nearest neighbours, including itself."""
     points = positions.numpy()
     _, index = cKDTree(points).query(points, k=min(count, len(points)), workers=-1)
     return torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), -1))
@@ -87,15 +87,15 @@ def _gradient(
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMap:
-    """Surfels, and the index that finds the one nearest to a point in constant time."""
+    """Surfels with an index for nearest-neighbour look-up in constant time."""
 
     surfels: Surfels
     index: SurfelIndex
-    keyframes: Float[Tensor, "k 4 4"]  # T_world_camera from which the surface was seen
+    keyframes: Float[Tensor, "k 4 4"]  # T_world_camera of the images from which the surface was baked
 
     @property
     def device(self) -> torch.device:
-        """Device of the surfels, their index and the keyframes, and of the rays and points that meet them."""
+        """Device of the surfels, their index and the keyframes, on which rays and query points must be too."""
         return self.surfels.positions.device
 
     def to(self, device: torch.device | str) -> SurfaceMap:
@@ -104,22 +104,22 @@ class SurfaceMap:
 
     @property
     def grid(self) -> VoxelGrid:
-        """The cells around the surface in which points are looked up."""
+        """The voxel grid in which points are looked up."""
         return self.index.grid
 
     @property
     def bytes(self) -> int:
-        """Memory that the surfels and their index take."""
+        """Memory of the surfels and their index, in bytes."""
         return surfel_bytes(len(self.surfels)) + self.index.bytes
 
     @property
     def mebibytes(self) -> float:
-        """Memory that the surfels and their index take, in MiB."""
+        """Memory of the surfels and their index, in MiB."""
         return self.bytes / 2**20
 
     @property
     def stored_cells(self) -> int:
-        """Number of entries of the index: one for each cell near the surface, and one for several cells far from it."""
+        """Number of entries of the index: one per cell near the surface, and one per several cells far from it."""
         return len(self.index.entries)
 
     @property
@@ -135,10 +135,10 @@ class SurfaceMap:
 
     @cached_property
     def surfel_radius(self) -> float:
-        """Distance from a surfel at which a ray counts as having met it (metres).
+        """Distance from a surfel within which a ray counts as hitting it (metres).
 
-        It is a share of the distance to the fourth neighbour, which nine tenths of the surfels do not exceed: large enough
-        to leave few holes between them, small enough to keep edges.
+        It is a fraction of the 90th percentile of the surfels' distances to their fourth neighbours: large enough to leave
+        few holes between them, small enough to preserve edges.
         """
         points = self.surfels.positions.cpu().numpy()  # scipy's tree is the host's
         away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=min(5, len(points)))
@@ -149,7 +149,7 @@ class SurfaceMap:
 
     @cached_property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Corners (metres, world) of the box that holds the middle nine tenths of the surfels along each axis."""
+        """Corners (metres, world) of the box that contains the middle 90 % of the surfels along each axis."""
         ordered = self.surfels.positions.sort(0).values
         last = len(ordered) - 1
         return ordered[round(0.05 * last)], ordered[round(0.95 * last)]
@@ -160,7 +160,7 @@ class SurfaceMap:
         self.index.warm_up()
 
     def nearest(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
-        """Return the index of the surfel nearest to each point (metres, world), as exactly as ``SurfelIndex`` finds it.
+        """Return the index of the surfel nearest to each point (metres, world), to the accuracy of ``SurfelIndex``.
 
         A point outside the grid is first clamped to the grid's border.
         """

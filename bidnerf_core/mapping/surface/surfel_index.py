@@ -1,9 +1,9 @@
-"""The index of surfels: which one is nearest to a point, in constant time and memory in proportion to the surface.
+"""Index of surfels: finds the one nearest to a point in constant time, with memory proportional to the surface's area.
 
-The cells of a voxel grid are grouped into blocks of 8 x 8 x 8. A dense table of blocks holds where the entries of each block
-begin and how many cells share one entry: one cell where surface is near, 2, 4 or 8 along each side farther away, so that a
-block far from all surface has a single entry. Within a block, cells are in Morton order (x, y and z interleaved bit by bit),
-in which cells that share an entry are consecutive; a look-up is thus three gathers, whatever the point.
+The cells of a voxel grid are grouped into blocks of 8 x 8 x 8. A dense table of blocks holds where each block's entries begin
+and how many cells share an entry: one cell near the surface, and 2, 4 or 8 along each side farther away, so a block far from
+any surface has a single entry. Within a block, cells are in Morton order (x, y and z interleaved bit by bit), so cells that
+share an entry are consecutive. A look-up is three gathers for any point.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ BLOCK_SIDE = 8
 """Cells along the side of a block."""
 CELLS_OF_BLOCK = BLOCK_SIDE**3
 MOST_CELLS = 2**31 - 1
-"""Largest number of cells of all blocks, since cells are numbered in 32 bits."""
+"""Maximum number of cells in all blocks, since cells are numbered in 32 bits."""
 COARSER_FROM = (2.0, 3.5, 6.0)
-"""Distances of a block's nearest octant from the nearest octant with surfels, centre to centre in octants of 4 cells, from
-which 2, 4 and 8 cells along each side share an entry. All surfels are then at least twice as far away as that side is long."""
+"""Minimum distances of a block's octants from octants with surfels (centre to centre, in octants of 4 cells) for 2, 4 and 8
+cells along each side to share an entry. All surfels are then at least twice that side away."""
 ENTRIES_AT_ONCE = 1 << 20
-"""Number of entries that are looked for at once."""
+"""Number of entries computed at once."""
 
 LEAF = 32
-"""Surfels in a leaf of the k-d tree: measured to be fastest for points some cells away from a plane of surfels."""
+"""Surfels in a leaf of the k-d tree: the fastest in measurements with points some cells away from a plane of surfels."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfelIndex:
-    """Finds the surfel nearest to a point, to within a cell near the surface and to within its distance far from it."""
+    """Nearest-neighbour index of surfels, accurate to about a cell near the surface and to the distance far from it."""
 
     grid: VoxelGrid
     first: Int[Tensor, "x y z"]  # int32: each block's first entry
@@ -48,9 +48,9 @@ class SurfelIndex:
 
     @staticmethod
     def of(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> SurfelIndex:
-        """Return the index of surfels at ``positions`` (metres, world).
+        """Build the index of surfels at ``positions`` (metres, world).
 
-        Raises ``InputError`` where there is none, or where the grid has more cells than can be numbered.
+        Raises ``InputError`` if there are none, or if the grid has more cells than can be numbered.
         """
         if not len(positions):
             raise InputError("no surface to bake: no point that several views agree on")
@@ -61,15 +61,15 @@ class SurfelIndex:
 
     @property
     def bytes(self) -> int:
-        """Memory that the index takes once it is in use."""
+        """Memory of the index in use, in bytes."""
         return index_bytes(self.level)
 
     def __call__(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
         """Return the index (int64) of the surfel nearest to each point (metres, world).
 
-        The distance of that surfel exceeds the least one by at most sqrt(3) cells, or by 87 % of the least one where that is
-        more; beside a plane, by 10 % of it. A point outside the grid is first clamped to the grid's border; one that is not
-        finite gets an arbitrary surfel.
+        The distance to that surfel exceeds the smallest by at most sqrt(3) cells or 87 % of the smallest, whichever is more;
+        near a plane, by 10 %. A point outside the grid is first clamped to the grid's border; a non-finite point gets an
+        arbitrary surfel.
         """
         offset, rate, cells, base = self._numbering
         flat = points.detach().reshape(-1, 3).T
@@ -90,9 +90,9 @@ class SurfelIndex:
     def _numbering(
         self,
     ) -> tuple[Float[Tensor, "3 1"], Float[Tensor, "3 3"], Int[Tensor, "c"], Int[Tensor, "3 1"]]:
-        """The tables that turn points into numbers of cells: ``offset + rate point`` is a place in each axis' part of a table
-        (which begins at ``base``) of terms whose sum is the number. Each part has one more cell at either end, which repeats
-        the border.
+        """Tables that convert points to cell numbers: ``offset + rate point`` is a position in each axis' part (starting at
+        ``base``) of a table of terms whose sum is the number. Each part has an extra cell at either end, which repeats the
+        border.
         """
         longest = max(self.grid.shape) + 2
         parts, strides = [], _strides(block_shape(self.grid))
@@ -117,17 +117,17 @@ class SurfelIndex:
 
 
 def block_shape(grid: VoxelGrid) -> tuple[int, int, int]:
-    """Return the number of blocks along x, y and z. Raises ``InputError`` where they have too many cells to be numbered."""
+    """Return the number of blocks along x, y and z. Raises ``InputError`` if they have too many cells to be numbered."""
     x, y, z = (-(-count // BLOCK_SIDE) for count in grid.shape)
     if x * y * z * CELLS_OF_BLOCK > MOST_CELLS:
         raise InputError(
-            f"a surface's grid of {x * y * z * CELLS_OF_BLOCK} cells, expected {MOST_CELLS} at most; bake it with larger cells"
+            f"the surface's grid has {x * y * z * CELLS_OF_BLOCK} cells, expected at most {MOST_CELLS}; use larger cells"
         )
     return x, y, z
 
 
 def block_levels(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> UInt8[Tensor, "x y z"]:
-    """Return the level of each block of ``grid``, see ``SurfelIndex``, for surfels at ``positions`` (metres, world)."""
+    """Return the level (see ``SurfelIndex``) of each block of ``grid``, for surfels at ``positions`` (metres, world)."""
     x, y, z = block_shape(grid)
     octants = VoxelGrid(grid.lower, BLOCK_SIDE / 2 * grid.cell, (2 * x, 2 * y, 2 * z))
     empty: Bool[Tensor, "x y z"] = torch.ones(octants.shape, dtype=torch.bool)
@@ -138,7 +138,7 @@ def block_levels(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> UInt8[Tens
 
 
 def index_bytes(level: UInt8[Tensor, "x y z"]) -> int:
-    """Return the memory that an index with blocks of these levels takes: entries of 4 bytes, and 13 for each block."""
+    """Return the memory (bytes) of an index with blocks of these levels: 4 per entry, and 13 per block."""
     return 4 * int(_counts(level).sum()) + 13 * level.numel()
 
 
@@ -157,7 +157,7 @@ def _strides(shape: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 def _morton(place: Int[Tensor, "*c 3"]) -> Int[Tensor, "*c"]:
-    """Return the Morton numbers of cells of a block, z in the lowest bit."""
+    """Return the Morton numbers of cells of a block, with z in the lowest bit."""
     spread = (place & 1) | (place & 2) << 2 | (place & 4) << 4
     return (spread[..., 0] << 2) | (spread[..., 1] << 1) | spread[..., 2]
 
