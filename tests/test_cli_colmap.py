@@ -50,7 +50,7 @@ def test_training_takes_depth_from_the_points(bidnerf: Run, shared: Path, tmp_pa
     train = ["train", shared / "data", *tiny.options()]
     found = bidnerf(*train, "--out", tmp_path / "map", "--depth-points", shared / "sparse")
     assert found.status == 0
-    assert "its unit is 0.37 m by 6 training cameras, places agree" in found.err
+    assert "its unit is 0.37 m according to 6 training cameras, positions agree" in found.err
     info = load_info(tmp_path / "map")
     assert info.sparse_depth > 30
     assert f"depth at {info.sparse_depth} pixels of 6 of 6 images" in found.err
@@ -86,7 +86,7 @@ def test_localization_takes_the_points_that_the_frames_observe(bidnerf: Run, sha
     without, with_points = bidnerf(*place), bidnerf(*place, "--depth-points", shared / "sparse")
     assert (without.status, with_points.status) == (0, 0)
     assert json.loads(without.out)["loss"] != json.loads(with_points.out)["loss"]
-    assert "its unit is 0.37 m by 6 training cameras" in with_points.err
+    assert "its unit is 0.37 m according to 6 training cameras" in with_points.err
     assert "points seen" in with_points.err
     assert "none by" not in with_points.err
 
@@ -163,7 +163,7 @@ def test_a_model_that_is_of_no_use_is_told_in_a_line(bidnerf: Run, shared: Path,
     training = sparse_model.write(tmp_path / "training", sparse_model.known(views, names))
     # The model is summarized once, whatever frames follow.
     assert_refused_last(
-        bidnerf(*place, "--depth-points", training), "no points that t_0001 observes", "6 images"
+        bidnerf(*place, "--depth-points", training), "no points observed by t_0001", "6 images"
     )
     strangers = sparse_model.write(
         tmp_path / "strangers", sparse_model.known(views, [f"x{n}" for n in names])

@@ -161,7 +161,7 @@ def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None
     assert len(json.loads((tmp_path / "path.json").read_text())) == 3
     status, _, err = bidnerf(*track, "val")
     assert status == 1
-    assert f"{tmp_path / 'data'}: no frame is of a split 'val', expected one of test, train" in err
+    assert f"{tmp_path / 'data'}: no frame belongs to a split 'val', expected one of test, train" in err
     assert bidnerf("track", "MAP", tmp_path, "--follow", "--split", "test").status == 2
 
 

@@ -493,7 +493,7 @@ def matrix_with(value: Any, row: int = 1, column: int = 3) -> list[list[Any]]:
     ],
 )
 def test_frames_without_a_pose_are_left_out_and_counted(nerfstudio: Callable[..., Path], given: Any) -> None:
-    with pytest.warns(InputWarning, match=r"1 of 6 frames have no pose .* the first is images/r_1\.png"):
+    with pytest.warns(InputWarning, match=r"1 of 6 frames have no pose .* first: images/r_1\.png"):
         dataset = open_dataset(nerfstudio(edit_frame(transform_matrix=given)))
     names = [name for split in dataset.splits for name in dataset.frame_names(split)]
     assert sorted(names) == ["r_0", "r_2", "r_3", "r_4", "r_5"]
@@ -517,7 +517,7 @@ BAD_DESCRIPTIONS: dict[str, tuple[Callable[[Json], Any], str]] = {
     "file_path a number": (edit_frame(file_path=3), "frame 1: file_path is 3, expected text"),
     "image twice": (
         edit_frame(file_path="./images/r_0"),
-        "frame 1 (./images/r_0): the image of frame 0 again, expected each image once",
+        "frame 1 (./images/r_0): has the same image as frame 0, expected each image once",
     ),
     "pose of 2x2": (edit_frame(transform_matrix=[[1, 0], [0, 1]]), "transform_matrix is not 3x4 or 4x4"),
     "flat pose": (edit_frame(transform_matrix=[1.0] * 16), "transform_matrix is not 3x4 or 4x4"),

@@ -164,10 +164,10 @@ def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_
 
 
 def test_no_registration_where_there_is_none_to_do(recording: Path, data_folder: Path) -> None:
-    with pytest.raises(InputError, match=r"no depth sensor that is known, expected a file"):
+    with pytest.raises(InputError, match=r"its depth sensor is not known, expected the file"):
         open_sequence(recording, register_depth=True)
     assert open_dataset(data_folder, register_depth=False).splits
-    with pytest.raises(InputError, match=r"depth belongs to its images, expected no registration"):
+    with pytest.raises(InputError, match=r"depth is already registered to its images"):
         open_dataset(data_folder, register_depth=SENSOR)
 
 

@@ -535,7 +535,7 @@ def test_two_readers_that_claim_a_folder_are_named(tmp_path: Path) -> None:
     register("readers", "first", Claiming())
     assert find_reader(tmp_path) is load_plugin("readers", "first")
     register("readers", "second", Claiming())
-    with pytest.raises(InputError, match="is recognised by the readers first and second"):
+    with pytest.raises(InputError, match="is recognized by the readers first and second"):
         find_reader(tmp_path)
 
 
@@ -554,7 +554,7 @@ def test_a_reader_that_fails_is_named_and_passed_over(site: Site, tmp_path: Path
     with pytest.warns(InputWarning) as told:
         assert find_reader(tmp_path) is None
     said = " ".join(str(warning.message) for warning in told)
-    assert "reader 'failing' fails to look at it: OSError: no disk" in said
+    assert "reader 'failing' failed to examine it: OSError: no disk" in said
     assert "reader 'broken' (stranger_broken:reader, from stranger 1.0): cannot be imported" in said
     register("readers", "sound", Claiming())
     with pytest.warns(InputWarning):
@@ -565,8 +565,8 @@ def test_a_reader_that_fails_is_named_and_passed_over(site: Site, tmp_path: Path
 @pytest.mark.parametrize(
     ("opens", "said"),
     [
-        (lambda: {}["poses"], "fails to open it: KeyError: 'poses'"),
-        (lambda: None, "(returned a NoneType, expected a Dataset|fails to open it: AttributeError)"),
+        (lambda: {}["poses"], "failed to open it: KeyError: 'poses'"),
+        (lambda: None, "(returned a NoneType, expected a Dataset|failed to open it: AttributeError)"),
     ],
 )
 def test_a_reader_that_cannot_open_what_it_recognised_is_named(

@@ -113,7 +113,7 @@ def test_a_recording_that_lacks_frames(views: list[View], tmp_path: Path) -> Non
     files = metadata(files, poses=poses)
     del files["rgbd/1.jpg"], files["rgbd/2.depth"]
     said = remarks_of(packed(tmp_path, files))
-    assert any("1 of 4 images is missing and left out, the first is rgbd/1.jpg" in text for text in said)
+    assert any("1 of 4 images is missing and left out, first: rgbd/1.jpg" in text for text in said)
     assert any("1 of 3 frames have no depth" in text for text in said)
     assert any("1 of 3 frames have no pose and are left out" in text for text in said)
     assert len(said) == 3
@@ -146,7 +146,7 @@ RECORDINGS: dict[str, tuple[Callable[[Files], Files], str]] = {
     "no photos": (without_photos, "rgbd/0.jpg: no such photo"),
     "no metadata": (lambda f: {"icon": b""}, "scan.r3d/metadata: not found in the archive, which holds 1 file"),
     "no size": (lambda f: metadata(f, w=None), "no w and h"),
-    "no K": (lambda f: metadata(f, K=None, perFrameIntrinsicCoeffs=None), "no K of 9 numbers"),
+    "no K": (lambda f: metadata(f, K=None, perFrameIntrinsicCoeffs=None), "no K with 9 numbers"),
     "metadata": (lambda f: {**f, "metadata": b"{"}, "scan.r3d/metadata: not JSON"),
     "cut depth": (cut_depth, "rgbd/0.depth: "),
     "long depth": (long_depth, "rgbd/0.depth: "),
@@ -190,7 +190,7 @@ def test_the_missing_package_is_named(
         monkeypatch.setitem(sys.modules, name, None)
     files = record3d_files(views)
     text = message(packed(tmp_path, files))
-    assert "depth of Record3D needs the package lzfse: pip install 'bidnerf[record3d]'" in text
+    assert "reading Record3D depth needs the package lzfse: pip install 'bidnerf[record3d]'" in text
     colour = {name: content for name, content in files.items() if not name.endswith((".depth", ".conf"))}
     assert all(timed.frame.depth is None for timed in open_sequence(packed(tmp_path, colour)))
 
@@ -241,13 +241,13 @@ def test_a_video_of_another_length_and_missing_depth(views: list[View], tmp_path
     write_video(folder / "rgb.mp4", [np.full((96, 128, 3), 50, np.uint8)] * 3)
     (folder / "depth/000001.png").unlink()
     said = remarks_of(folder)
-    assert any("1 of 4 frames is missing and left out, the first is number 3" in text for text in said)
+    assert any("1 of 4 frames is missing and left out, first: frame 3" in text for text in said)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert [timed.frame.depth is not None for timed in open_sequence(folder)] == [True, False, True]
     with (folder / "odometry.csv").open("a") as file:
         file.write("1000.7")
-    assert any("the last row is cut off and is left out" in text for text in remarks_of(folder))
+    assert any("the last row is truncated and was left out" in text for text in remarks_of(folder))
 
 
 def test_intrinsics_of_each_frame(views: list[View], tmp_path: Path) -> None:
@@ -320,7 +320,7 @@ def test_lists_of_photos_that_are_not_there(views: list[View], tmp_path: Path) -
     folder = write_reality_capture(tmp_path, views)
     (folder / "2.png").unlink()
     (said,) = remarks_of(folder)
-    assert "cameras.csv: 1 of 4 photos is missing and left out, the first is 2.png" in said
+    assert "cameras.csv: 1 of 4 photos is missing and left out, first: 2.png" in said
     text = (folder / "cameras.csv").read_text()
     (folder / "cameras.csv").write_text(text.replace(",0,0,0,0,0,0\n", ",0,0,0,0.1,0,0\n").replace("\r", ""))
     text = (folder / "cameras.csv").read_text()
@@ -331,7 +331,7 @@ def test_lists_of_photos_that_are_not_there(views: list[View], tmp_path: Path) -
 def test_sequences_without_poses_and_with_missing_images(views: list[View], tmp_path: Path) -> None:
     folder = write_kitti(tmp_path / "kitti", views)
     (folder / "image_2/000001.png").unlink()
-    assert any("1 of 4 images are missing, the first is number 1" in text for text in remarks_of(folder))
+    assert any("1 of 4 images are missing, first: number 1" in text for text in remarks_of(folder))
     (tmp_path / "kitti/poses/07.txt").unlink()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

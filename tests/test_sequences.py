@@ -144,7 +144,7 @@ def test_datasets_of_other_readers_have_sequences(tmp_path: Path) -> None:
     sequence = open_sequence(tmp_path, readers=[Anything()])
     assert names(sequence) == list(Others.seen)
     assert [timed.split for timed in sequence] == ["train", "train", "test"]
-    with pytest.raises(InputError, match="with cameras of its own"):
+    with pytest.raises(InputError, match="with its own cameras"):
         open_sequence(tmp_path, readers=[Anything()], focal=100.0)
 
 
@@ -183,7 +183,7 @@ def test_places_without_a_sequence(tmp_path: Path) -> None:
     ):
         open_sequence(tmp_path / "notes.txt")
     write_transforms(tmp_path, {"train": tiny.views(1)})
-    with pytest.raises(InputError, match="is a dataset with cameras of its own, expected no other camera"):
+    with pytest.raises(InputError, match="is a dataset with its own cameras; leave out the camera"):
         open_sequence(tmp_path, camera=tiny.CAMERA)
 
 

@@ -134,7 +134,7 @@ def test_a_sequence_may_lack_poses_and_depth(scene: Path) -> None:
     assert [timed.frame.depth is None for timed in frames] == [False, False, True]
     assert [timed.time for timed in frames] == [None] * 3
     with pytest.warns(
-        InputWarning, match=r"1 of 3 poses is missing and left out, the first is frame-000001\.pose\.txt"
+        InputWarning, match=r"1 of 3 poses is missing and left out, first: frame-000001\.pose\.txt"
     ):
         dataset = open_dataset(one)
     assert [dataset.frame_names(split) for split in dataset.splits] == [["frame-000002"], ["frame-000000"]]
@@ -210,8 +210,8 @@ def test_broken_poses_name_the_file(case: str, scene: Path) -> None:
     ("text", "message"),
     [
         ("", r"TestSplit\.txt: lists no sequence"),
-        ("sequence2\nsequence7", r"TestSplit\.txt: line 2: no folder of sequence7, expected seq-07"),
-        ("sequence2\n\nsequence2", r"TestSplit\.txt: line 3: sequence2 again"),
+        ("sequence2\nsequence7", r"TestSplit\.txt: line 2: no folder for sequence7, expected seq-07"),
+        ("sequence2\n\nsequence2", r"TestSplit\.txt: line 3: sequence2 is repeated"),
         ("the second", r"TestSplit\.txt: line 1: 'the second', expected a sequence"),
     ],
 )

@@ -202,7 +202,7 @@ def test_missing_images_are_left_out_and_counted(tmp_path: Path) -> None:
     assert sorted(views_of(dataset)) == [f"{number:04d}" for number in (0, 1, 5, 6, 7, 8, 9)]
     assert len(remarks) == 1
     assert "3 of 10 images are missing and left out" in remarks[0]
-    assert remarks[0].endswith("the first is images/0002.png")
+    assert remarks[0].endswith("first: images/0002.png")
     for file in (folder / "images").iterdir():
         file.unlink()
     with pytest.raises(InputError, match=r"frame 1 .*: no image .*0001\.png, expected that file"):
@@ -215,7 +215,7 @@ def test_frames_without_their_depth_image_have_colour_alone(tmp_path: Path) -> N
     dataset, remarks = opened(folder)
     assert [name for name, view in views_of(dataset).items() if view.frame.depth is None] == ["0006"]
     assert len(remarks) == 1
-    assert "1 of 10 depth images is missing and left out, the first is depth/0006.png" in remarks[0]
+    assert "1 of 10 depth images is missing and left out, first: depth/0006.png" in remarks[0]
 
 
 def test_lists_of_names_that_no_frame_has(tmp_path: Path) -> None:

@@ -220,12 +220,12 @@ BROKEN: dict[str, tuple[str, Callable[[list[str]], list[str]], str]] = {
         r"groundtruth\.txt: line 4: the quaternion has length 0\.5, expected 1",
     ),
     "words": ("groundtruth.txt", lambda rows: ["12.5 a b c d e f g", *rows], r"groundtruth\.txt: line 4: .*'a'"),
-    "no time": ("rgb.txt", lambda rows: ["soon rgb/a.png", *rows], r"rgb\.txt: line 4: 'soon' is no time stamp"),
+    "no time": ("rgb.txt", lambda rows: ["soon rgb/a.png", *rows], r"rgb\.txt: line 4: 'soon' is not a time stamp"),
     "infinite time": ("depth.txt", lambda rows: ["inf depth/a.png", *rows], r"depth\.txt: line 4: the time stamp is inf"),
     "time twice": (
         "rgb.txt",
         lambda rows: [*rows, rows[2]],
-        r"rgb\.txt: line 14: the time stamp 1305031102\.\d+ of line 6 again",
+        r"rgb\.txt: line 14: the time stamp 1305031102\.\d+ repeats line 6",
     ),
     "two poses at a time": (
         "groundtruth.txt",
@@ -273,9 +273,9 @@ def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
     edit(folder / "groundtruth.txt", lambda rows: [*rows[:-1], rows[-1][: rows[-1].index(" ") + 6]])
     said = remarks_of(folder)
     for remark in (
-        "rgb.txt: 4 of 10 images are missing and left out, the first is rgb/",
+        "rgb.txt: 4 of 10 images are missing and left out, first: rgb/",
         "depth.txt: 5 of 10 depth images are missing",
-        "the last row is cut off (2 of 8 entries)",
+        "the last row is truncated (2 of 8 entries)",
     ):
         assert sum(remark in text for text in said) == 1
     assert len(said) == 3
@@ -298,7 +298,7 @@ def test_poses_of_keyframes_are_counted(folder: Path) -> None:
     edit(folder / "groundtruth.txt", lambda rows: [f"{times[n]:.6f} 0 0 {n} 0 0 0 1" for n in (0, 4, 8)])
     (said,) = remarks_of(folder)
     assert (
-        "7 of 10 images have no pose and are left out: its 3 poses are 0.13 s apart as a rule, as those of keyframes"
+        "7 of 10 images have no pose and are left out: its 3 poses are usually 0.13 s apart, like those of keyframes"
         in said
     )
 

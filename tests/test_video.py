@@ -155,7 +155,7 @@ def test_a_video_that_breaks_off(clip: Path, tmp_path: Path) -> None:
     content = whole.read_bytes()
     broken.write_bytes(content[: len(content) // 2])
     found = list[TimedFrame]()
-    message = r"broken\.mp4: breaks off at frame \d+ \(.*\), expected a whole video file"
+    message = r"broken\.mp4: breaks off at frame \d+ \(.*\), expected a complete video file"
     with pytest.raises(InputError, match=message):
         found.extend(open_sequence(broken, focal=50))
     assert 0 < len(found) < COUNT

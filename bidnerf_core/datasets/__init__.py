@@ -1,4 +1,4 @@
-"""Readers of posed images and of sequences, and writers. All file-format conventions are converted here."""
+"""Readers for posed images and sequences, and writers. All file-format conventions are converted here."""
 
 from __future__ import annotations
 
@@ -76,16 +76,17 @@ def open_dataset(
     depth_unit: float | None = None,
     masks: str | Path | MaskFolder | None = None,
 ) -> Dataset:
-    """Open the dataset in the folder ``path``. Descriptions are read and checked now, images when views are requested.
+    """Open the dataset in the folder ``path``. Descriptions are read and checked immediately, images when
+    views are requested.
 
-    ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. The default is
-    white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. ``camera`` (intrinsics or
-    a file of them) is for formats without a camera of their own, such as TUM RGB-D. ``register_depth`` determines whether
-    depth is moved to the colour camera, and from which sensor; the default depends on the format. ``depth_unit`` (metres per
-    step of depth images) replaces the unit of the format. ``masks`` is a folder of
-    images whose black pixels show what is not to be used (see ``MaskFolder``). What a description lists and the folder lacks is left out, with an
-    ``InputWarning`` that counts it. Raises ``InputError`` where there is no such folder, where no reader recognises it, where
-    nothing is left, and where a description is not usable.
+    ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. It
+    defaults to white if the images have one, following NeRF-Synthetic, and to black otherwise. ``camera``
+    (intrinsics or a file of them) is for formats that store no camera, such as TUM RGB-D. ``register_depth``
+    determines whether depth is registered to the colour camera, and from which sensor; the default depends on
+    the format. ``depth_unit`` (metres per step of depth images) overrides the unit of the format. ``masks``
+    is a folder of images whose black pixels are ignored (see ``MaskFolder``). Files that are listed but
+    missing are left out, with an ``InputWarning`` that counts them. Raises ``InputError`` if there is no such
+    folder, if no reader recognizes it, if nothing is left, and if a description is invalid.
     """
     folder = Path(path)
     if not folder.exists():
@@ -113,14 +114,16 @@ def open_sequence(
     depth_unit: float | None = None,
     masks: str | Path | MaskFolder | None = None,
 ) -> FrameSequence:
-    """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video. None is read yet.
+    """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video. Nothing
+    is decoded yet.
 
-    Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
-    ``Frame.open``. Without them, images have that of their EXIF; images without a focal length, and videos, have one of the
-    ``assumed`` cameras. Datasets have their own cameras, except those for which ``open_dataset`` accepts one.
-    ``register_depth``, ``depth_unit`` and ``masks`` are as in ``open_dataset``; depth in a folder of images is registered if a sensor is
-    given, and in millimetres unless a unit is given. Raises
-    ``InputError`` where nothing is found, where a description is not usable, and for a missing or superfluous camera.
+    The camera of images and videos is ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov``
+    (degrees), as in ``Frame.open``. Without these, images use their EXIF; images without a focal length, and
+    videos, use one of the ``assumed`` cameras. Datasets have their own cameras, except those for which
+    ``open_dataset`` accepts one. ``register_depth``, ``depth_unit`` and ``masks`` are as in ``open_dataset``;
+    depth in a folder of images is registered if a sensor is given, and in millimetres unless a unit is given.
+    Raises ``InputError`` if nothing is found, if a description is invalid, and for a missing or superfluous
+    camera.
     """
     if masks is not None:
         unmasked = open_sequence(
@@ -154,18 +157,19 @@ def _options(
     register: DepthRegistration | None,
     depth_unit: float | None,
 ) -> ReadOptions:
-    """Return the options for a reader. Raises ``InputError`` for those that its format does not leave open."""
+    """Build the options for a reader. Raises ``InputError`` for options that the format does not accept."""
     if camera.is_given and "camera" not in reader.accepts:
-        raise InputError(f"{folder}: is a dataset with cameras of its own, expected no other camera")
+        raise InputError(f"{folder}: is a dataset with its own cameras; leave out the camera")
     if camera.is_given and camera.camera is None:
-        raise InputError(f"{folder}: is a dataset, expected a camera with all its intrinsics (camera=)")
+        raise InputError(f"{folder}: is a dataset, expected a camera with all intrinsics (camera=)")
     if register not in (None, False) and "register_depth" not in reader.accepts:
         raise InputError(
-            f"{folder}: is a dataset whose depth belongs to its images, expected no registration; leave out register_depth"
+            f"{folder}: is a dataset whose depth is already registered to its images; leave out"
+            " register_depth"
         )
     if depth_unit is not None and "depth_unit" not in reader.accepts:
         raise InputError(
-            f"{folder}: is a dataset without depth images, or with depth of a fixed unit, expected no other; leave out"
+            f"{folder}: is a dataset without depth images, or with depth in a fixed unit; leave out"
             " depth_unit"
         )
     given = camera.camera
@@ -175,13 +179,13 @@ def _options(
 
 
 def _not_a_dataset(file: Path) -> str:
-    """Return why a file is no dataset."""
+    """Return why a file is not a dataset."""
     packed = file.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
     return f"is a file, expected the folder of a dataset{'; unpack the archive first' if packed else ''}"
 
 
 def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:
-    """Return why a folder is no dataset, and what to do."""
+    """Return why a folder is not a dataset, and what to do."""
     inside = [
         child.name for child in sorted(folder.iterdir()) if child.is_dir() and _reader_of(child, readers)
     ]

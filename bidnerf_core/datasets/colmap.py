@@ -1,7 +1,8 @@
-"""Points of a COLMAP sparse model that the frames of a dataset observe, in metres.
+"""Points of a COLMAP sparse model observed by the frames of a dataset, in metres.
 
-Images of the model and frames of the dataset are matched by name. The model has its own world and unit of length, whose
-length in metres is estimated from the positions of the training cameras, which both contain. No other pose is used.
+Images of the model and frames of the dataset are matched by name. The model has its own world frame and
+length unit; the unit's length in metres is estimated from the positions of the training cameras, which both
+contain. No other pose is used.
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ from bidnerf_core.geometry.similarity import fit_similarity, spread
 
 MODEL_SPLITS = frozenset({"train", "val", "test"})
 LARGEST_MISFIT = 0.2
-"""Limit of the median distance between the training cameras and the model's, relative to their spread. A larger one means that
-the scene is another; a hand-held camera that moved by decimetres reaches 0.03."""
+"""Largest median distance between the training cameras and the model's, relative to their spread. A larger
+one indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03."""
 OUTLIER = 3.0
-"""Cameras that are off by more than this many medians are left out ..."""
-ALWAYS_FITS = 0.01  # ... but never those that are off by less than this fraction of the spread
+"""Cameras off by more than this many medians are left out ..."""
+ALWAYS_FITS = 0.01  # ... but never those off by less than this fraction of the spread
 
 
 @dataclass(frozen=True)
 class SparseChoice:
-    """The choice of the points of a COLMAP model that are used."""
+    """Selection criteria for the points of a COLMAP model."""
 
-    points_error: float = 2.0  # largest mean reprojection error of a point that is used, pixels
-    points_views: int = 2  # minimum number of images that observe a point that is used
+    points_error: float = 2.0  # largest mean reprojection error of a selected point, pixels
+    points_views: int = 2  # smallest number of images that observe a selected point
 
     def __post_init__(self) -> None:
         if not self.points_error > 0:
@@ -56,9 +57,10 @@ class Unit:
 
 
 class SparsePoints:
-    """The points of the model in ``folder``, scaled by the training cameras ``places`` (frame name, T_world_camera).
+    """The points of the model in ``folder``, scaled with the training cameras ``places`` (frame name,
+    T_world_camera).
 
-    Raises ``InputError`` where the folder holds no sound model, and where its cameras are not the training cameras.
+    Raises ``InputError`` if the folder holds no valid model, and if its cameras are not the training cameras.
     """
 
     def __init__(
@@ -77,12 +79,15 @@ class SparsePoints:
 
     @property
     def summary(self) -> str:
-        """One line about the unit of the model."""
+        """One line about the model's unit."""
         unit = self.unit
         checked = (
-            f", places agree to {unit.misfit:.2%} of their spread" if unit.cameras > 2 else ", unchecked"
+            f", positions agree to {unit.misfit:.2%} of their spread" if unit.cameras > 2 else ", unchecked"
         )
-        return f"{self.folder}: its unit is {unit.metres:.4g} m by {unit.cameras} training cameras{checked}"
+        return (
+            f"{self.folder}: its unit is {unit.metres:.4g} m according to {unit.cameras} training"
+            f" cameras{checked}"
+        )
 
     def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
         """Return the points that a frame observes (metres, camera frame); none if the model lacks the frame."""
@@ -95,9 +100,10 @@ class SparsePoints:
         return points[points[:, 2] > 0]
 
     def rays(self, views: Sequence[View], split: str) -> Observations:
-        """Return the points that all ``views`` observe, as rays in the last camera's frame, using their relative poses.
+        """Return the points observed by all ``views`` as rays in the last camera's frame, using the views'
+        relative poses.
 
-        Raises ``InputError`` where they observe none.
+        Raises ``InputError`` if they observe none.
         """
         T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
         found = [(view, self.seen(view.frame.name, split)) for view in views]
@@ -108,13 +114,13 @@ class SparsePoints:
         ]
         if not parts:
             names = ", ".join(view.frame.name for view in views)
-            raise InputError(f"{self.folder}: no points that {names} observes; it has {self._images.some}")
+            raise InputError(f"{self.folder}: has no points observed by {names}; it has {self._images.some}")
         return Observations.joined(parts)
 
     def onto(self, view: View, split: str) -> View:
         """Return the view with the depth (planar z) of the nearest observed point at each pixel, 0 elsewhere.
 
-        A view that has measured depth, or that observes no points, is returned unchanged.
+        A view with measured depth, or without observed points, is returned unchanged.
         """
         points = self.seen(view.frame.name, split)
         if view.frame.has_depth or len(points) == 0:
@@ -123,13 +129,13 @@ class SparsePoints:
         return View(view.frame.with_images(depth=depth), view.T_ref_camera)
 
     def _measured(self, places: Sequence[tuple[str, SE3]], split: str) -> Unit:
-        """Estimate the unit from the training cameras, and again without the outliers among them."""
+        """Estimate the unit from the training cameras, and again without outliers."""
         pairs = [(self._images.find(name, split), T.translation) for name, T in places]
         known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
         if len(known) < 2:
             raise InputError(
-                f"{self.folder}: has {len(known)} of the {len(places)} training cameras, expected 2 or more to know "
-                f"how long its unit is; it has {self._images.some}"
+                f"{self.folder}: has {len(known)} of the {len(places)} training cameras, expected at least 2"
+                f" to determine its unit; it has {self._images.some}"
             )
         there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
         try:
@@ -143,14 +149,14 @@ class SparsePoints:
             ) from error
         if misfit > LARGEST_MISFIT:
             raise InputError(
-                f"{self.folder}: its cameras are {misfit:.0%} of their spread away from the training's, expected "
-                f"{LARGEST_MISFIT:.0%} or less; is it a model of these images?"
+                f"{self.folder}: its cameras are {misfit:.0%} of their spread away from the training"
+                f" cameras, expected at most {LARGEST_MISFIT:.0%}; is it a model of these images?"
             )
         return Unit(unit, int(fits.sum()), misfit)
 
 
 class _Names:
-    """The images of a model by frame names: the stem, or folders and stem as datasets join them ("left_0001")."""
+    """The images of a model by frame name: the stem, or folders and stem as joined by datasets ("left_0001")."""
 
     def __init__(self, folder: Path, images: Sequence[ModelImage]) -> None:
         self._folder, self._images = folder, images
@@ -161,9 +167,10 @@ class _Names:
                 self._by_name[name].append((parts[:-1], image))
 
     def find(self, name: str, split: str) -> ModelImage | None:
-        """Return the image of a frame, or None. Folders named train, val or test separate the frames of splits.
+        """Return the image of a frame, or None. Folders named train, val or test separate the frames of
+        splits.
 
-        Raises ``InputError`` where the name is ambiguous.
+        Raises ``InputError`` if the name is ambiguous.
         """
         others = MODEL_SPLITS - {split}
         fits = [
@@ -188,7 +195,7 @@ class _Names:
 
 
 def _kept(points: ModelPoints, choice: SparseChoice) -> Tensor:
-    """Return the mask of the points that are good enough. A negative error was never computed and excludes no point."""
+    """Return the mask of the points that meet the criteria. A negative error was never computed and excludes no point."""
     sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
     return sound & (points.errors <= choice.points_error) & (points.tracks >= choice.points_views)
 

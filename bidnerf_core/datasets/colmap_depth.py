@@ -1,4 +1,5 @@
-"""Depth maps of COLMAP's dense reconstruction: the text ``width&height&channels&``, then 32-bit floats, row by row.
+"""Depth maps of COLMAP's dense reconstruction: the text ``width&height&channels&``, then 32-bit floats, row
+by row.
 
 Depth is planar z of the undistorted image in units of the model, 0 where nothing was reconstructed.
 """
@@ -18,7 +19,7 @@ KINDS = ("geometric", "photometric")
 """The kinds of depth maps, the more reliable one first."""
 LARGEST_HEAD = 64
 """Bytes of the text before the numbers."""
-EXPECTED = "a depth map of COLMAP's"
+EXPECTED = "a COLMAP depth map"
 
 
 def depth_map_of(model: Path, name: str) -> Path | None:
@@ -32,7 +33,9 @@ def depth_map_of(model: Path, name: str) -> Path | None:
 
 
 def read_colmap_depth(path: Path, unit: float) -> DepthImage:
-    """Read a depth map, in ``unit`` metres per unit of the model. Raises ``InputError`` for other and for cut files."""
+    """Read a depth map, with ``unit`` metres per unit of the model. Raises ``InputError`` for other or
+    truncated files.
+    """
     content = read_file(path, EXPECTED)
     *sizes, numbers = content.split(b"&", 3)
     if len(sizes) != 3 or not all(size.isdigit() and len(size) < LARGEST_HEAD for size in sizes):

@@ -1,8 +1,8 @@
 """The files of a COLMAP sparse model: ``cameras``, ``images`` and ``points3D``, as .bin or .txt.
 
-Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. The files ``rigs`` and
-``frames`` of newer versions are not needed, since these versions still write each image's pose to ``images``. pycolmap is not
-used, because it hangs on a truncated ``points3D.bin``.
+Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. The
+files ``rigs`` and ``frames`` of newer versions are not needed, since these versions still write each image's
+pose to ``images``. pycolmap is not used because it hangs on a truncated ``points3D.bin``.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class ModelPoints:
 
 
 def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
-    """Read the model in ``folder``. Raises ``InputError`` where there is none, or where a file is damaged."""
+    """Read the model in ``folder``. Raises ``InputError`` if there is none, or if a file is damaged."""
     suffix = next((s for s in (".bin", ".txt") if _is_model(folder, s)), None)
     if suffix is None:
         inside = [
@@ -87,7 +87,8 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
 def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]]:
     """Read the images of the model in ``folder``, and their cameras by id; its points may be missing.
 
-    Raises ``InputError`` where there is no model, where a file is damaged, and for a camera that is not perspective.
+    Raises ``InputError`` if there is no model, if a file is damaged, and for a camera that is not
+    perspective.
     """
     suffix = next((s for s in (".bin", ".txt") if has_posed_images(folder, s)), None)
     if suffix is None:
@@ -99,7 +100,9 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
 
 
 def count_posed_images(folder: Path) -> int:
-    """Return the number of images that the model in ``folder`` says to hold. Raises ``InputError`` as ``read_posed_images``."""
+    """Return the number of images that the model in ``folder`` declares. Raises ``InputError`` as
+    ``read_posed_images`` does.
+    """
     if has_posed_images(folder, ".bin"):
         (count,) = _Bytes(folder / "images.bin").take(COUNT)
         return int(count)
@@ -107,7 +110,7 @@ def count_posed_images(folder: Path) -> int:
 
 
 def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
-    """Return whether a folder has the cameras and images of a model, as .bin or .txt unless a suffix is given."""
+    """Return whether a folder has a model's cameras and images, as .bin or .txt unless ``suffix`` restricts it."""
     suffixes = (".bin", ".txt") if suffix is None else (suffix,)
     return any(
         all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")) for suffix in suffixes
@@ -121,7 +124,7 @@ def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
     if name is None:
         expected = ", ".join(MODEL_IDS.values())
         raise InputError(
-            f"{where} is of the model {model}, expected one of {expected}; undistort the images with COLMAP"
+            f"{where} has the model {model}, expected one of {expected}; undistort the images with COLMAP"
         )
     parameters = file.array(np.dtype("<f8"), colmap_parameters(name)).tolist()
     return int(number), colmap_camera(where, name, int(width), int(height), parameters)
@@ -165,7 +168,7 @@ class _Bytes:
         if size > self.left:
             length = len(self._content)
             raise InputError(
-                f"{self.path}: ends too early, at byte {length}; expected a whole file of COLMAP's"
+                f"{self.path}: ends too early, at byte {length}; expected a complete COLMAP file"
             )
         self._place += size
         return self._place - size
@@ -176,12 +179,10 @@ def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
     file = _Bytes(path)
     (count,) = file.take(COUNT)
     if count > file.left:  # a false count must not allocate memory
-        raise InputError(
-            f"{path}: says that it holds {count} entries in {file.left} bytes, expected a sound file"
-        )
+        raise InputError(f"{path}: declares {count} entries in {file.left} bytes; is the file damaged?")
     found = [one(file) for _ in range(int(count))]
     if file.left:
-        raise InputError(f"{path}: {file.left} bytes after its {count} entries, expected a file of COLMAP's")
+        raise InputError(f"{path}: {file.left} bytes after its {count} entries, expected a COLMAP file")
     return found
 
 
@@ -200,7 +201,7 @@ def _binary_point(file: _Bytes) -> ModelPoint:
 
 
 def _text_images(path: Path) -> list[ModelImage]:
-    """Read two lines per image; the second is empty where nothing was observed."""
+    """Read two lines per image; the second is empty if nothing was observed."""
     found, rows = [], iter(_rows(path, "id, pose, camera and name of an image"))
     for row in rows:
         if not row.text or row.text.startswith("#"):
@@ -232,7 +233,7 @@ def _text_points(path: Path) -> list[ModelPoint]:
 
 
 def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np.ndarray) -> ModelImage:
-    """Make an image from a ``pose``, which is a quaternion w x y z followed by a translation."""
+    """Build an image from a ``pose``, which is a quaternion w x y z followed by a translation."""
     if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(pose[:4]) < 2):
         raise InputError(f"{where}: image {name!r} has an invalid pose, expected a unit quaternion")
     rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
@@ -244,7 +245,7 @@ def _together(path: Path, points: list[ModelPoint]) -> ModelPoints:
     ordered = sorted(points, key=lambda point: point.id)
     ids = torch.tensor([point.id for point in ordered], dtype=torch.int64)
     if bool((ids.diff() == 0).any()):
-        raise InputError(f"{path}: two points have the same id, expected a sound file")
+        raise InputError(f"{path}: two points have the same id, expected unique ids")
     positions = torch.tensor([point.position for point in ordered], dtype=torch.float64).reshape(-1, 3)
     errors = torch.tensor([point.error for point in ordered], dtype=torch.float64)
     tracks = torch.tensor([point.track for point in ordered], dtype=torch.int64)

@@ -1,18 +1,18 @@
 """Folders of a COLMAP project: images and a sparse model, with no other file.
 
-Models are looked for in ``sparse``, ``colmap/sparse`` (nerfstudio), the folder itself, ``dense`` and the like, as .bin or .txt
-(``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). Where the mapper wrote several (``sparse/0``,
-``sparse/1`` ...), that with the most images is used, with a remark. Images are in the folder, of those where projects have them,
-that holds most of the model's images. Missing images and photos that are not registered are left out and counted. Every eighth
-registered image in the natural order of the names (the first, the ninth ...) is held out as "test" and the others are "train",
-as is usual for captures.
+Models are looked for in ``sparse``, ``colmap/sparse`` (nerfstudio), the folder itself, ``dense`` and the
+like, as .bin or .txt (``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). If the
+mapper wrote several (``sparse/0``, ``sparse/1`` ...), the one with the most images is used, with a remark.
+Among the usual image folders, the one that holds most of the model's images is used. Missing images and
+photos that are not registered are left out and counted. Every eighth registered image in natural name order
+(the first, the ninth ...) is held out as "test" and the others are "train", as is usual for captures.
 
-In a workspace of dense reconstruction (``images``, ``sparse``, ``stereo/depth_maps``) the depth maps are the images' depth:
-those that were filtered geometrically, or else the photometric ones.
+In a dense workspace (``images``, ``sparse``, ``stereo/depth_maps``) the depth maps provide the images' depth:
+the geometrically filtered ones, or else the photometric ones.
 
-The world is that of the model, whose unit of length is arbitrary: poses and maps are in it, not in metres. Images are used as
-they are stored, as in COLMAP, whose pixel centres are at +0.5 like ours. The camera of an image that was resized after the
-reconstruction is scaled. COLMAP records no times: a sequence is in the order of the names.
+The world is that of the model, whose unit of length is arbitrary: poses and maps use that unit, not metres.
+Images are used as stored, as in COLMAP, whose pixel centres are at +0.5 like ours. The camera of an image
+that was resized after the reconstruction is scaled. COLMAP records no times: a sequence is in name order.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ MODELS = (
     "undistorted/sparse",
     "model",
 )
-"""Places of a model, or of numbered folders of models, in order of preference."""
+"""Where to look for a model, or numbered folders of models, in order of preference."""
 IMAGES = (
     "images", "colmap/images", "dense/images", "dense/0/images", "undistorted/images", "input", "image", "photos", "rgb", ".",
     "../images", "../../images",
 )  # fmt: skip
-"""Places of the images, relative to the folder; those beside the model come first."""
+"""Where to look for the images, relative to the folder; those next to the model come first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class ColmapFrame:
         return f"{self.name.stem}{face}"
 
     def faces(self) -> list[ColmapFrame]:
-        """Return the pinhole views of a panorama; the frame itself where it is none."""
+        """Return the pinhole views of a panorama; the frame itself if it is not one."""
         if not isinstance(self.camera, PanoramaFace):
             return [self]
         return [
@@ -95,7 +95,7 @@ class ColmapFrame:
 
 
 class ColmapReader(Reader):
-    """The reader of folders of COLMAP projects."""
+    """Reader for COLMAP project folders."""
 
     expected = "images with a sparse model in sparse/0 (COLMAP)"
 
@@ -103,7 +103,7 @@ class ColmapReader(Reader):
         return bool(_models(path))
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the model. Raises ``InputError`` where it is damaged or has no registered image."""
+        """Read the model. Raises ``InputError`` if it is damaged or has no registered image."""
         return self._open(path, options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -132,7 +132,7 @@ class ColmapDataset(SplitDataset[ColmapFrame]):
 
 
 def _models(path: Path) -> list[Path]:
-    """Return the models of the first place that has any: the place itself, or numbered folders in it."""
+    """Return the models at the first location that has any: the location itself, or numbered folders in it."""
     for place in MODELS:
         folder = path / place
         inside = [child for child in folder.glob("*") if child.name.isdecimal() and has_posed_images(child)]
@@ -151,8 +151,8 @@ def _largest(path: Path, models: Sequence[Path]) -> Path:
     others = ", ".join(f"{model.relative_to(path)} ({sizes[model]})" for model in models if model != chosen)
     remark(
         path,
-        f"has {len(models)} models, of which {chosen.relative_to(path)} with {amount(sizes[chosen], 'image')} is used, not"
-        f" {others}; models have worlds of their own",
+        f"has {len(models)} models, of which {chosen.relative_to(path)} with"
+        f" {amount(sizes[chosen], 'image')} is used, not {others}; each model has its own world frame",
     )
     return chosen
 
@@ -160,28 +160,26 @@ def _largest(path: Path, models: Sequence[Path]) -> Path:
 def _frames(path: Path, model: Path) -> list[ColmapFrame]:
     images, cameras = read_posed_images(model)
     if not images:
-        raise InputError(f"{model}: has no registered image, expected a model with one or more")
+        raise InputError(f"{model}: has no registered image, expected at least one")
     folder, files = _image_folder(path, model, images)
     there = present(
         images,
         lambda image: image.name in files,
         folder,
         lambda image: image.name,
-        lambda image: InputError(
-            f"{folder / image.name}: no such file, expected it as {model} has that image"
-        ),
+        lambda image: InputError(f"{folder / image.name}: no such file, although {model} lists that image"),
     )
     _remark_unregistered(path, folder, files)
     frames = [_frame(model, image, files[image.name], cameras) for image in there]
     frames.sort(key=lambda frame: natural_order(str(frame.name)))
     for frame, following in pairwise(frames):
         if frame.name == following.name:
-            raise InputError(f"{model}: image {frame.name} is registered twice, expected each once")
+            raise InputError(f"{model}: image {frame.name} is registered twice, expected once")
     return frames
 
 
 def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tuple[Path, dict[str, Path]]:
-    """Return the folder that holds most of the images, and the files of these by their names in the model."""
+    """Return the folder that holds most of the images, and the image files by their names in the model."""
     beside = [model.parent / "images", model.parent.parent / "images"]
     places = list(dict.fromkeys([*beside, *(path / place for place in IMAGES)]))
     best: tuple[Path, dict[str, Path]] = (path / IMAGES[0], {})
@@ -197,19 +195,21 @@ def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tupl
 
 
 def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> None:
-    """Count the photos in a folder of images that the model lacks."""
+    """Count the photos in an image folder that the model lacks."""
     if folder == path:
         return
     photos = [file for file in folder.rglob("*") if file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
     others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
     if others:
         text = f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out"
-        remark(folder, f"{text}, the first is {others[0].relative_to(folder)}")
+        remark(folder, f"{text}, first: {others[0].relative_to(folder)}")
 
 
 def _frame(model: Path, image: ModelImage, file: Path, cameras: dict[int, Camera]) -> ColmapFrame:
     if image.camera not in cameras:
-        raise InputError(f"{model}: image {image.name!r} has the camera {image.camera}, which cameras lacks")
+        raise InputError(
+            f"{model}: image {image.name!r} has the camera {image.camera}, which is missing from cameras"
+        )
     name = PurePosixPath(posix_name(image.name))
     return ColmapFrame(
         name, file, cameras[image.camera], image.T_camera_model.inverse(), depth_map_of(model, image.name)

@@ -1,4 +1,4 @@
-"""The interface of a dataset, and the naming of frames that all readers share."""
+"""The interface of a dataset, and the frame naming that all readers share."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ ReadingProgress: TypeAlias = Callable[[int, int], None]
 class Dataset(Protocol):
     """Posed images in splits. Poses are ``T_world_camera`` with OpenCV axes, float64; depth is planar z in metres.
 
-    A frame's name is the stem of its image file. Where several files of a split share a stem, the names are prefixed with as
-    few folders as make them unique ("left_0001", "right_0001"); the bare stem is then rejected as ambiguous.
+    A frame's name is the stem of its image file. If several files of a split share a stem, the names are
+    prefixed with just enough folders to make them unique ("left_0001", "right_0001"); the bare stem is then
+    rejected as ambiguous.
     """
 
     @property
@@ -28,7 +29,7 @@ class Dataset(Protocol):
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """The names of the splits, at least one; "train" comes first where there is one."""
+        """The names of the splits, at least one; "train" comes first if it exists."""
         ...
 
     @property
@@ -45,25 +46,25 @@ class Dataset(Protocol):
     ) -> list[View]:
         """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
-        Of a whole split, frames that are hidden altogether by a mask are left out.
+        When reading a whole split, frames that a mask hides entirely are left out.
 
-        Raises ``InputError`` for an unknown split or frame, and for a file that is missing or not usable.
+        Raises ``InputError`` for an unknown split or frame, and for a file that is missing or invalid.
         """
         ...
 
 
 @runtime_checkable
 class Georeferenced(Protocol):
-    """A dataset that knows more of its world than the poses say. Readers may offer it beside ``Dataset``."""
+    """A dataset that knows more about its world than the poses. Readers may provide it in addition to ``Dataset``."""
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of the poses; None where the format does not say it."""
+        """The unit of the poses; None if the format does not specify it."""
         ...
 
     @property
     def up(self) -> tuple[float, float, float] | None:
-        """The upward direction in the world, where the capture measured gravity, as phones do; else None."""
+        """The upward direction in the world if the capture measured gravity, as phones do; else None."""
         ...
 
 
@@ -81,7 +82,7 @@ def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], 
 
 
 def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return a name for each path (folders, then stem): its stem, prefixed with as few folders as make it unique."""
+    """Return a name for each path (folders, then stem): its stem, prefixed with just enough folders to make it unique."""
     names = [path[-1] for path in paths]
     for depth in range(2, max(map(len, paths), default=0) + 1):
         count = Counter(names)
@@ -90,7 +91,7 @@ def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def _numbered(names: list[str]) -> list[str]:
-    """Return the names with "-2" and so on added to those that occur again, such as of a/b.png and a_b.png."""
+    """Return the names with "-2" and so on appended to repeated ones, such as those of a/b.png and a_b.png."""
     used = set(names)
     seen, found = set[str](), list[str]()
     for name in names:

@@ -1,11 +1,13 @@
-"""Recordings of EuRoC's micro aerial vehicle, and of others in this layout (ASL, TUM-VI): folders with ``mav0``.
+"""Recordings of EuRoC's micro aerial vehicle, and others in this layout (ASL, TUM-VI): folders with ``mav0``.
 
-``mav0/cam0/data.csv`` lists ``timestamp [ns],filename`` of the images in ``mav0/cam0/data``, ``mav0/cam0/sensor.yaml`` has
-``T_BS`` (4x4, camera to body), ``intrinsics`` (fx, fy, cx, cy), ``distortion_coefficients`` and ``resolution``.
-``mav0/state_groundtruth_estimate0/data.csv`` (or ``mocap0``, ``vicon0``) has the poses of the body: ``timestamp [ns], px, py, pz,
-qw, qx, qy, qz``, metres. They are interpolated at the times of the images and moved to the camera. Images without a pose are in
-the sequence but not in the dataset, and a remark counts them. Principal points count pixels from the centre of the upper left
-one, so half a pixel is added. Every eighth posed image (the first, the ninth ...) is held out as "test", the others are "train".
+``mav0/cam0/data.csv`` lists ``timestamp [ns],filename`` of the images in ``mav0/cam0/data``;
+``mav0/cam0/sensor.yaml`` has ``T_BS`` (4x4, camera to body), ``intrinsics`` (fx, fy, cx, cy),
+``distortion_coefficients`` and ``resolution``. ``mav0/state_groundtruth_estimate0/data.csv`` (or ``mocap0``,
+``vicon0``) has the poses of the body: ``timestamp [ns], px, py, pz, qw, qx, qy, qz``, metres. They are
+interpolated at the image times and transformed to the camera. Images without a pose are in the sequence but
+not in the dataset, and a remark counts them. Principal points are relative to the centre of the upper left
+pixel, so half a pixel is added. Every eighth posed image (the first, the ninth ...) is held out as "test",
+the others are "train".
 """
 
 from __future__ import annotations
@@ -30,11 +32,11 @@ from bidnerf_core.io.files import is_file, read_file
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
 NUMBERS = r"\s*:[^\[]*\[([^\]]*)\]"
-"""What follows a key whose value is a list of numbers, perhaps below ``data:`` of a matrix."""
+"""Follows a key whose value is a list of numbers, possibly below a matrix's ``data:``."""
 
 
 class EurocReader(Reader):
-    """The reader of recordings in the layout of EuRoC."""
+    """Reader for recordings in EuRoC's layout."""
 
     accepts: tuple[OpenQuestion, ...] = ("camera",)
     expected = "mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)"
@@ -43,7 +45,7 @@ class EurocReader(Reader):
         return _root(path) is not None
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the lists. Raises ``InputError`` where one is missing or not usable, and where no image has a pose."""
+        """Read the lists. Raises ``InputError`` if one is missing or invalid, and if no image has a pose."""
         truth = _truth(path)
         if truth is None:
             raise InputError(f"{path}: has no poses, expected mav0/{TRUTHS[0]}/data.csv")
@@ -70,7 +72,7 @@ def _truth(path: Path) -> Path | None:
 
 def _frames(path: Path, options: ReadOptions) -> list[ImageFrame]:
     root, truth = _root(path), _truth(path)
-    assert root is not None  # recognises ensures it
+    assert root is not None  # ensured by recognises
     rows = read_timed_rows(root / "cam0" / "data.csv", "filename")
     require_distinct_times(rows)
     camera, T_body_camera = _sensor(root / "cam0" / "sensor.yaml", options)
@@ -84,7 +86,7 @@ def _frames(path: Path, options: ReadOptions) -> list[ImageFrame]:
 
 
 def _sensor(file: Path, options: ReadOptions) -> tuple[CameraSource, SE3]:
-    """Return the camera, as given or as calibrated, and its pose in the body. Raises ``InputError``."""
+    """Return the camera, given or calibrated, and its pose in the body frame. Raises ``InputError``."""
     text = read_file(file, "EuRoC's sensor.yaml").decode("utf-8", "replace")
     matrix = torch.tensor(_numbers(file, text, "T_BS", 16), dtype=torch.float64).reshape(4, 4)
     try:
@@ -111,7 +113,7 @@ def _sensor(file: Path, options: ReadOptions) -> tuple[CameraSource, SE3]:
 
 
 def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
-    """Return the ``count`` numbers of a list in YAML, in brackets on one line or several."""
+    """Return the ``count`` numbers of a bracketed YAML list on one or several lines."""
     found = re.search(rf"^\s*{key}{NUMBERS}", text, re.MULTILINE)
     try:
         numbers = [float(word) for word in found[1].replace(",", " ").split()] if found else []

@@ -1,7 +1,7 @@
-"""Files that a description names, where the name was written on another system.
+"""Finding files from names that were written on another system.
 
-Descriptions come with Windows separators, in other upper and lower case than the files, without the extension of an image, or
-with the absolute path that a file had on another machine. The file is found anyway where only one can be meant.
+Descriptions may use Windows separators, different case from the files, no image extension, or an absolute
+path from another machine. The file is found anyway if the name is unambiguous.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ IMAGE_ENDINGS = ("", *IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 
 
 def posix_name(name: str) -> PurePosixPath:
-    """Return a name with the separators of this library; backslashes are those of Windows."""
+    """Return a name with POSIX separators; backslashes are taken for those of Windows."""
     return PurePosixPath(PureWindowsPath(name).as_posix() if "\\" in name else name)
 
 
@@ -28,9 +28,10 @@ class FileNames:
         self._listed: dict[Path, dict[str, str]] = {}
 
     def find(self, name: PurePosixPath, endings: tuple[str, ...] = ("",)) -> Path | None:
-        """Return the file that is called ``name``, with one of the ``endings`` added, or None.
+        """Return the file named ``name`` plus one of the ``endings``, or None.
 
-        The exact name is tried first, then names in other upper and lower case, then the last parts of an absolute path.
+        The exact name is tried first, then names that differ in case, then the last parts of an absolute
+        path.
         """
         for ending in endings:
             exact = self._folder / f"{name}{ending}"
@@ -44,7 +45,9 @@ class FileNames:
         return None
 
     def _tails(self, name: PurePosixPath) -> list[tuple[str, ...]]:
-        """Return the parts of a relative name; of an absolute one, those below any of its folders, longest first."""
+        """Return the parts of a relative name; for an absolute one, the parts below each of its folders,
+        longest first.
+        """
         if not name.parts:
             return []
         if not (name.is_absolute() or name.parts[0].endswith(":")):
@@ -60,7 +63,9 @@ class FileNames:
         return place if is_file(place) else None
 
     def _entries(self, folder: Path) -> dict[str, str]:
-        """Return the names in a folder by their lower-case form; names that differ by case alone stand for themselves."""
+        """Return the names in a folder by their lower-case form; names that differ only in case are keyed by
+        themselves.
+        """
         if folder not in self._listed:
             try:
                 names = [child.name for child in folder.iterdir()]

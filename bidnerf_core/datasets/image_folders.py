@@ -23,10 +23,12 @@ def open_images(
     background: Background | None = None,
     depth_unit: float | None = None,
 ) -> FileSequence:
-    """Return the images of a folder, by time if all names are times (``12.345.png``), else in the natural order of names.
+    """Return the images of a folder, by time if all names are times (``12.345.png``), else in natural name
+    order.
 
-    ``NAME.depth.png`` (``depth_unit``, by default millimetres) next to ``NAME.png`` is its depth, as ``bidnerf render`` writes it. Images have the given
-    camera, or that of their EXIF, as in ``Frame.open``; depth is registered from ``sensor``, if there is one. Raises ``InputError`` where there is no image.
+    ``NAME.depth.png`` next to ``NAME.png`` is its depth, as written by ``bidnerf render``, in units of
+    ``depth_unit`` (by default millimetres). Images have the given camera, or the one in their EXIF, as in
+    ``Frame.open``; depth is registered from ``sensor``, if given. Raises ``InputError`` if there is no image.
     """
     photos, _ = photos_in(folder)
     if not photos:

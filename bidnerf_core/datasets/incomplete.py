@@ -1,4 +1,4 @@
-"""Recordings of which some files are missing: what is there is used, and what is missing is counted in one remark."""
+"""Recordings with missing files: the files present are used, and the missing ones are counted in one remark."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ F = TypeVar("F")
 
 
 def remark(where: Path | str, text: str) -> None:
-    """Issue an ``InputWarning``: one line about what was assumed or left out in ``where``."""
+    """Issue a one-line ``InputWarning`` about what was assumed or left out in ``where``."""
     warnings.warn(f"{where}: {text}", InputWarning, stacklevel=3)
 
 
@@ -25,9 +25,10 @@ def present(
     error: Callable[[F], InputError] | None = None,
     noun: str = "image",
 ) -> list[F]:
-    """Return the frames whose files are there. A remark counts the others, with the ``name`` of the first missing file.
+    """Return the frames whose files exist. A remark counts the others, with the ``name`` of the first missing
+    file.
 
-    Where nothing is left, the ``error`` of the first frame is raised, if there is one.
+    If nothing is left, the ``error`` of the first frame is raised, if there is one.
     """
     there = [frame for frame in frames if is_there(frame)]
     if len(there) < len(frames):
@@ -38,6 +39,6 @@ def present(
         are = "is" if gone == 1 else "are"
         remark(
             where,
-            f"{gone} of {amount(len(frames), noun)} {are} missing and left out, the first is {name(first)}",
+            f"{gone} of {amount(len(frames), noun)} {are} missing and left out, first: {name(first)}",
         )
     return there

@@ -1,11 +1,12 @@
 """Sequences of KITTI's odometry benchmark (https://www.cvlibs.net/datasets/kitti/eval_odometry.php).
 
-``calib.txt`` has the projection matrices ``P0`` to ``P3`` (3x4) of the rectified cameras, ``times.txt`` the times (seconds), and
-``image_2/000000.png`` ... the images of camera 2, the left colour camera; the first of ``image_2``, ``image_0``, ``image_3`` and
-``image_1`` that is there is used. Poses are rows of twelve numbers (3x4, camera 0 to world, OpenCV axes, metres) in
-``poses.txt`` of the folder or, as distributed, in ``../../poses/NN.txt`` for the sequence ``NN``; they are moved to the camera
-whose images are used. Principal points count pixels from the centre of the upper left one, so half a pixel is added. Every
-eighth image (the first, the ninth ...) is held out as "test" and the others are "train".
+``calib.txt`` has the projection matrices ``P0`` to ``P3`` (3x4) of the rectified cameras, ``times.txt`` the
+times (seconds), and ``image_2/000000.png`` ... the images of camera 2, the left colour camera; the first
+existing folder of ``image_2``, ``image_0``, ``image_3`` and ``image_1`` is used. Poses are rows of twelve
+numbers (3x4, camera 0 to world, OpenCV axes, metres) in the folder's ``poses.txt`` or, as distributed, in
+``../../poses/NN.txt`` for the sequence ``NN``; they are transformed to the camera whose images are used.
+Principal points are relative to the centre of the upper left pixel, so half a pixel is added. Every eighth
+image (the first, the ninth ...) is held out as "test" and the others are "train".
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from bidnerf_core.io.rows import read_rows
 
 CALIBRATION = "calib.txt"
 CAMERAS = (2, 0, 3, 1)
-"""Numbers of the cameras in the order in which their images are looked for."""
+"""Camera numbers, in the order in which their images are looked for."""
 
 
 class KittiReader(Reader):
-    """The reader of sequences of KITTI's odometry benchmark."""
+    """Reader for sequences of KITTI's odometry benchmark."""
 
     expected = "calib.txt with image_2 or image_0 (KITTI odometry)"
 
@@ -44,7 +45,7 @@ class KittiReader(Reader):
         return is_file(path / CALIBRATION) and _number(path) is not None
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the lists. Raises ``InputError`` where one is not usable, and where there are no poses."""
+        """Read the lists. Raises ``InputError`` if one is invalid, and if there are no poses."""
         file = _poses(path)
         if file is None:
             raise InputError(
@@ -79,7 +80,7 @@ def _poses(path: Path) -> Path | None:
 
 def _frames(path: Path) -> list[ImageFrame]:
     number = _number(path)
-    assert number is not None  # recognises ensures it
+    assert number is not None  # ensured by recognises
     folder = path / f"image_{number}"
     images = [
         file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.stem.isdecimal()
@@ -106,11 +107,11 @@ def _remark_missing(path: Path, listed: int, images: list[Path]) -> None:
     there = {int(image.stem) for image in images}
     gone = [number for number in range(listed) if number not in there]
     if gone:
-        remark(path, f"{len(gone)} of {amount(listed, 'image')} are missing, the first is number {gone[0]}")
+        remark(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
 
 
 def _calibration(file: Path, number: int, width: int, height: int) -> tuple[Intrinsics, SE3]:
-    """Return a camera, and its pose in camera 0. Raises ``InputError`` where the file lacks it."""
+    """Return a camera, and its pose in camera 0. Raises ``InputError`` if the file lacks it."""
     for row in read_rows(file, "KITTI's calib.txt", "P0: 12 numbers"):
         name, _, text = row.text.partition(":")
         if name.strip() == f"P{number}":

@@ -1,4 +1,4 @@
-"""Datasets and sequences whose images have masks in a folder of their own."""
+"""Datasets and sequences whose images have masks in a separate folder."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from bidnerf_core.geometry.units import LengthUnit
 
 
 class MaskedDataset:
-    """A dataset whose frames hide what the masks of a folder hide, besides what they hide anyway; see ``Dataset``.
+    """A dataset whose frames also hide what the masks in a folder hide; see ``Dataset``.
 
-    Where the whole of a split is read, frames that are hidden altogether are left out. Raises ``InputError`` where no frame
-    has a mask.
+    When a whole split is read, frames that are entirely hidden are left out. Raises ``InputError`` if no
+    frame has a mask.
     """
 
     def __init__(self, dataset: Dataset, masks: MaskFolder) -> None:
@@ -42,12 +42,12 @@ class MaskedDataset:
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of the poses, where the format says it."""
+        """The unit of the poses, if the format specifies it."""
         return getattr(self.unmasked, "unit", None)
 
     @property
     def up(self) -> tuple[float, float, float] | None:
-        """The upward direction in the world, where the capture measured gravity."""
+        """The upward direction in the world, if the capture measured gravity."""
         return getattr(self.unmasked, "up", None)
 
     @property
@@ -71,14 +71,14 @@ class MaskedDataset:
 
 
 def mask_folder(masks: str | Path | MaskFolder) -> MaskFolder:
-    """Return the folder of masks, in which black is hidden unless it says otherwise."""
+    """Return the mask folder; black is hidden unless it specifies otherwise."""
     return masks if isinstance(masks, MaskFolder) else MaskFolder(masks)
 
 
 def masked(frame: Frame, masks: MaskFolder) -> Frame:
-    """Return the frame with what its mask hides, by its name. Raises ``InputError`` as ``MaskFolder.hidden`` does."""
+    """Return the frame with its mask, found by name, applied. Raises ``InputError`` as ``MaskFolder.hidden`` does."""
     lens = frame.lens if isinstance(frame.lens, CentralLens) else None
-    camera = frame.intrinsics if lens is None else lens  # the mask is of the image before it was undistorted
+    camera = frame.intrinsics if lens is None else lens  # the mask refers to the image before undistortion
     size, orientation = (camera.width, camera.height), frame.orientation
     stored = orientation.upright_size(*size)  # which exchanges the sides back
     hidden = masks.hidden(frame.name, Raster(*stored, orientation), size)
@@ -88,10 +88,10 @@ def masked(frame: Frame, masks: MaskFolder) -> Frame:
 
 
 def masked_sequence(frames: FrameSequence, masks: MaskFolder) -> FrameSequence:
-    """Return a sequence whose frames hide what the masks of a folder hide.
+    """Return a sequence whose frames hide what the masks in a folder hide.
 
-    Raises ``InputError`` where no frame has a mask. Sequences that do not list their ``names``, such as streams, show that only
-    at their end, with an ``InputWarning``.
+    Raises ``InputError`` if no frame has a mask. For sequences without ``names``, such as streams, this is
+    known only at the end and causes an ``InputWarning``.
     """
     names: Sequence[str] | None = getattr(frames, "names", None)
     if names is not None:
@@ -110,7 +110,7 @@ def _read(entry: SequenceEntry, masks: MaskFolder) -> tuple[Frame, SE3 | None]:
 
 
 class _MaskedStream:
-    """Frames that are decoded one after another, such as a video's, whose masks are named after them."""
+    """Frames decoded one after another, such as a video's, whose masks are named after them."""
 
     def __init__(self, frames: FrameSequence, masks: MaskFolder) -> None:
         self._frames, self._masks = frames, masks

@@ -1,4 +1,4 @@
-"""The pinhole views into which panoramas are cut."""
+"""The pinhole views into which panoramas are divided."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""What scans of phones have in common: photos with depth of a lidar of lower resolution, and a pose for each frame.
+"""Common properties of phone scans: photos with lower-resolution lidar depth, and a pose for each frame.
 
-ARKit's poses are camera to world with OpenGL axes and +y up, its intrinsics count pixels from the centre of the upper left one,
-and its confidence is 0 (low), 1 or 2 (high). Depth is kept where the confidence is high, and up to the range of the lidar;
-beyond it, depth was inferred from the photo. Each pixel has the depth of the nearest measurement. Photos with more than 640
-pixels on the longer side are reduced to that size with their camera, unless the user names another one (``reading_at``): a scan
-has hundreds of them.
+ARKit's poses are camera to world with OpenGL axes and +y up, its intrinsics are relative to the centre of the
+upper left pixel, and its confidence is 0 (low), 1 or 2 (high). Depth is kept where the confidence is high,
+and up to the range of the lidar; beyond it, depth was inferred from the photo. Each pixel has the depth of
+the nearest measurement. Photos with more than 640 pixels on the longer side are downscaled to that size, as
+is their camera, unless the user gives another size (``reading_at``): a scan has hundreds of them.
 
-Phones record up to 60 frames a second, far more than a map needs. Of such recordings the dataset has five frames a second, and
-the sequence all of them.
+Phones record up to 60 frames a second, far more than a map needs. The dataset of such a recording has five
+frames a second, and the sequence all of them.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import reduced
 
 LARGEST_SIDE = 640
-"""Usual number of pixels on the longer side of a photo once it is read."""
+"""Default limit of the pixels on a photo's longer side."""
 LIDAR_RANGE = 5.0
 """Range of the lidar (metres) according to Apple."""
 HIGH_CONFIDENCE = 2
 CENTRE_OF_PIXEL = 0.5
-"""What is added to principal points that count pixels from the centre of the upper left one."""
+"""Added to principal points relative to the centre of the upper left pixel."""
 FRAMES_PER_SECOND = 5.0
-"""Largest rate of the frames of a dataset."""
+"""Largest frame rate of a dataset."""
 ROUNDING = 0.005
-"""Seconds by which the times of frames may be early."""
+"""Seconds by which frame times may be early."""
 
 
 class Timed(Protocol):
@@ -59,7 +59,7 @@ T = TypeVar("T", bound=Timed)
 
 @dataclass(frozen=True)
 class Measured:
-    """Depth of a lidar, and the file that messages name."""
+    """Lidar depth, and the file that messages name."""
 
     depth: DepthImage
     where: str
@@ -72,9 +72,11 @@ def scan_frame(
     depth: Measured | None,
     image: Path | str,
 ) -> Frame:
-    """Return a frame of a photo and its depth, reduced to at most ``LARGEST_SIDE`` pixels on the longer side by default.
+    """Build a frame from a photo and its depth, by default downscaled to ``LARGEST_SIDE`` pixels on the
+    longer side.
 
-    ``rgb`` is in [0, 1], or bytes as in ``read_compact_image``. ``camera`` is scaled to the photo. Raises ``InputError`` where camera or depth are of another aspect ratio.
+    ``rgb`` is in [0, 1], or bytes as in ``read_compact_image``. ``camera`` is scaled to the photo. Raises
+    ``InputError`` if the camera or depth has another aspect ratio.
     """
     raster = Raster(rgb.shape[1], rgb.shape[0])
     whole = CameraSource(camera).find(image, raster).intrinsics
@@ -91,16 +93,18 @@ def sure_depth(
     where: str,
     high: int = HIGH_CONFIDENCE,
 ) -> DepthImage:
-    """Return depth where its confidence, if there is any, is ``high``, and within the range of the lidar; 0 elsewhere.
+    """Keep depth whose confidence, if there is any, is ``high``, and within the range of the lidar; 0
+    elsewhere.
 
-    Raises ``InputError`` for a confidence of another size or with values above ``high``; ``where`` begins the message.
+    Raises ``InputError``, whose message begins with ``where``, for a confidence of another size or with
+    values above ``high``.
     """
     metres = torch.where(measured.metres <= LIDAR_RANGE, measured.metres, 0)
     if confidence is not None:
         if confidence.shape != tuple(metres.shape):
             found = "x".join(map(str, confidence.shape[::-1]))
             raise InputError(
-                f"{where}: is {found}, expected {metres.shape[1]}x{metres.shape[0]} as its depth"
+                f"{where}: is {found}, expected {metres.shape[1]}x{metres.shape[0]} like its depth"
             )
         if confidence.max() > high:
             raise InputError(
@@ -111,9 +115,10 @@ def sure_depth(
 
 
 def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
-    """Return ``T_world_camera`` (OpenCV axes) of a quaternion x y z w and a position, or None where they hold no pose.
+    """Return ``T_world_camera`` (OpenCV axes) from a quaternion x y z w and a position, or None if they hold
+    no pose.
 
-    The axes of the camera are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
+    The camera axes are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
     """
     length = math.hypot(*numbers[:4])
     if not all(map(math.isfinite, numbers)) or length == 0:
@@ -128,7 +133,7 @@ def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 |
 def thinned(where: Path, frames: Sequence[T]) -> tuple[list[T], list[T]]:
     """Return the frames of a dataset, at most ``FRAMES_PER_SECOND``, and the others; a remark counts them.
 
-    ``frames`` are in chronological order. All are kept where one has no time.
+    ``frames`` are in chronological order. All are kept if any has no time.
     """
     times = [frame.time for frame in frames]
     if any(time is None for time in times):
@@ -144,6 +149,7 @@ def thinned(where: Path, frames: Sequence[T]) -> tuple[list[T], list[T]]:
     if others:
         remark(
             where,
-            f"the dataset has {len(kept)} of {amount(len(frames), 'frame')}, {FRAMES_PER_SECOND:g} a second; the sequence has all",
+            f"the dataset has {len(kept)} of {amount(len(frames), 'frame')}, {FRAMES_PER_SECOND:g} per"
+            " second; the sequence has all",
         )
     return kept, others

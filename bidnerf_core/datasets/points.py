@@ -1,4 +1,4 @@
-"""Files of points that a depth sensor measured."""
+"""Files of points measured by a depth sensor."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ EXPECTED_POINTS = "expected n rows of x, y, z in metres"
 def read_depth_points(path: Path) -> Observations:
     """Read points (metres, OpenCV axes) as depth rays in the camera's frame.
 
-    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or by blanks. Further columns are ignored, and
-    ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from the camera. A .npz file
-    holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor`` (4x4); the points are then in the
-    sensor's frame. Raises ``InputError`` for anything else.
+    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or blanks. Further columns are
+    ignored, and ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from
+    the camera. A .npz file holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor``
+    (4x4); the points are then in the sensor's frame. Raises ``InputError`` for anything else.
     """
     points, T_camera_sensor = _read(path)
     if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise InputError(
-            f"{path}: an array of shape {points.shape} and type {points.dtype}, {EXPECTED_POINTS}"
+            f"{path}: has an array of shape {points.shape} and type {points.dtype}, {EXPECTED_POINTS}"
         )
     xyz = torch.from_numpy(points[:, :3].astype(np.float64))
     try:
@@ -56,7 +56,7 @@ def _read(path: Path) -> tuple[np.ndarray, SE3]:
 def _from_archive(path: Path) -> tuple[np.ndarray, SE3]:
     arrays = read_archive(path, ("points", "T_camera_sensor"), "a .npz file of points")
     if "points" not in arrays:
-        raise InputError(f"{path}: no array 'points' in it, expected one with {EXPECTED_POINTS[9:]}")
+        raise InputError(f"{path}: no array 'points', expected one with {EXPECTED_POINTS[9:]}")
     if "T_camera_sensor" not in arrays:
         return arrays["points"], SE3.identity()
     given = arrays["T_camera_sensor"]

@@ -1,13 +1,15 @@
-"""Raw data of Polycam, an iOS program (https://github.com/PolyCam/polyform): folders with ``keyframes``.
+"""Raw data exported by the iOS app Polycam (https://github.com/PolyCam/polyform): folders with ``keyframes``.
 
-``keyframes/cameras/TIME.json`` has ``fx fy cx cy width height`` and ``t_00`` to ``t_23``, the rows of ARKit's camera-to-world
-matrix (OpenGL axes, +y up); TIME is in microseconds. ``keyframes/corrected_cameras`` and ``corrected_images`` have the poses
-after a global optimization and undistorted photos; they are used where there are any, else ``cameras`` and ``images``. Newer
-exports have no size in them: it is that of the photo. ``keyframes/depth/TIME.png`` is planar z in millimetres, of lower
-resolution, with ``keyframes/confidence/TIME.png`` (0 low, 127 medium, 255 high). See ``phone_scans`` for how both are read.
+``keyframes/cameras/TIME.json`` has ``fx fy cx cy width height`` and ``t_00`` to ``t_23``, the rows of ARKit's
+camera-to-world matrix (OpenGL axes, +y up); TIME is in microseconds. ``keyframes/corrected_cameras`` and
+``corrected_images`` have the poses after global optimization and undistorted photos; they are used if they
+exist, else ``cameras`` and ``images``. Newer exports store no size, so the photo's size is used.
+``keyframes/depth/TIME.png`` is planar z in millimetres at a lower resolution, with
+``keyframes/confidence/TIME.png`` (0 low, 127 medium, 255 high). See ``phone_scans`` for how both are read.
 
-Undistorted photos have a black border, in which nothing may be learned: 15 pixels of it are hidden, as others cut them off.
-Every eighth photo (the first, the ninth ...) is held out as "test" and the others are "train".
+Undistorted photos have a black border, which must not be learned: 15 pixels of it are hidden, the width that
+other software crops. Every eighth photo (the first, the ninth ...) is held out as "test" and the others are
+"train".
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from bidnerf_core.io.images import decode, read_compact_image
 from bidnerf_core.io.json import Record, read_record
 
 BORDER = 15
-"""Pixels of the border of an undistorted photo that are hidden."""
+"""Width in pixels of the hidden border of an undistorted photo."""
 HIGH_CONFIDENCE = 255
 MICROSECONDS = 1_000_000
 SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -68,7 +70,7 @@ class PolycamFrame:
 
 
 class PolycamReader(Reader):
-    """The reader of Polycam's raw data."""
+    """Reader for Polycam's raw data."""
 
     expected = "keyframes/images and keyframes/cameras, or the corrected ones (Polycam, raw data)"
 
@@ -76,7 +78,7 @@ class PolycamReader(Reader):
         return any(_folders(path, corrected) is not None for corrected in (True, False))
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the cameras. Raises ``InputError`` where one is not usable, and where no photo has one."""
+        """Read the cameras. Raises ``InputError`` if one is invalid, and if no photo has one."""
         return self._open(path, options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -108,7 +110,7 @@ class PolycamDataset(SplitDataset[PolycamFrame]):
 
 
 def _folders(path: Path, corrected: bool) -> tuple[Path, Path] | None:
-    """Return the folders of the photos and of their cameras, or None where one of them is missing or empty."""
+    """Return the folders of photos and cameras, or None if one of them is missing or empty."""
     prefix = "corrected_" if corrected else ""
     for base in (path / "keyframes", path):
         images, cameras = base / f"{prefix}images", base / f"{prefix}cameras"
@@ -123,9 +125,10 @@ def _frames(path: Path) -> list[PolycamFrame]:
         corrected, found = False, _folders(path, False)
         remark(
             path,
-            "has no corrected_cameras, so the poses are ARKit's, which drift; Polycam corrects them if asked to",
+            "has no corrected_cameras, so the poses are ARKit's, which drift; Polycam can correct them on"
+            " export",
         )
-    assert found is not None  # recognises ensures it
+    assert found is not None  # ensured by recognises
     images, cameras = found
     descriptions = sorted(cameras.glob("*.json"), key=lambda file: natural_order(file.name))
     photos = {file.stem: file for file in images.iterdir() if file.suffix.lower() in SUFFIXES}
@@ -134,7 +137,7 @@ def _frames(path: Path) -> list[PolycamFrame]:
         lambda file: file.stem in photos,
         images,
         lambda file: f"{file.stem}.jpg",
-        lambda file: InputError(f"{images / file.stem}.jpg: no such file, expected it as {file} is there"),
+        lambda file: InputError(f"{images / file.stem}.jpg: no such file, although {file} exists"),
         noun="photo",
     )
     if alone := len(photos) - len(kept):

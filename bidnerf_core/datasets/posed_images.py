@@ -1,4 +1,4 @@
-"""Image files with a camera, a pose and perhaps depth each: what many formats come down to once their lists are read."""
+"""Image files, each with a camera, a pose and possibly depth: the common form of many formats."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bidnerf_core.io.files import is_file
 
 @dataclass(frozen=True, eq=False)
 class ImageFrame:
-    """An image file with what a format says about it."""
+    """An image file and its metadata from a format."""
 
     image: Path
     camera: CameraSource
@@ -53,22 +53,24 @@ class MetricImageDataset(ImageDataset):
 
 
 def images_there(where: Path, frames: Sequence[ImageFrame]) -> list[ImageFrame]:
-    """Return the frames whose image is there; a remark about ``where``, the list that names them, counts the others."""
+    """Return the frames whose image exists; a remark about ``where``, the list that names them, counts the others."""
     return present(
         frames,
         lambda frame: is_file(frame.image),
         where,
         lambda frame: frame.image.name,
-        lambda frame: InputError(f"{frame.image}: no such file, expected it as {where} lists it"),
+        lambda frame: InputError(f"{frame.image}: no such file, although {where} lists it"),
     )
 
 
 def images_posed(where: Path, frames: Sequence[ImageFrame]) -> list[ImageFrame]:
-    """Return the frames with a pose; a remark about ``where`` counts the others. Raises ``InputError`` where none has one."""
+    """Return the frames with a pose; a remark about ``where`` counts the others. Raises ``InputError`` if
+    none has one.
+    """
     posed = [frame for frame in frames if frame.T_world_camera is not None]
     if not posed:
         raise InputError(
-            f"{where}: has no pose of any of {amount(len(frames), 'image')}, expected one of some at least"
+            f"{where}: has no pose for any of {amount(len(frames), 'image')}, expected at least one"
         )
     if len(posed) < len(frames):
         remark(

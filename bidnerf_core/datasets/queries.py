@@ -1,4 +1,4 @@
-"""Queries for a localization: photos, or frames of a dataset, each read when it is its turn."""
+"""Images to localize: photos, or frames of a dataset, each read on demand."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from bidnerf_core.localization import window as windowed
 log = logging.getLogger("bidnerf")
 
 NAMED = 5
-"""Maximum number of files that a message names."""
+"""Largest number of files named in a message."""
 
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An image, or several with known relative poses; the pose of the last one is sought."""
+    """An image, or several with known relative poses; the pose of the last one is to be found."""
 
     name: str
     views: tuple[View, ...]
-    truth: SE3 | None = None  # T_world_camera, where a dataset has it; used for errors and --perturb alone
+    truth: SE3 | None = None  # T_world_camera if the dataset has it; used only for errors and --perturb
     depth_rays: Observations | None = None
     file: Path | None = None  # of the last image
 
     @property
     def frame(self) -> Frame:
-        """The image whose pose is sought."""
+        """The image whose pose is to be found."""
         return self.views[-1].frame
 
 
@@ -75,15 +75,18 @@ class DepthPoints:
         rays = self.sparse.rays(views, split)
         names = [view.frame.name for view in views]
         blind = ", ".join(name for name in names if len(self.sparse.seen(name, split)) == 0)
-        log.info("%s: %s seen%s", names[-1], amount(len(rays), "point"), blind and f", none by {blind}")
+        log.info(
+            "%s: %s seen%s", names[-1], amount(len(rays), "point"), blind and f", but {blind} observes none"
+        )
         return rays
 
 
 class Photos:
-    """Image files, each a query.
+    """Image files, each of them a query.
 
-    ``depth`` holds the depth file of each photo that has one, ``depth_unit`` is the length of one of its steps (metres), and
-    ``sensor`` the camera from which depth is registered to the photos. ``masks`` hide parts of the photos.
+    ``depth`` holds the depth files of photos that have one, ``depth_unit`` is the length of one of its steps
+    (metres), and ``sensor`` the camera from which depth is registered to the photos. ``masks`` hide parts of
+    the photos.
     """
 
     def __init__(
@@ -130,7 +133,7 @@ class Photos:
         return Query(name, views, depth_rays=rays, file=file)
 
     def _remark(self, name: str, text: str) -> None:
-        """Log the source of a camera, or what was assumed, unless the same was logged for an earlier photo."""
+        """Log the source of a camera, or an assumption, unless the same was logged for an earlier photo."""
         if text not in self._remarks:
             self._remarks.add(text)
             log.info("%s: %s", name, text)
@@ -170,17 +173,17 @@ class DatasetFrames:
         return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, file)
 
     def _with_window(self, rig: tuple[str, ...], listed: list[str], size: int) -> tuple[str, ...]:
-        if size == 1 or rig[0] not in listed:  # an unknown name is rejected when it is read
+        if size == 1 or rig[0] not in listed:  # an unknown name is rejected on reading
             return rig
         names = windowed(listed, listed.index(rig[0]), size)
         if len(names) < size:
-            before = f"{names[-1]} has {len(names) - 1} before it in split {self._split!r}"
+            before = f"{names[-1]} has only {len(names) - 1} before it in split {self._split!r}"
             log.info("--window %d: %s; a rig of %d", size, before, len(names))
         return names
 
 
 def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:
-    """Return the image files among ``paths`` and in folders among them; the log names other files there.
+    """Return the image files among ``paths`` and in folders among them; other files there are logged.
 
     Files of ``depth`` may lie among the photos. Raises ``InputError`` for a folder without photos.
     """
@@ -193,7 +196,7 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
         others = [file for file in others if file not in depth]
         if not found:
             formats = expected_files()
-            raise InputError(f"{path}: no photos in it, and no dataset ({formats})")
+            raise InputError(f"{path}: contains no photos and is not a dataset ({formats})")
         if others:
             named = ", ".join(file.name for file in others[:NAMED])
             more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
@@ -203,9 +206,10 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
 
 
 def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Path]:
-    """Return the depth file of each photo: by name where names agree (``NAME.png``, ``NAME.depth.png``), else in order.
+    """Return the depth file of each photo: by name if the names agree (``NAME.png``, ``NAME.depth.png``),
+    else in order.
 
-    Raises ``UsageError`` where depth files can be assigned in neither way.
+    Raises ``UsageError`` if depth files can be assigned in neither way.
     """
     if not depth:
         return {}

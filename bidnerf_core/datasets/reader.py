@@ -1,4 +1,4 @@
-"""The interface of a reader of one dataset format, and the options with which it opens a folder."""
+"""The interface of a reader for one dataset format, and the options with which it opens a folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from bidnerf_core.io.images import Background
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
-"""The registration of depth to colour images: from a sensor or a file of one, from the format's own (True), or none (False)."""
+"""How depth is registered to colour images: from a given sensor or its file, from the format's own sensor
+(True), or not at all (False)."""
 Answer = TypeVar("Answer")
 OpenQuestion = Literal["camera", "register_depth", "depth_unit"]
 """An option of ``ReadOptions`` that a format may leave open."""
@@ -28,9 +29,9 @@ OpenQuestion = Literal["camera", "register_depth", "depth_unit"]
 class ReadOptions:
     """The options with which a reader opens a folder.
 
-    ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel; None is the format's
-    own. ``camera`` (intrinsics or a file of them), ``register_depth`` and ``depth_unit`` (metres per step of depth images, in
-    place of the format's) reach only the readers that accept them.
+    ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel;
+    None is the format's own. ``camera`` (intrinsics or a file of them), ``register_depth`` and ``depth_unit``
+    (metres per step of depth images, instead of the format's) are passed only to readers that accept them.
     """
 
     background: Background | None = None
@@ -39,9 +40,11 @@ class ReadOptions:
     depth_unit: float | None = None
 
     def sensor(self, folder: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
-        """Return the sensor from which depth is registered, or None where depth is used as it is; ``own`` is the format's.
+        """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the
+        format's.
 
-        Raises ``InputError``, which begins with ``folder``, for True where the format has none, and as ``DepthCamera.read``.
+        Raises ``InputError``, whose message begins with ``folder``, for True if the format has no sensor, and
+        as ``DepthCamera.read`` does.
         """
         register = self.register_depth
         if register is None:
@@ -50,7 +53,7 @@ class ReadOptions:
             return None
         if register is True and own is None:
             raise InputError(
-                f"{folder}: has no depth sensor that is known, expected a file of one (register_depth=)"
+                f"{folder}: its depth sensor is not known, expected the file of one (register_depth=)"
             )
         if register is True or isinstance(register, DepthCamera):
             return own if register is True else register
@@ -58,29 +61,30 @@ class ReadOptions:
 
 
 def checked_unit(depth_unit: float | None) -> float | None:
-    """Return a unit of depth as given. Raises ``InputError`` where it is not a positive number of metres per step."""
+    """Return a depth unit as given. Raises ``InputError`` unless it is a positive number of metres per step."""
     if depth_unit is not None and not 0 < depth_unit <= FARTHEST:
         raise InputError(
-            f"depth_unit is {depth_unit:g}, expected a positive number of metres a step, such as 0.001"
+            f"depth_unit is {depth_unit:g}, expected a positive number of metres per step, such as 0.001"
         )
     return depth_unit
 
 
 @runtime_checkable
 class Reader(Protocol):
-    """A reader of one dataset format. Subclasses inherit the attributes and methods that have a default here."""
+    """A reader for one dataset format. Subclasses inherit the attributes and methods that have a default here."""
 
     accepts: Collection[OpenQuestion] = ()
-    """The options that the format leaves open: "camera" where its files have none, "register_depth" where its depth may not be
-    registered to its images, "depth_unit" where its depth images may be in another unit. Others are refused before the reader
-    is called."""
+    """The options that the format accepts: "camera" if its files have none, "register_depth" if its depth may
+    not be registered to its images, "depth_unit" if its depth images may be in another unit. Others are
+    rejected before the reader is called."""
 
     suffixes: Collection[str] = ()
-    """The endings (".r3d") of the names of single files that hold a whole dataset; the paths of such files reach the reader."""
+    """The extensions (".r3d") of single files that hold a whole dataset; the paths of such files are passed
+    to the reader."""
 
     @property
     def expected(self) -> str:
-        """The files that a folder of this format holds, for error messages."""
+        """The files in a folder of this format, for error messages."""
         ...
 
     def recognises(self, path: Path) -> bool:
@@ -92,7 +96,7 @@ class Reader(Protocol):
         ...
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        """Return the frames in chronological order, also those that no split has; by default, all frames in order of names."""
+        """Return the frames in chronological order, including those in no split; by default, all frames in name order."""
         return sequence_of(self.open(path, options))
 
 
@@ -106,17 +110,17 @@ ORDER = (
     "transforms", "tum", "twelve-scenes", "seven-scenes", "record3d", "polycam", "stray-scanner", "euroc", "kitti",
     "reality-capture", "colmap",
 )  # fmt: skip
-"""The bundled readers in the order in which they are asked; a folder may hold files of several formats."""
+"""The bundled readers in the order in which they are tried; a folder may hold files of several formats."""
 
 READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)
 """The readers by name."""
 
 
 def find_reader(folder: Path) -> Reader | None:
-    """Return the reader that recognises a folder, or None: the first bundled one, or else the only other one.
+    """Return the reader that recognizes a folder, or None: the first bundled one, or else the only other one.
 
-    A reader that cannot be loaded or that fails is reported by an ``InputWarning``. Raises ``InputError`` where several readers
-    that are not bundled recognise the folder.
+    A reader that cannot be loaded or fails is reported by an ``InputWarning``. Raises ``InputError`` if
+    several third-party readers recognize the folder.
     """
     for name in ORDER:
         if may_hold(READERS[name], folder) and READERS[name].recognises(folder):
@@ -128,18 +132,19 @@ def find_reader(folder: Path) -> Reader | None:
     }
     if len(claims) > 1:
         raise InputError(
-            f"{folder}: is recognised by the readers {enumeration(list(claims))}, expected one; uninstall the others"
+            f"{folder}: is recognized by the readers {enumeration(list(claims))}, expected one; uninstall"
+            " the others"
         )
     return next(iter(claims.values()), None)
 
 
 def may_hold(reader: Reader, path: Path) -> bool:
-    """Return whether ``path`` is a folder, or a file with an ending of the reader's single files."""
+    """Return whether ``path`` is a folder, or a file with one of the reader's extensions."""
     return path.is_dir() or path.suffix.lower() in getattr(reader, "suffixes", ())
 
 
 def opened(reader: Reader, folder: Path, options: ReadOptions) -> Dataset:
-    """Return what a reader opens. Raises ``InputError`` where one that is not bundled fails, or opens no dataset."""
+    """Return what a reader opens. Raises ``InputError`` if a third-party reader fails, or does not return a dataset."""
     return _answer(reader, folder, Dataset, lambda: reader.open(folder, options))
 
 
@@ -157,14 +162,14 @@ def _answer(reader: Reader, folder: Path, expected: type, ask: Callable[[], Answ
     except (InputError, OSError, MemoryError):
         raise
     except Exception as error:
-        raise InputError(f"{who} fails to open it: {type(error).__name__}: {error}") from error
+        raise InputError(f"{who} failed to open it: {type(error).__name__}: {error}") from error
     if not isinstance(answer, expected):
         raise InputError(f"{who} returned a {type(answer).__name__}, expected a {expected.__name__}")
     return answer
 
 
 def expected_files(readers: Sequence[Reader] | None = None) -> str:
-    """Return what the folders of the formats hold, for messages; by default those of all readers."""
+    """Return what the folders of the formats contain, for messages; by default for all readers."""
     if readers is None:
         readers = [*(READERS[name] for name in ORDER), *(reader for _, reader in _others())]
     return "; or ".join(reader.expected for reader in readers)
@@ -185,5 +190,5 @@ def _claims(name: str, reader: Reader, folder: Path) -> bool:
         return bool(reader.recognises(folder))
     except Exception as error:
         why = f"{type(error).__name__}: {error}"
-        warnings.warn(f"{folder}: reader {name!r} fails to look at it: {why}", InputWarning, stacklevel=2)
+        warnings.warn(f"{folder}: reader {name!r} failed to examine it: {why}", InputWarning, stacklevel=2)
         return False

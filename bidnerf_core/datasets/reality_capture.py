@@ -1,10 +1,12 @@
-"""Photos whose cameras RealityCapture exported as comma-separated values ("Internal/External camera parameters").
+"""Photos whose cameras were exported by RealityCapture as comma-separated values ("Internal/External camera
+parameters").
 
-The columns are ``#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2``. The rotation of the camera (OpenGL axes) is
-``Rz(-heading) Rx(pitch) Ry(roll)``, in degrees, in a world whose z points up. ``f`` is the focal length in millimetres of a film
-of 36 mm, ``px`` and ``py`` are the distance of the principal point from the middle, both relative to the longer side of the
-photo; ``k1`` to ``t2`` are Brown's distortion in OpenCV's sense. Photos are in the folder, or in ``images``. Every eighth photo
-in the natural order of the names (the first, the ninth ...) is held out as "test" and the others are "train".
+The columns are ``#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2``. The rotation of the camera
+(OpenGL axes) is ``Rz(-heading) Rx(pitch) Ry(roll)``, in degrees, in a world whose z points up. ``f`` is the
+focal length in millimetres for a film 36 mm wide, ``px`` and ``py`` are the offset of the principal point
+from the image centre, both relative to the longer side of the photo; ``k1`` to ``t2`` are Brown's distortion
+in OpenCV's convention. Photos are in the folder, or in ``images``. Every eighth photo in natural name order
+(the first, the ninth ...) is held out as "test" and the others are "train".
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ IMAGES = ("", "images", "input")
 
 @dataclass(frozen=True)
 class _Photo:
-    """A row of the list, by the names of its columns, and its photo if that is there."""
+    """A row of the list, keyed by column name, and its photo if that exists."""
 
     row: Row
     values: Mapping[str, str]
@@ -54,7 +56,7 @@ class _Photo:
 
 
 class RealityCaptureReader(Reader):
-    """The reader of RealityCapture's lists of cameras."""
+    """Reader for RealityCapture's camera lists."""
 
     expected = "photos with a .csv of #name,x,y,alt,heading,pitch,roll,f (RealityCapture)"
 
@@ -62,7 +64,7 @@ class RealityCaptureReader(Reader):
         return _list(path) is not None
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the list. Raises ``InputError`` where a row is not usable, and where no photo is there."""
+        """Read the list. Raises ``InputError`` if a row is invalid, and if no photo exists."""
         return self._open(path, options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -70,7 +72,7 @@ class RealityCaptureReader(Reader):
 
     def _open(self, path: Path, options: ReadOptions) -> ImageDataset:
         file = _list(path)
-        assert file is not None  # recognises ensures it
+        assert file is not None  # ensured by recognises
         frames = [_frame(photo) for photo in _photos(path, file)]
         frames.sort(key=lambda frame: natural_order(frame.image.name))
         return ImageDataset(Splits(path, hold_out(frames)), options.background)
@@ -118,14 +120,14 @@ def _photos(path: Path, file: Path) -> list[_Photo]:
         file,
         lambda photo: photo.values["name"],
         lambda photo: InputError(
-            f"{photo.row.where}: no photo {photo.values['name']} in {path}, expected it or in images"
+            f"{photo.row.where}: no photo {photo.values['name']} in {path}, expected it there or in images"
         ),
         noun="photo",
     )
 
 
 def _frame(photo: _Photo) -> ImageFrame:
-    assert photo.image is not None  # present ensures it
+    assert photo.image is not None  # ensured by present
     heading, pitch, roll = (photo.number(key) for key in ("heading", "pitch", "roll"))
     turn = Rotation.from_euler("ZXY", [-heading, pitch, roll], degrees=True).as_matrix()
     rotation = torch.from_numpy(turn) * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
@@ -137,7 +139,9 @@ def _camera(photo: _Photo, image: Path) -> Intrinsics:
     header = read_header(image)
     longer = max(header.width, header.height)
     if photo.number("k4") != 0:
-        raise photo.row.error(": k4 is not 0, which OpenCV's model lacks; export undistorted images instead")
+        raise photo.row.error(
+            ": k4 is not 0, which OpenCV's model does not support; export undistorted images instead"
+        )
     lens = tuple(photo.number(key) for key in LENS)
     focal = photo.number("f") * longer / FILM
     centre = (header.width / 2 + photo.number("px") * longer, header.height / 2 + photo.number("py") * longer)

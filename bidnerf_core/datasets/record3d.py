@@ -1,11 +1,13 @@
-"""Recordings of the iOS program Record3D: ``.r3d`` files, or folders that one was unpacked to.
+"""Recordings of the iOS app Record3D: ``.r3d`` files, or folders with their unpacked content.
 
-A ``.r3d`` file is a zip archive. ``metadata`` is JSON: ``w h`` (of the photos) and ``dw dh`` (of depth), ``K`` (column by
-column), ``perFrameIntrinsicCoeffs`` (``fx fy cx cy`` of each frame, in newer recordings), ``poses`` (``qx qy qz qw tx ty tz``,
-camera to world, OpenGL axes), ``frameTimestamps`` (seconds) or ``fps``. Frame N has ``rgbd/N.jpg``, ``rgbd/N.depth`` (32-bit
-floats in metres, row by row, compressed with LZFSE) and, from a lidar, ``rgbd/N.conf`` (a byte of confidence per pixel,
-compressed likewise). Depth takes the package ``lzfse``, which the extra ``record3d`` installs. The world is that of the
-recording: the camera of its first frame as a rule, so no axis of it is vertical. See ``phone_scans`` for how depth and photos are read.
+A ``.r3d`` file is a zip archive. ``metadata`` is JSON: ``w h`` (of the photos) and ``dw dh`` (of depth),
+``K`` (column by column), ``perFrameIntrinsicCoeffs`` (``fx fy cx cy`` of each frame, in newer recordings),
+``poses`` (``qx qy qz qw tx ty tz``, camera to world, OpenGL axes), ``frameTimestamps`` (seconds) or ``fps``.
+Frame N has ``rgbd/N.jpg``, ``rgbd/N.depth`` (32-bit floats in metres, row by row, compressed with LZFSE) and,
+from a lidar, ``rgbd/N.conf`` (a byte of confidence per pixel, compressed likewise). Reading depth needs the
+package ``lzfse``, which the extra ``record3d`` installs. The world is that of the recording, usually the
+camera frame of its first frame, so none of its axes is vertical. See ``phone_scans`` for how depth and photos
+are read.
 
 Members of the archive are read one at a time and within limits. Every eighth frame of the dataset (the first, the ninth ...) is
 held out as "test" and the others are "train".
@@ -45,7 +47,7 @@ from bidnerf_core.io.images import Background, ImageSource, read_compact_image
 from bidnerf_core.io.json import Record, parse_record
 
 METADATA = "metadata"
-EXPECTED = "a recording of Record3D (.r3d)"
+EXPECTED = "a Record3D recording (.r3d)"
 FLOAT_BYTES = 4
 INSTALL = "pip install 'bidnerf[record3d]', or pip install lzfse"
 
@@ -97,7 +99,7 @@ class Record3DFrame:
 
 
 class Record3DReader(Reader):
-    """The reader of Record3D's recordings."""
+    """Reader for Record3D recordings."""
 
     suffixes = (".r3d",)
     expected = "a .r3d file, or metadata with rgbd/0.jpg ... (Record3D)"
@@ -106,7 +108,7 @@ class Record3DReader(Reader):
         return path.suffix.lower() == ".r3d" if not path.is_dir() else _is_unpacked(path)
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the description. Raises ``InputError`` where it or the archive is damaged, and where ``lzfse`` is missing."""
+        """Read the metadata. Raises ``InputError`` if it or the archive is damaged, and if ``lzfse`` is missing."""
         return self._open(path, options)[0]
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -162,21 +164,22 @@ class Record3DDataset(SplitDataset[Record3DFrame]):
         return Measured(sure_depth(measured, confidence, f"{self.path}/{frame.file('conf')}"), where)
 
     def _unpacked(self, name: str, size: int) -> bytes:
-        """Return the ``size`` bytes that a compressed file holds. Raises ``InputError`` for any other number of bytes."""
+        """Return the ``size`` decompressed bytes of a file. Raises ``InputError`` for any other number of bytes."""
         where, content = f"{self.path}/{name}", self._files.read(name)
         assert self._decompress is not None  # there is depth
-        # Compressed data is never much longer than what it holds: more would unpack to more than is expected.
+        # Compressed data is never much longer than its content, so longer data would unpack to more than
+        # expected.
         if len(content) > size + size // 8 + 1024:
             raise InputError(
                 f"{where}: has {len(content)} bytes, expected at most the {size} that it should unpack to"
             )
         try:
             found = self._decompress(content)
-        except Exception as error:  # of a library in C
-            raise InputError(f"{where}: not readable as LZFSE ({error}), expected a whole file") from error
+        except Exception as error:  # raised by a C library
+            raise InputError(f"{where}: not readable as LZFSE ({error}), expected a complete file") from error
         if len(found) != size:
             raise InputError(
-                f"{where}: unpacks to {len(found)} bytes, expected {size} as metadata says (dw, dh)"
+                f"{where}: unpacks to {len(found)} bytes, expected {size} according to metadata (dw, dh)"
             )
         return found
 
@@ -186,14 +189,14 @@ def _is_unpacked(folder: Path) -> bool:
 
 
 def _lzfse(path: Path) -> Callable[[bytes], bytes]:
-    """Return the function that decompresses LZFSE. Raises ``InputError`` where no package has it."""
+    """Return the function that decompresses LZFSE. Raises ``InputError`` if no package provides it."""
     try:
         import lzfse
     except ImportError:
         try:
             import liblzfse as lzfse  # the same code under its former name
         except ImportError as error:
-            raise InputError(f"{path}: depth of Record3D needs the package lzfse: {INSTALL}") from error
+            raise InputError(f"{path}: reading Record3D depth needs the package lzfse: {INSTALL}") from error
     decompress: Callable[[bytes], bytes] = lzfse.decompress
     return decompress
 
@@ -242,7 +245,7 @@ def _is_number(value: object) -> bool:
 
 
 def _times(metadata: Record, count: int) -> list[float | None]:
-    """Return the times of the frames, by their stamps or by the rate."""
+    """Return the frame times, from their stamps or from the rate."""
     stamps = metadata.items("frameTimestamps")
     if stamps is not None and len(stamps) >= count:
         return [metadata.checked_number(stamp, "an entry of frameTimestamps") for stamp in stamps[:count]]
@@ -251,7 +254,7 @@ def _times(metadata: Record, count: int) -> list[float | None]:
 
 
 def _cameras(metadata: Record, count: int) -> list[Intrinsics]:
-    """Return the cameras of the frames: their own, or that of the first frame for all."""
+    """Return the cameras of the frames: their own, or the first frame's for all."""
     width, height = metadata.size("w"), metadata.size("h")
     if width is None or height is None:
         raise metadata.error("no w and h, expected the size of the photos")
@@ -261,7 +264,7 @@ def _cameras(metadata: Record, count: int) -> list[Intrinsics]:
     elif shared is not None and len(shared) == 9:
         rows = [[shared[0], shared[4], shared[6], shared[7]]] * count  # column by column
     else:
-        raise metadata.error("no K of 9 numbers, expected the intrinsics")
+        raise metadata.error("no K with 9 numbers, expected the intrinsics")
     return [_camera(metadata, row, width, height) for row in rows]
 
 

@@ -1,4 +1,4 @@
-"""Reading an image of a recording with the depth image that belongs to it."""
+"""Reading an image of a recording together with its depth image."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class DepthFile:
     unit: float  # metres per step
     read: Callable[[Path, float], DepthImage]  # from a file and the unit; often a ``DepthReader``
     sensor: DepthCamera | None = (
-        None  # the sensor from which it is registered to its image; None: it already is
+        None  # the sensor from which it is registered to its image; None if it already is
     )
 
 
 @dataclass(frozen=True)
 class _Side:
-    pixels: int | None  # None where images keep their own size
+    pixels: int | None  # None if images keep their own size
     asked: bool
 
 
@@ -45,11 +45,12 @@ _side: ContextVar[_Side | None] = ContextVar("side", default=None)
 
 @contextmanager
 def reading_at(largest: int | None, asked: bool = False) -> Iterator[None]:
-    """Let readers reduce images to ``largest`` pixels along the longer side within the context, in this thread.
+    """Let readers downscale images to ``largest`` pixels along the longer side within the context, in this
+    thread.
 
-    Images are then never in memory at their own size. ``asked`` says that the user named this size, or for None that images
-    should keep theirs: it then replaces a smaller limit of the format. Readers learn of it by ``largest_side``, as
-    ``read_rgbd`` does for them; those that do not use it do without.
+    Images are then never held in memory at their own size. ``asked`` states that the user requested this size
+    (None: that images keep theirs), which then overrides a smaller limit of the format. Readers query it with
+    ``largest_side``, as ``read_rgbd`` does for them; those that ignore it still work.
     """
     token = _side.set(_Side(largest, asked))
     try:
@@ -59,7 +60,7 @@ def reading_at(largest: int | None, asked: bool = False) -> Iterator[None]:
 
 
 def largest_side(usual: int | None = None) -> int | None:
-    """Return the pixels along the longer side to which images are reduced now, or None; ``usual`` is the format's own limit."""
+    """Return the current limit of the longer side in pixels, or None; ``usual`` is the format's own limit."""
     side = _side.get()
     if side is None:
         return usual
@@ -76,12 +77,14 @@ def read_rgbd(
     depth: DepthFile | None = None,
     hidden_of: Callable[[int, int], Bool[Tensor, "h w"] | None] = lambda width, height: None,
 ) -> Frame:
-    """Read the image file ``image``, laid over ``background`` (rgb) where it has an alpha channel, and its depth.
+    """Read the image file ``image``, composited over ``background`` (rgb) if it has an alpha channel, and its
+    depth.
 
-    ``camera_of`` returns the camera of an image of a width and height, or raises ``InputError`` where that is not the size
-    expected; it is called before any pixel is decoded. The images of a ``Lens`` are resampled to its pinhole camera.
-    ``hidden_of`` returns the pixels that are not to be used, of an image of that size. Registered depth may be of any size: each pixel has that of the nearest
-    measurement. Raises ``InputError`` for a file that is not readable, and for registered depth of another aspect ratio.
+    ``camera_of`` returns the camera for an image's width and height, or raises ``InputError`` if the size is
+    not the expected one; it is called before any pixel is decoded. The images of a ``Lens`` are resampled to
+    its pinhole camera. ``hidden_of`` returns the pixels to be ignored in an image of that size. Registered
+    depth may be of any size: each pixel has the depth of the nearest measurement. Raises ``InputError`` for
+    an unreadable file, and for registered depth of another aspect ratio.
     """
     header = read_header(image)
     camera, size = camera_of(header.width, header.height), (header.width, header.height)

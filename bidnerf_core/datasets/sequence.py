@@ -20,24 +20,25 @@ from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.se3 import SE3
 
 ReadFrame: TypeAlias = Callable[[], tuple[Frame, SE3 | None]]
-"""Reads the files of a frame; the pose is its ``T_world_camera`` where that is known."""
+"""Reads the files of a frame; the pose is ``T_world_camera`` if known."""
 
 TIMESTAMP = re.compile(r"\d+\.\d+")
 
 
 @dataclass(frozen=True, eq=False)
 class TimedFrame:
-    """A frame of a sequence, its time, and its true pose if that is known."""
+    """A frame of a sequence, its time, and its true pose if known."""
 
     time: float | None  # seconds, from an origin that depends on the recording
-    frame: Frame  # without colours (``has_colour``) where only depth was recorded at this time
-    truth: SE3 | None = None  # T_world_camera, OpenCV axes, where the recording has it
+    frame: Frame  # without colours (``has_colour``) if only depth was recorded at this time
+    truth: SE3 | None = None  # T_world_camera, OpenCV axes, if the recording has it
     split: str | None = None  # the split of the dataset that holds the frame
 
 
 @runtime_checkable
 class FrameSequence(Protocol):
-    """Frames in chronological order. Each is read when the iteration reaches it, which may raise ``InputError``.
+    """Frames in chronological order. Each is read when the iteration reaches it, which may raise
+    ``InputError``.
 
     Either all frames have a time or none has. Iterating again starts over.
     """
@@ -61,16 +62,17 @@ class SequenceEntry:
 
 
 class FileSequence:
-    """A sequence whose frames are files of their own, so that it can be indexed, sliced and reversed."""
+    """A sequence whose frames are separate files, so it can be indexed, sliced and reversed."""
 
-    # Not a subclass of collections.abc.Sequence: run-time type checkers look at an item of those, which would read a file.
+    # Not a subclass of collections.abc.Sequence: run-time type checkers inspect an item of those, which would
+    # read a file.
 
     def __init__(self, path: Path, entries: Sequence[SequenceEntry]) -> None:
         self._path, self._entries = path, entries
 
     @staticmethod
     def ordered(path: Path, entries: Sequence[SequenceEntry]) -> FileSequence:
-        """Return the frames in order of time; if any lacks a time, as they are listed and all without times."""
+        """Return the frames in order of time; if any lacks a time, in the given order and all without times."""
         if any(entry.time is None for entry in entries):
             return FileSequence(path, [replace(entry, time=None) for entry in entries])
         return FileSequence(path, sorted(entries, key=lambda entry: entry.time or 0.0))
@@ -81,17 +83,17 @@ class FileSequence:
 
     @property
     def entries(self) -> Sequence[SequenceEntry]:
-        """The frames, none of which is read."""
+        """The frames, without reading any."""
         return self._entries
 
     @property
     def names(self) -> list[str]:
-        """The names of the frames, none of which is read."""
+        """The names of the frames, without reading any."""
         return [entry.name for entry in self._entries]
 
     @property
     def times(self) -> list[float | None]:
-        """The times of the frames (seconds), none of which is read."""
+        """The times of the frames (seconds), without reading any."""
         return [entry.time for entry in self._entries]
 
     def of_split(self, split: str) -> FileSequence:
@@ -99,8 +101,12 @@ class FileSequence:
         chosen = [entry for entry in self._entries if entry.split == split]
         if not chosen:
             known = ", ".join(sorted({entry.split for entry in self._entries if entry.split is not None}))
-            expected = f"expected one of {known}" if known else "as only those of a dataset with poses are"
-            raise InputError(f"{self._path}: no frame is of a split {split!r}, {expected}")
+            expected = (
+                f"expected one of {known}"
+                if known
+                else "since only frames of a dataset with poses have a split"
+            )
+            raise InputError(f"{self._path}: no frame belongs to a split {split!r}, {expected}")
         return FileSequence(self._path, chosen)
 
     def __len__(self) -> int:
@@ -116,12 +122,12 @@ class FileSequence:
     def __getitem__(self, place: slice) -> FileSequence: ...
 
     def __getitem__(self, place: int | slice) -> TimedFrame | FileSequence:
-        """Read one frame, or return a part of the sequence, such as every second frame (``[::2]``)."""
+        """Read one frame, or return a slice of the sequence, such as every second frame (``[::2]``)."""
         if isinstance(place, slice):
             return FileSequence(self._path, self._entries[place])
         entry = self._entries[place]
         frame, truth = entry.read()
-        # As floats at once: a tracker reads the colours of a frame often, and holds few frames.
+        # Converted to floats at once: a tracker reads the colours of a frame often, and holds few frames.
         return TimedFrame(entry.time, replace(frame, rgb=frame.rgb), truth, entry.split)
 
 
@@ -131,7 +137,7 @@ def timestamp(stem: str) -> float | None:
 
 
 def sequence_of(dataset: Dataset) -> FileSequence:
-    """Return the frames of all splits of a dataset in the natural order of their names, without times."""
+    """Return the frames of all splits of a dataset in natural name order, without times."""
     listed = [(split, name) for split in dataset.splits for name in dataset.frame_names(split)]
     listed.sort(key=lambda frame: natural_order(frame[1]))
     return FileSequence.ordered(

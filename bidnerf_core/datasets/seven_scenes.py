@@ -1,20 +1,22 @@
 """Folders of 7-Scenes (https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes).
 
-A frame is ``frame-000000.color.png``, ``frame-000000.depth.png`` (16-bit planar z in millimetres, 0 and 65535 where nothing
-was measured) and ``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres). A scene has folders ``seq-01``,
-``seq-02`` ..., and the files ``TrainSplit.txt`` and ``TestSplit.txt`` list them ("sequence1" or "seq-01"). The folder of one
-sequence can be read as well; there, and in a scene without split files, every eighth frame (the first, the ninth ...) is held
-out as "test" and the others are "train". The format records no times: a sequence is in the order of folders and numbers.
+A frame is ``frame-000000.color.png``, ``frame-000000.depth.png`` (16-bit planar z in millimetres, 0 and 65535
+where nothing was measured) and ``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres). A scene
+has folders ``seq-01``, ``seq-02`` ..., and the files ``TrainSplit.txt`` and ``TestSplit.txt`` list them
+("sequence1" or "seq-01"). The folder of a single sequence can be read as well; in that case, and in a scene
+without split files, every eighth frame (the first, the ninth ...) is held out as "test" and the others are
+"train". The format records no times: a sequence is ordered by folder and number.
 
-The Kinect's two cameras were not calibrated, and its depth is not registered to its colour images. The poses are those of
-the depth camera (focal length 585 px); the colour camera has 525 px and is mounted 2.6 cm away. By default both are treated as
-in the literature on relocalization (ACE, CVPR 2023, and the pseudo ground truth of Brachmann et al., ICCV 2021): poses are
-moved to the colour camera and depth is registered to it, using the calibration of another Kinect or the one that is given.
-Without registration, images, depth and poses are used as they are, with the 585 px of the dataset's page for both, as in
-KinectFusion and its successors; at the border, colours are then some 30 px away from their depth.
+The Kinect's two cameras were not calibrated, and its depth is not registered to its colour images. The poses
+are those of the depth camera (focal length 585 px); the colour camera has 525 px and is mounted 2.6 cm away.
+By default both are handled as in the relocalization literature (ACE, CVPR 2023, and the pseudo ground truth
+of Brachmann et al., ICCV 2021): poses are transformed to the colour camera and depth is registered to it,
+using the calibration of another Kinect or a given one. Without registration, images, depth and poses are used
+as they are, with the 585 px stated on the dataset's page for both, as in KinectFusion and its successors;
+near the image border, colours are then some 30 px away from their depth.
 
-For images of other sizes, cameras are scaled. A camera that is given, or in ``camera.json`` or ``cameras.txt`` of the folder,
-is that of the colour images; without registration, it is that of the depth images as well.
+Cameras are scaled to images of other sizes. A camera that is given, or found in the folder's ``camera.json``
+or ``cameras.txt``, describes the colour images; without registration, it describes the depth images as well.
 """
 
 from __future__ import annotations
@@ -93,9 +95,10 @@ class SceneFrame:
 
 
 class SevenScenesReader(Reader):
-    """The reader of folders of 7-Scenes.
+    """Reader for 7-Scenes folders.
 
-    Poses and depth are moved from a depth sensor to the colour camera: that of a Kinect, unless another or none is given.
+    Poses and depth are transferred from the depth sensor to the colour camera, by default with a Kinect's
+    calibration.
     """
 
     accepts = ("camera", "register_depth", "depth_unit")
@@ -107,7 +110,7 @@ class SevenScenesReader(Reader):
     def open(self, path: Path, options: ReadOptions) -> Dataset:
         """List the frames; those without a pose are left out and counted.
 
-        Raises ``InputError`` where none has one, and for split files that are not usable.
+        Raises ``InputError`` if none has a pose, and for invalid split files.
         """
         splits = _splits(path)
         frames = list({frame: None for group in splits.values() for frame in group})
@@ -117,9 +120,7 @@ class SevenScenesReader(Reader):
                 lambda frame: frame.pose.is_file(),
                 path,
                 lambda frame: frame.pose.relative_to(path),
-                lambda frame: InputError(
-                    f"{frame.pose}: no such file, expected it as {frame.image.name} is there"
-                ),
+                lambda frame: InputError(f"{frame.pose}: no such file, although {frame.image.name} exists"),
                 noun="pose",
             )
         )
@@ -175,7 +176,9 @@ class SevenScenesDataset(SplitDataset[SceneFrame]):
 
 
 def _splits(path: Path) -> dict[str, list[SceneFrame]]:
-    """Return the frames of the listed sequences; without split files, of all sequences with every eighth held out."""
+    """Return the frames of the listed sequences; without split files, of all sequences with every eighth
+    frame held out.
+    """
     folders = _sequence_folders(path)
     listed = {split: path / name for split, name in SPLIT_FILES.items() if (path / name).is_file()}
     if not folders:
@@ -195,12 +198,12 @@ def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
         if found is None:
             raise row.error(f": {row.text[:40]!r}")
         if int(found[1]) not in folders:
-            raise InputError(f"{row.where}: no folder of {row.text}, expected seq-{int(found[1]):02d}")
+            raise InputError(f"{row.where}: no folder for {row.text}, expected seq-{int(found[1]):02d}")
         if int(found[1]) in numbers:
-            raise InputError(f"{row.where}: {row.text} again, expected each sequence once")
+            raise InputError(f"{row.where}: {row.text} is repeated, expected each sequence once")
         numbers.append(int(found[1]))
     if not numbers:
-        raise InputError(f"{file}: lists no sequence, expected lines such as sequence1")
+        raise InputError(f"{file}: lists no sequences, expected lines such as sequence1")
     return numbers
 
 

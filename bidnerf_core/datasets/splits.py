@@ -35,7 +35,7 @@ class NamedFrame(Protocol):
 
     @property
     def time(self) -> float | None:
-        """The time (seconds) at which the image was taken, where the format records it."""
+        """The time (seconds) at which the image was taken, if the format records it."""
         ...
 
 
@@ -57,7 +57,7 @@ class Splits(Generic[F]):
         return tuple(self._frames)
 
     def names(self, split: str) -> list[str]:
-        """Return the names of a split in order. Raises ``InputError`` for an unknown split."""
+        """Return the names in a split, in order. Raises ``InputError`` for an unknown split."""
         self._known(split)
         return list(self._names[split])
 
@@ -78,14 +78,14 @@ class Splits(Generic[F]):
         return [group[0] for group in self._frames.values()]
 
     def distinct(self) -> list[tuple[str, F]]:
-        """Return each description once, with the first split that holds it; splits may share frames."""
+        """Return each description once, with the first split that contains it; splits may share frames."""
         found = {
             id(frame): (split, frame) for split in reversed(self.splits) for frame in self._frames[split]
         }
         return list(found.values())
 
     def distinct_names(self) -> list[tuple[str, str]]:
-        """Return the first split, and the name there, of each description; splits may share frames."""
+        """Return each description's first split and its name there; splits may share frames."""
         seen, found = set[int](), list[tuple[str, str]]()
         for split, group in self._frames.items():
             for name, frame in zip(self._names[split], group, strict=True):
@@ -100,9 +100,9 @@ class Splits(Generic[F]):
 
 
 class SplitDataset(ABC, Generic[F]):
-    """A ``Dataset`` whose frames are described by ``Splits``; subclasses read the image and the pose of a frame.
+    """A ``Dataset`` whose frames are described by ``Splits``; subclasses read the image and pose of a frame.
 
-    Subclasses set ``unit`` and ``up`` where their format says them, see ``Georeferenced``.
+    Subclasses set ``unit`` and ``up`` if their format specifies them, see ``Georeferenced``.
     """
 
     unit: LengthUnit | None = None
@@ -122,7 +122,7 @@ class SplitDataset(ABC, Generic[F]):
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """The requested colour, or black, as images of most formats have no alpha channel."""
+        """The requested colour, or black, since images of most formats have no alpha channel."""
         return self._background
 
     def frame_names(self, split: str) -> list[str]:
@@ -147,13 +147,14 @@ class SplitDataset(ABC, Generic[F]):
         return views
 
     def distinct_names(self) -> list[tuple[str, str]]:
-        """Return the first split, and the name there, of each frame; splits may share frames."""
+        """Return each frame's first split and its name there; splits may share frames."""
         return self._frames.distinct_names()
 
     def sequence(self, others: Sequence[F] = ()) -> FrameSequence:
-        """Return the frames of all splits in chronological order, or in that of file names where times are not recorded.
+        """Return the frames of all splits in chronological order, or in file-name order if times are not
+        recorded.
 
-        ``others`` are frames that are in no split, since they lack what a dataset needs.
+        ``others`` are frames that belong to no split because they lack something that a dataset needs.
         """
         listed: list[tuple[str | None, F]] = [*self._frames.distinct(), *((None, frame) for frame in others)]
         listed.sort(key=lambda item: natural_order("/".join(item[1].parts)))
@@ -171,11 +172,11 @@ class SplitDataset(ABC, Generic[F]):
 
     @abstractmethod
     def _frame(self, frame: F, name: str) -> Frame:
-        """Read the frame's image and depth. Raises ``InputError`` where a file is missing or not usable."""
+        """Read the frame's image and depth. Raises ``InputError`` if a file is missing or invalid."""
 
     @abstractmethod
     def _pose(self, frame: F) -> SE3 | None:
-        """Return ``T_world_camera``, or None where the recording does not have it."""
+        """Return ``T_world_camera``, or None if the recording does not have it."""
 
 
 def hold_out(frames: list[F]) -> dict[str, list[F]]:

@@ -1,10 +1,12 @@
-"""Recordings of the iOS program Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md).
+"""Recordings of the iOS app Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md).
 
-``rgb.mp4`` is a video, ``odometry.csv`` has ``timestamp, frame, x, y, z, qx, qy, qz, qw`` of its frames (seconds, metres; camera
-to world with OpenCV axes) and in newer recordings ``fx, fy, cx, cy``, ``camera_matrix.csv`` is the 3x3 matrix of all frames.
-``depth/000000.png`` (16-bit planar z in millimetres, 256x192) and ``confidence/000000.png`` (0, 1, 2) belong to the frames of
-that number; some may be missing. See ``phone_scans`` for how depth and photos are read. Reading the video takes the extra
-``video``. Every eighth frame of the dataset (the first, the ninth ...) is held out as "test" and the others are "train".
+``rgb.mp4`` is a video, ``odometry.csv`` has ``timestamp, frame, x, y, z, qx, qy, qz, qw`` of its frames
+(seconds, metres; camera to world with OpenCV axes) and in newer recordings ``fx, fy, cx, cy``,
+``camera_matrix.csv`` is the 3x3 camera matrix of all frames. ``depth/000000.png`` (16-bit planar z in
+millimetres, 256x192) and ``confidence/000000.png`` (0, 1, 2) belong to the frame with that number; some may
+be missing. See ``phone_scans`` for how depth and photos are read. Reading the video needs the extra
+``video``. Every eighth frame of the dataset (the first, the ninth ...) is held out as "test" and the others
+are "train".
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class StrayFrame:
 
 
 class StrayScannerReader(Reader):
-    """The reader of Stray Scanner's recordings."""
+    """Reader for Stray Scanner recordings."""
 
     expected = f"{VIDEO} with {ODOMETRY} and {MATRIX} (Stray Scanner)"
 
@@ -69,7 +71,7 @@ class StrayScannerReader(Reader):
         return is_file(path / ODOMETRY) and is_file(path / MATRIX)
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the odometry. Raises ``InputError`` where a file is not usable, and where the extra ``video`` is missing."""
+        """Read the odometry. Raises ``InputError`` if a file is invalid, and if the extra ``video`` is missing."""
         return self._open(path, options)[0]
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -103,7 +105,7 @@ class StrayDataset(SplitDataset[StrayFrame]):
 
     def _depth(self, frame: StrayFrame) -> Measured | None:
         files = {kind: self.path / kind / f"{frame.stem}.png" for kind in ("depth", "confidence")}
-        arrays = self.path / "depth" / f"{frame.stem}.npy"  # of the first versions
+        arrays = self.path / "depth" / f"{frame.stem}.npy"  # written by the first versions
         depth = next((file for file in (files["depth"], arrays) if is_file(file)), None)
         if depth is None:
             return None
@@ -125,7 +127,7 @@ def _frames(path: Path, video: VideoFrames) -> list[StrayFrame]:
     shared = _matrix(path / MATRIX, video.size)
     rows = [row for row in rows if row.text]
     if len(rows) > 1 and len(rows[-1].text.split(",")) < len(names):
-        remark(rows[-1].where, "the last row is cut off and is left out")
+        remark(rows[-1].where, "the last row is truncated and was left out")
         rows = rows[:-1]
     frames = [_frame(row, names, shared) for row in rows]
     if not frames:
@@ -134,15 +136,15 @@ def _frames(path: Path, video: VideoFrames) -> list[StrayFrame]:
         frames,
         lambda frame: frame.number < len(video),
         path / VIDEO,
-        lambda frame: f"number {frame.number}",
+        lambda frame: f"frame {frame.number}",
         lambda frame: InputError(
-            f"{video.path}: has {len(video)} frames, expected that of number {frame.number}"
+            f"{video.path}: has {len(video)} frames, but frame {frame.number} is needed"
         ),
         noun="frame",
     )
     posed = [frame for frame in there if frame.T_world_camera is not None]
     if not posed:
-        raise InputError(f"{path / ODOMETRY}: has no pose that is finite, expected one for each frame")
+        raise InputError(f"{path / ODOMETRY}: has no finite pose, expected one for each frame")
     if len(posed) < len(there):
         remark(
             path / ODOMETRY,

@@ -1,13 +1,13 @@
-"""Rows with time stamps, as in the TUM RGB-D benchmark; trajectories, and their poses at the times in between.
+"""Rows with time stamps, as in the TUM RGB-D benchmark; trajectories, and their poses interpolated in time.
 
-A row is ``timestamp value value ...``, separated by blanks or commas; ``#`` begins a comment, empty lines are skipped, and
-Windows line endings are allowed. Rows may be in any order. A last row that is cut off, as where a copy broke off, is left out
-with a remark.
+A row is ``timestamp value value ...``, separated by blanks or commas; ``#`` begins a comment, empty lines are
+skipped, and Windows line endings are allowed. Rows may be in any order. A truncated last row, as left by an
+interrupted copy, is left out with a remark.
 
-A trajectory is one of three kinds, which its rows tell apart. TUM: ``timestamp tx ty tz qx qy qz qw`` (seconds), or another
-order of the quaternion where a comment names one (``# timestamp tx ty tz qw qx qy qz``). EuRoC:
-``timestamp,px,py,pz,qw,qx,qy,qz[,...]`` (nanoseconds). KITTI: twelve numbers, the first three rows of a 4x4 matrix, without a
-time, one for each image. All are camera to world, or body to world for EuRoC.
+A trajectory is in one of three formats, distinguished by its rows. TUM: ``timestamp tx ty tz qx qy qz qw``
+(seconds), or another quaternion order if a comment states it (``# timestamp tx ty tz qw qx qy qz``). EuRoC:
+``timestamp,px,py,pz,qw,qx,qy,qz[,...]`` (nanoseconds). KITTI: twelve numbers, the first three rows of a 4x4
+matrix, without a time, one row for each image. All are camera to world, or body to world for EuRoC.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from bidnerf_core.io.rows import LARGEST_ROWS, Row, parse_rows, read_rows
 
 NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
 UNIT_TO = 0.01
-"""How far the length of a quaternion may be from 1, for example because of rounding to four decimals."""
+"""Tolerance of a quaternion's length around 1, for example because of rounding to four decimals."""
 LARGEST_GAP = 0.1
-"""Seconds. Within this time a hand-held camera deviates from the interpolated path by a few millimetres; motion capture that
-lost its markers leaves longer gaps, in which no pose is known."""
+"""Seconds. Within this time a hand-held camera deviates from the interpolated path by a few millimetres;
+motion capture that lost its markers leaves longer gaps, in which no pose is known."""
 KITTI_ROW = 12
-"""Numbers of a row of KITTI's: a 3x4 matrix."""
+"""Numbers in a KITTI row: a 3x4 matrix."""
 NANOSECONDS = 10**9
 LEAST_NANOSECONDS = 10**14
-"""Whole numbers from here on are nanoseconds: as seconds they would be three million years."""
+"""Integers from here on are nanoseconds: as seconds they would be three million years."""
 QUATERNION_COLUMNS = re.compile(r"\bq_?(?:\w+_)?([wxyz])\b", re.IGNORECASE)
 
 
@@ -53,7 +53,7 @@ class TimedRow:
     row: Row
     time: float  # seconds
     words: tuple[str, ...]  # what follows the time stamp
-    rest: str  # the same as one text, such as the name of a file with blanks in it
+    rest: str  # the same as one text, such as a file name with blanks in it
 
     @property
     def where(self) -> str:
@@ -64,8 +64,8 @@ class TimedRow:
 def read_timed_rows(path: Path, columns: str) -> list[TimedRow]:
     """Read the rows in chronological order; ``columns`` names the columns after the time stamp ("tx ty tz").
 
-    Raises ``InputError`` where the file is missing, not text, too large or without rows, and for a row with fewer
-    entries or without a finite time.
+    Raises ``InputError`` if the file is missing, not text, too large or without rows, and for a row with too
+    few entries or without a finite time.
     """
     return timed_rows(read_rows(path, "a list of time stamps", f"timestamp {columns}"), path, columns)
 
@@ -73,14 +73,14 @@ def read_timed_rows(path: Path, columns: str) -> list[TimedRow]:
 def timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool = False) -> list[TimedRow]:
     """Return the rows of the file ``path`` in chronological order, as ``read_timed_rows`` does.
 
-    Whole numbers are nanoseconds where ``nanoseconds`` says so, and where they are too large for seconds.
+    Integer times are nanoseconds if ``nanoseconds`` is set, or if they are too large for seconds.
     """
     count = 1 + len(columns.split())
     if not rows:
         raise InputError(f"{path}: has no rows, expected lines of timestamp {columns}")
     if len(rows) > 1 and len(_words(rows[-1])) < count:
         found = len(_words(rows[-1]))
-        remark(rows[-1].where, f"the last row is cut off ({found} of {count} entries) and is left out")
+        remark(rows[-1].where, f"the last row is truncated ({found} of {count} entries) and was left out")
         rows = rows[:-1]
     return sorted((_timed(row, count, nanoseconds) for row in rows), key=lambda row: row.time)
 
@@ -96,7 +96,7 @@ def _timed(row: Row, count: int, nanoseconds: bool) -> TimedRow:
     try:
         time = float(words[0])
     except ValueError as error:
-        raise row.error(f": {words[0]!r} is no time stamp") from error
+        raise row.error(f": {words[0]!r} is not a time stamp") from error
     if not math.isfinite(time):
         raise row.error(f": the time stamp is {words[0]}")
     if words[0].isdecimal() and (nanoseconds or time >= LEAST_NANOSECONDS):
@@ -105,18 +105,18 @@ def _timed(row: Row, count: int, nanoseconds: bool) -> TimedRow:
 
 
 def require_distinct_times(rows: list[TimedRow]) -> None:
-    """Raise ``InputError`` where two of the rows, which are in chronological order, have the same time stamp."""
+    """Raise ``InputError`` if two of the rows, which are in chronological order, have the same time stamp."""
     for row, following in pairwise(rows):
         if row.time == following.time:
             first, second = sorted((row.row, following.row), key=lambda row: row.line)
             raise InputError(
-                f"{second.where}: the time stamp {row.time:.6f} of line {first.line} again, expected each once"
+                f"{second.where}: the time stamp {row.time:.6f} repeats line {first.line}, expected each once"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses ``T_world_camera`` (OpenCV axes, metres) in chronological order (seconds); no time occurs twice."""
+    """Poses ``T_world_camera`` (OpenCV axes, metres) in chronological order (seconds), with distinct times."""
 
     times: Float[Tensor, "n"]
     rotations: Float[Tensor, "n 3 3"]
@@ -128,7 +128,8 @@ class Trajectory:
     def at(self, time: float, largest_gap: float = LARGEST_GAP) -> SE3 | None:
         """Return the pose at a time: a sample, or the interpolation of its two neighbours (slerp and linear).
 
-        None before the first sample, after the last, and between two that are more than ``largest_gap`` seconds apart.
+        Returns None before the first sample, after the last, and between two samples more than
+        ``largest_gap`` seconds apart.
         """
         after = int(np.searchsorted(self.times.numpy(), time))
         if after < len(self) and float(self.times[after]) == time:
@@ -145,11 +146,13 @@ class Trajectory:
 
 
 def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Trajectory:
-    """Read a trajectory of one of the kinds above. ``times`` (seconds) are those of the images, for KITTI's, which has none.
+    """Read a trajectory in one of the formats above. ``times`` (seconds) are the image times, for KITTI's
+    format, which has none.
 
-    Poses that are not finite, and those whose quaternion is zero, are left out with a remark that counts them. Raises
-    ``InputError``, with the file and line, where a row is cut off, a quaternion is not of length 1, two rows have the same time
-    and different poses, or the rows of KITTI's kind are not as many as the images.
+    Poses that are not finite, and those whose quaternion is zero, are left out with a remark that counts
+    them. Raises ``InputError``, with the file and line, if a row is truncated, a quaternion does not have
+    length 1, two rows have the same time but different poses, or the number of KITTI rows differs from the
+    number of images.
     """
     content = read_file(path, "a trajectory", LARGEST_ROWS)
     rows = parse_rows(content, path, "a trajectory", f"timestamp {NUMBERS_A_LINE}")
@@ -166,7 +169,7 @@ def _comments(content: bytes) -> list[str]:
 
 
 def _quaternion_order(content: bytes, rows: Sequence[Row]) -> str:
-    """Return the order of the quaternion: that which a comment names, else that of EuRoC or of TUM."""
+    """Return the quaternion order: the one stated in a comment, else that of EuRoC or TUM."""
     for line in _comments(content):
         named = "".join(QUATERNION_COLUMNS.findall(line)).lower()
         if sorted(named) == sorted("xyzw"):
@@ -179,19 +182,21 @@ def _timed_trajectory(path: Path, rows: Sequence[TimedRow], order: str) -> Traje
     numbers = [_pose_numbers(row, order) for row in rows]
     known = [place for place, found in enumerate(numbers) if found is not None]
     if not known:
-        raise InputError(f"{path}: has no pose that is finite, expected lines of timestamp {NUMBERS_A_LINE}")
+        raise InputError(f"{path}: has no finite pose, expected lines of timestamp {NUMBERS_A_LINE}")
     if len(known) < len(rows):
         first = next(place for place, found in enumerate(numbers) if found is None)
         left = amount(len(rows) - len(known), "pose")
         remark(
-            path, f"{left} of {len(rows)} not finite or zero, left out (first: line {rows[first].row.line})"
+            path,
+            f"{left} of {len(rows)} not finite or zero, left out (first: line {rows[first].row.line})",
         )
     kept = list[int]()
     for place in known:
         if kept and rows[kept[-1]].time == rows[place].time:
             if numbers[kept[-1]] != numbers[place]:
                 raise InputError(
-                    f"{rows[place].where}: another pose at the time {rows[place].time:.6f}, expected one pose a time"
+                    f"{rows[place].where}: another pose at the time {rows[place].time:.6f}, expected one pose"
+                    " per time"
                 )
             continue
         kept.append(place)
@@ -208,7 +213,7 @@ def check_unit(length: float, where: str, names: str) -> None:
 
 
 def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
-    """Return the translation and the quaternion (x, y, z, w) of a row, or None where there is no pose in it."""
+    """Return the translation and the quaternion (x, y, z, w) of a row, or None if it holds no pose."""
     numbers = row.row.plain_numbers(row.words[:7])
     quaternion = dict(zip(order, numbers[3:], strict=True))
     length = math.hypot(*numbers[3:])
@@ -219,10 +224,10 @@ def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
 
 
 def _kitti(path: Path, rows: Sequence[Row], times: Sequence[float] | None) -> Trajectory:
-    """Return the poses of rows of 3x4 matrices, one for each of ``times``."""
+    """Return the poses in rows of 3x4 matrices, one for each of ``times``."""
     kind = f"{path}: has rows of {KITTI_ROW} numbers, KITTI's 3x4 poses, which have no times"
     if times is None or len(times) != len(rows):
-        images = "images of known times" if times is None else amount(len(times), "image")
+        images = "images with known times" if times is None else amount(len(times), "image")
         raise InputError(f"{kind}; there are {len(rows)} for {images}, expected one for each image")
     remark(
         path, f"rows of {KITTI_ROW} numbers are read as KITTI's 3x4 camera-to-world poses, one for each image"
@@ -245,10 +250,12 @@ def _kitti_pose(row: Row) -> SE3:
 
 
 def read_matrices(path: Path) -> list[SE3]:
-    """Read KITTI's rows of twelve numbers as poses ``T_world_camera``. Raises ``InputError``, with file and line, for others."""
-    rows = read_rows(path, "a file of KITTI's poses", f"{KITTI_ROW} numbers, a 3x4 matrix")
+    """Read KITTI's rows of twelve numbers as poses ``T_world_camera``. Raises ``InputError``, with file and
+    line, for others.
+    """
+    rows = read_rows(path, "a file of KITTI poses", f"{KITTI_ROW} numbers, a 3x4 matrix")
     if len(rows) > 1 and len(_words(rows[-1])) < KITTI_ROW:
-        remark(rows[-1].where, "the last row is cut off and is left out")
+        remark(rows[-1].where, "the last row is truncated and was left out")
         rows = rows[:-1]
     if not rows:
         raise InputError(f"{path}: has no rows, expected {KITTI_ROW} numbers in each")

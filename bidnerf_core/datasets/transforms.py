@@ -50,11 +50,11 @@ from bidnerf_core.io.files import is_file
 from bidnerf_core.io.images import Background, background_colour, read_header
 
 DYNAMIC_MASK = "dynamic_mask_"
-"""Prefix of the masks of instant-ngp, which lie beside the images."""
+"""Prefix of instant-ngp's masks, which lie next to the images."""
 
 
 class TransformsReader(Reader):
-    """The reader of folders with ``transforms*.json``."""
+    """Reader for folders with ``transforms*.json``."""
 
     accepts: tuple[OpenQuestion, ...] = ("depth_unit",)
     expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
@@ -89,7 +89,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         self._read_depth = DepthReader()
         self._depth_unit = depth_unit
         self._by_images = background is None
-        self._scaled: set[tuple[int, int, int, int]] = set()  # sizes of images and cameras that were reported
+        self._scaled: set[tuple[int, int, int, int]] = set()  # sizes of images and cameras already reported
         self._first: tuple[str, int, int] | None = (
             None  # file, width and height of the first image whose camera has no size
         )
@@ -102,7 +102,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         return self._background
 
     def image_file(self, split: str, name: str) -> Path:
-        """Return the image file of a frame. Raises ``InputError`` where there is none."""
+        """Return the image file of a frame. Raises ``InputError`` if there is none."""
         ((_, frame),) = self._frames.select(split, [name])
         return self._files.images[frame]
 
@@ -137,9 +137,10 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         return frame.T_world_camera
 
     def _size_of_camera(self, frame: FrameRecord, path: Path, width: int, height: int) -> tuple[int, int]:
-        """Return the size of the image that the camera describes: that of the file, or the same reduced or enlarged.
+        """Return the image size that the camera describes: the file's own, or one with the same aspect ratio.
 
-        Raises ``InputError`` for another one. A camera without a size is that of the first such image, taken with the same lens.
+        Raises ``InputError`` for any other size. A camera without a size describes the first such image,
+        taken with the same lens.
         """
         camera = frame.camera
         expected, whose = (camera.width or width, camera.height or height), "w and h say"
@@ -168,7 +169,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
 
 
 class _Files:
-    """The images, depth images and masks of the frames; those that are missing are left out, and counted in a remark."""
+    """The images, depth images and masks of the frames; missing ones are left out, and counted in a remark."""
 
     def __init__(self, folder: Path, splits: dict[str, list[FrameRecord]]) -> None:
         self._folder, self._names = folder, FileNames(folder)
@@ -199,7 +200,8 @@ class _Files:
     def _no_image(self, frame: FrameRecord) -> InputError:
         tried = self._folder / frame.file_path
         return frame.record.error(
-            f"no image {tried}, expected that file (also tried with the extension of an image added, in any case)"
+            f"no image {tried}, expected that file (also tried with image extensions added, in upper and"
+            " lower case)"
         )
 
     def _no_mask(self, frame: FrameRecord) -> InputError:
@@ -208,7 +210,7 @@ class _Files:
         )
 
     def _remark_names(self) -> None:
-        """Report names that differ from those of the files by more than an added extension."""
+        """Report names that differ from the file names by more than an added extension."""
         for frame, path in self.images.items():
             written = frame.record.text("file_path") or ""
             if not str(path).startswith(str(self._folder / written)):

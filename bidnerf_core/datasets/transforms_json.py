@@ -27,7 +27,7 @@ METRES_PER_DEPTH_UNIT = 0.001
 DEPTH_KEYS = ("depth_file_path", "depth_path")
 """The keys of a depth image: nerfstudio's, and that of instant-ngp and NeRFCapture."""
 UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
-"""The keys of the metres per step of its values, in the same order."""
+"""The keys for the metres per step of its values, in the same order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class FrameRecord:
     file_path: PurePosixPath  # as in the file, without a leading "./"
     camera: CameraRecord
     T_world_camera: SE3
-    scale: float  # that was removed from its matrix; 1 where that was rigid
+    scale: float  # removed from its matrix; 1 if that was rigid
     depth_path: PurePosixPath | None
     depth_unit: float  # metres
     time: float | None  # seconds
@@ -46,7 +46,7 @@ class FrameRecord:
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of its position, where the file says ``"unit": "metres"`` or ``"units"``, as those of bidnerf do."""
+        """The unit of its position if the file says ``"unit": "metres"`` or ``"units"``, as bidnerf's files do."""
         said = self.record.value("unit")
         return said if said in get_args(LengthUnit) else None
 
@@ -57,7 +57,9 @@ class FrameRecord:
         return stem if self.camera.face is None else f"{stem}_{self.camera.face}"
 
     def faces(self) -> list[FrameRecord]:
-        """Return the pinhole views of a panorama; the frame itself where it is none. Raises ``InputError`` for its depth."""
+        """Return the pinhole views of a panorama; the frame itself if it is not one. Raises ``InputError``
+        for a panorama with depth.
+        """
         if self.camera.lens != PANORAMA:
             return [self]
         if self.depth_path is not None:
@@ -76,7 +78,7 @@ class FrameRecord:
 
 
 def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
-    """Read the frames of each split of the folder ``path``. Raises ``InputError`` for a description that is not usable."""
+    """Read the frames of each split of the folder ``path``. Raises ``InputError`` for an invalid description."""
     files = {split: path / file_of(split) for split in SPLITS if (path / file_of(split)).is_file()}
     if files:
         return _cut({split: read_frames(read_record(file)) for split, file in files.items()})
@@ -85,7 +87,7 @@ def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
 
 
 def _cut(splits: dict[str, list[FrameRecord]]) -> dict[str, list[FrameRecord]]:
-    """Return the splits with panoramas cut into pinhole views; splits may share frames."""
+    """Return the splits with panoramas divided into pinhole views; splits may share frames."""
     views = {id(frame): frame.faces() for group in splits.values() for frame in group}
     return {split: [view for frame in group for view in views[id(frame)]] for split, group in splits.items()}
 
@@ -93,7 +95,7 @@ def _cut(splits: dict[str, list[FrameRecord]]) -> dict[str, list[FrameRecord]]:
 def read_frames(file: Record) -> list[FrameRecord]:
     """Read every entry of ``frames`` that has a pose; a remark counts the others.
 
-    Raises ``InputError`` where two have the same image, and where none has a pose.
+    Raises ``InputError`` if two have the same image, and if none has a pose.
     """
     entries = file.items("frames")
     if not entries:
@@ -104,7 +106,7 @@ def read_frames(file: Record) -> list[FrameRecord]:
     for number, frame in enumerate(frames):
         first = seen.setdefault(frame.parts, number)
         if first != number:
-            raise frame.record.error(f"the image of frame {first} again, expected each image once")
+            raise frame.record.error(f"has the same image as frame {first}, expected each image once")
     _remark_scales(file, frames)
     if file.value("enable_depth_loading") is False and any(
         "depth_path" in frame.record.values for frame in frames
@@ -114,20 +116,20 @@ def read_frames(file: Record) -> list[FrameRecord]:
 
 
 def _posed(file: Record, entries: list[Any]) -> list[tuple[int, Any]]:
-    """Return the numbered entries but for those without a pose, unless that is all of them."""
+    """Return the numbered entries without those lacking a pose, unless all of them do."""
     kept = [(number, entry) for number, entry in enumerate(entries) if not _lacks_pose(entry)]
     if kept and len(kept) < len(entries):
         first = next(entry for entry in entries if _lacks_pose(entry))
         remark(
             file.where,
-            f"{len(entries) - len(kept)} of {amount(len(entries), 'frame')} have no pose (transform_matrix is missing, zero or"
-            f" not finite) and are left out, the first is {first.get('file_path')}",
+            f"{len(entries) - len(kept)} of {amount(len(entries), 'frame')} have no pose (transform_matrix"
+            f" is missing, zero or not finite) and are left out, first: {first.get('file_path')}",
         )
     return kept or list(enumerate(entries))
 
 
 def _lacks_pose(entry: Any) -> bool:
-    """Return whether a frame has no matrix, or one of zeros or with numbers that are not finite."""
+    """Return whether a frame has no matrix, a zero matrix, or one with numbers that are not finite."""
     if not isinstance(entry, dict):
         return False
     rows = entry.get("transform_matrix")
@@ -154,7 +156,7 @@ def _remark_scales(file: Record, frames: list[FrameRecord]) -> None:
 
 
 def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[FrameRecord]]:
-    """Split one ``transforms.json`` by its lists of file names, or hold out every eighth frame where it has none."""
+    """Split one ``transforms.json`` by its lists of file names, or hold out every eighth frame if it has none."""
     lists = {split: file.items(f"{split}_filenames") for split in SPLITS}
     if not any(lists.values()):
         return hold_out(frames)
@@ -176,7 +178,7 @@ def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[Fram
 def _listed(
     file: Record, by_path: dict[PurePosixPath, FrameRecord], key: str, entries: Iterable[object]
 ) -> list[FrameRecord]:
-    """Return the frames that a list names. A remark counts the names that no frame has."""
+    """Return the frames that a list names. A remark counts the names without a frame."""
     given = list(entries)
     found = [by_path.get(posix_name(entry)) if isinstance(entry, str) else None for entry in given]
     strange = [entry for entry, frame in zip(given, found, strict=True) if frame is None]
@@ -216,7 +218,7 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
 def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
     """Return the depth image of a frame, or None, and the metres per step of its values.
 
-    nerfstudio and instant-ngp have keys of their own for both; ``enable_depth_loading`` switches instant-ngp's off.
+    nerfstudio and instant-ngp use different keys for both; ``enable_depth_loading`` disables instant-ngp's.
     """
     for key, unit_key in zip(DEPTH_KEYS, UNIT_KEYS, strict=True):
         path = own.text(key)
@@ -236,7 +238,7 @@ def _unit(record: Record, keys: Iterable[str]) -> float:
 
 
 def _time(own: Record) -> float | None:
-    """Return ``time`` or ``timestamp`` (seconds), or the number that is the name of the file in ``source``."""
+    """Return ``time`` or ``timestamp`` (seconds), or the number in the name of the ``source`` file."""
     for key in ("time", "timestamp"):
         if (found := own.number(key)) is not None:
             return found

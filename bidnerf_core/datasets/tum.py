@@ -1,23 +1,24 @@
 """Folders of the TUM RGB-D benchmark as it is distributed (https://cvg.cit.tum.de/data/datasets/rgbd-dataset).
 
-``rgb.txt`` and ``depth.txt`` list images with their time stamps (seconds), ``groundtruth.txt`` the poses of the colour
-camera in the frame of the motion capture: ``timestamp tx ty tz qx qy qz qw``, camera to world, OpenCV axes. The three are
-sampled at different times and rates. A colour image is paired with the depth image that is nearest in time, if each is the
-other's nearest and they are at most 20 ms apart, and with the pose interpolated between the samples before and after it. A
-frame outside the time span of the ground truth, or in a gap of more than 0.1 s, has no pose: it is in the sequence but not in
-the dataset, and a remark counts it. The ground truth may also be in the format of EuRoC, or of KITTI with one pose for each
-image. Every eighth of the posed frames (the first, the ninth ...) is held out as "test" and the others are "train". Listed
-images that are missing are left out with a remark; names may have blanks in them.
+``rgb.txt`` and ``depth.txt`` list images with their time stamps (seconds), ``groundtruth.txt`` the poses of
+the colour camera in the motion-capture frame: ``timestamp tx ty tz qx qy qz qw``, camera to world, OpenCV
+axes. The three are sampled at different times and rates. A colour image is paired with the depth image
+nearest in time if they are mutual nearest neighbours at most 20 ms apart, and with the pose interpolated
+between the samples before and after it. A frame outside the time span of the ground truth, or in a gap of
+more than 0.1 s, has no pose: it is in the sequence but not in the dataset, and a remark counts it. The ground
+truth may also be in the format of EuRoC, or of KITTI with one pose for each image. Every eighth posed frame
+(the first, the ninth ...) is held out as "test" and the others are "train". Listed images that are missing
+are left out with a remark; names may contain blanks.
 
-Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image. The published
-images already contain the correction of the depth scale. Depth of other recordings in this layout is registered from the
-sensor that is given.
+Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image.
+The published images already include the depth scale correction. Depth of other recordings in this layout is
+registered if a sensor is given.
 
-The camera is, in this order: the one that is given, as a file or as ``freiburg1``, 2 or 3; the one in ``camera.json`` or
-``cameras.txt`` of the folder (in the formats of ``bidnerf localize --camera``); the published one of freiburg1, 2 or 3,
-according to the folder's name. Published principal points count pixels from the centre of the upper left one, so half a pixel
-is added here. Colour images of freiburg1 and freiburg2 are distorted; the camera models this (k1 k2 p1 p2 k3), and no image
-is resampled.
+The camera is, in this order: the given one, as a file or as ``freiburg1``, 2 or 3; the one in the folder's
+``camera.json`` or ``cameras.txt`` (in the formats of ``bidnerf localize --camera``); the published one of
+freiburg1, 2 or 3, according to the folder's name. Published principal points are relative to the centre of
+the upper left pixel, so half a pixel is added here. Colour images of freiburg1 and freiburg2 are distorted;
+the camera models this (k1 k2 p1 p2 k3), and no image is resampled.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class ListedDepth:
-    """A depth image of the list."""
+    """A listed depth image."""
 
     where: str
     image: Path
@@ -80,7 +81,7 @@ class ListedDepth:
 
 @dataclass(frozen=True, eq=False)
 class TumFrame:
-    """A colour image of the list, with what belongs to it."""
+    """A listed colour image, with its associated data."""
 
     where: str  # the file and line that lists it
     image: Path
@@ -99,10 +100,10 @@ class TumFrame:
 
 
 class TumReader(Reader):
-    """The reader of folders of the TUM RGB-D benchmark.
+    """Reader for folders of the TUM RGB-D benchmark.
 
-    A camera that is given (intrinsics, a file, or the name of one of the benchmark's sensors) takes precedence over all others;
-    depth is registered from the sensor that is given, if there is one.
+    A given camera (intrinsics, a file, or the name of one of the benchmark's sensors) takes precedence over
+    all others; depth is registered if a sensor is given.
     """
 
     accepts = ("camera", "register_depth", "depth_unit")
@@ -112,7 +113,7 @@ class TumReader(Reader):
         return (path / COLOUR_LIST).is_file()
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the lists. Raises ``InputError`` where one is missing or broken, and where no frame has a pose."""
+        """Read the lists. Raises ``InputError`` if one is missing or malformed, and if no frame has a pose."""
         if not (path / TRUTH).is_file():
             raise InputError(f"{path / TRUTH}: no such file, expected the poses of the frames of a dataset")
         frames, trajectory = _recorded(path)
@@ -131,7 +132,7 @@ class TumReader(Reader):
 
     def _dataset(self, path: Path, splits: dict[str, list[TumFrame]], options: ReadOptions) -> TumDataset:
         given = None if options.camera is None else _named_camera(options.camera) or options.camera
-        unknown, ways = f"its name says none of {SENSORS}", f"one of {SENSORS}, or a file"
+        unknown, ways = f"its name contains none of {SENSORS}", f"one of {SENSORS}, or a file"
         camera = folder_camera(path, given, published_camera(path), unknown, ways)
         unit = METRES_PER_STEP if options.depth_unit is None else options.depth_unit
         return TumDataset(Splits(path, splits), camera, options.sensor(path), options.background, unit)
@@ -171,7 +172,7 @@ def published_camera(folder: Path) -> Intrinsics | None:
 
 
 def _named_camera(given: Camera | Path) -> Intrinsics | None:
-    """Return the calibration of a sensor that is given by its name, such as ``freiburg1``, or None."""
+    """Return the calibration of a sensor given by name, such as ``freiburg1``, or None."""
     found = None if not isinstance(given, Path) or given.exists() else SENSOR.fullmatch(str(given))
     return CAMERAS[found[1]] if found else None
 
@@ -179,13 +180,13 @@ def _named_camera(given: Camera | Path) -> Intrinsics | None:
 def tum_frames(folder: Path) -> list[TumFrame]:
     """Read the lists of a folder and associate them by time; no image is opened. Raises ``InputError``.
 
-    Images that are missing are left out, and remarks count them.
+    Missing images are left out, and remarks count them.
     """
     return _recorded(folder)[0]
 
 
 def _recorded(folder: Path) -> tuple[list[TumFrame], Trajectory | None]:
-    """Return the frames of a folder, and its ground truth where it has one."""
+    """Return the frames of a folder, and its ground truth if it has one."""
     names = FileNames(folder)
     colours = _listed(folder / COLOUR_LIST)
     times = [row.time for row in colours]
@@ -214,7 +215,7 @@ def _frame(
 
 
 def _depths(folder: Path, names: FileNames) -> list[tuple[float, ListedDepth]]:
-    """Return the times and files of the depth images that are there."""
+    """Return the times and files of the depth images that exist."""
     if not (folder / DEPTHS).is_file():
         return []
     listed = [
@@ -230,7 +231,7 @@ def _depths(folder: Path, names: FileNames) -> list[tuple[float, ListedDepth]]:
 
 
 def _file(row: TimedRow, names: FileNames, folder: Path) -> tuple[Path, bool]:
-    """Return the file that a row lists, whose name may have blanks, and whether it is there."""
+    """Return the file that a row lists, whose name may contain blanks, and whether it exists."""
     for name in (row.rest.strip("\"'"), row.words[0]):
         if (found := names.find(posix_name(name))) is not None:
             return found, True
@@ -238,7 +239,9 @@ def _file(row: TimedRow, names: FileNames, folder: Path) -> tuple[Path, bool]:
 
 
 def _remark_without_pose(path: Path, images: int, posed: int, trajectory: Trajectory) -> None:
-    """Count the images without a pose, with the usual gap between poses. Raises ``InputError`` where no image has a pose."""
+    """Count the images without a pose, and report the usual gap between poses. Raises ``InputError`` if no
+    image has a pose.
+    """
     if posed == 0:
         raise InputError(
             f"{path / TRUTH}: covers no image of {COLOUR_LIST}, expected samples before and after their times, "
@@ -246,8 +249,8 @@ def _remark_without_pose(path: Path, images: int, posed: int, trajectory: Trajec
         )
     gap = float(trajectory.times.diff().median()) if len(trajectory) > 1 else 0.0
     why = (
-        f"its {len(trajectory)} poses are {gap:.2g} s apart as a rule, as those of keyframes are, and none is interpolated over"
-        f" more than {LARGEST_GAP:g} s"
+        f"its {len(trajectory)} poses are usually {gap:.2g} s apart, like those of keyframes, and none is"
+        f" interpolated over more than {LARGEST_GAP:g} s"
         if gap > LARGEST_GAP
         else f"before its first pose, after its last, or in gaps of more than {LARGEST_GAP:g} s"
     )
@@ -255,7 +258,8 @@ def _remark_without_pose(path: Path, images: int, posed: int, trajectory: Trajec
 
 
 def associate(times: Sequence[float], others: Sequence[float], largest: float) -> dict[int, int]:
-    """Return the pairs of indices that are mutually nearest in time, at most ``largest`` seconds apart.
+    """Return the pairs of indices that are mutual nearest neighbours in time, at most ``largest`` seconds
+    apart.
 
     Both lists are in chronological order.
     """
@@ -270,7 +274,7 @@ def associate(times: Sequence[float], others: Sequence[float], largest: float) -
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return, for each time, the index of the nearest of the others; of two equally near ones, the earlier."""
+    """Return the index of the other time nearest to each time; the earlier one if two are equally near."""
     after = np.searchsorted(others, times).clip(1, max(1, len(others) - 1))
     before = after - 1
     after = after.clip(max=len(others) - 1)

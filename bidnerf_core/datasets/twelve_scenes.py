@@ -1,11 +1,12 @@
 """Folders of 12-Scenes (https://graphics.stanford.edu/projects/reloc): an iPad's photos with a Structure sensor's depth.
 
-A scene has ``info.txt`` (``m_calibrationColorIntrinsic`` and ``m_calibrationDepthIntrinsic``, 4x4, of images of
-``m_colorWidth`` x ``m_colorHeight`` and ``m_depthWidth`` x ``m_depthHeight``), ``split.txt`` (``sequence0 [frames=357] [start=0 ;
-end=356]``) and ``data`` with ``frame-000000.color.jpg``, ``frame-000000.depth.png`` (16-bit planar z in millimetres) and
-``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres; -INF where tracking failed). Depth is registered to the
-colour camera by the two calibrations. As in the literature on relocalization (SCoRe Forests' successors, DSAC, ACE) the first
-sequence is "test" and the others are "train"; without ``split.txt`` every eighth frame is held out.
+A scene has ``info.txt`` (``m_calibrationColorIntrinsic`` and ``m_calibrationDepthIntrinsic``, 4x4, of images
+of ``m_colorWidth`` x ``m_colorHeight`` and ``m_depthWidth`` x ``m_depthHeight``), ``split.txt`` (``sequence0
+[frames=357] [start=0 ; end=356]``) and ``data`` with ``frame-000000.color.jpg``, ``frame-000000.depth.png``
+(16-bit planar z in millimetres) and ``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres;
+-INF if tracking failed). Depth is registered to the colour camera by the two calibrations. As in the
+relocalization literature (the successors of SCoRe Forests, DSAC, ACE) the first sequence is "test" and the
+others are "train"; without ``split.txt`` every eighth frame is held out.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ FOCAL_TOLERANCE = 1e-3
 
 
 class TwelveScenesReader(Reader):
-    """The reader of folders of 12-Scenes."""
+    """Reader for 12-Scenes folders."""
 
     accepts: tuple[OpenQuestion, ...] = ("camera", "register_depth", "depth_unit")
     expected = "info.txt with data/frame-000000.color.jpg ... (12-Scenes)"
@@ -49,7 +50,7 @@ class TwelveScenesReader(Reader):
         return _info(path) is not None and _data(path) is not None
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the poses. Raises ``InputError`` where a description is not usable, and where no frame has a pose."""
+        """Read the poses. Raises ``InputError`` if a description is invalid, and if no frame has a pose."""
         frames = images_posed(path, _frames(path, options))
         return MetricImageDataset(Splits(path, _splits(path, frames)), options.background)
 
@@ -77,7 +78,7 @@ def _names(folder: Path) -> list[str]:
 
 def _frames(path: Path, options: ReadOptions) -> list[ImageFrame]:
     folder, info = _data(path), _info(path)
-    assert folder is not None  # recognises ensures it
+    assert folder is not None  # ensured by recognises
     assert info is not None
     colour, own = _cameras(info)
     camera = CameraSource(options.camera or colour)
@@ -94,7 +95,7 @@ def _frames(path: Path, options: ReadOptions) -> list[ImageFrame]:
 
 
 def _pose(file: Path) -> SE3 | None:
-    """Return the pose in a file, or None where there is none or tracking failed."""
+    """Return the pose in a file, or None if there is none or tracking failed."""
     if not is_file(file):
         return None
     rows = read_rows(file, "a file of a pose", "4 rows of 4 numbers", LARGEST_POSE)
@@ -103,9 +104,9 @@ def _pose(file: Path) -> SE3 | None:
 
 
 def _cameras(info: Path) -> tuple[Intrinsics, DepthCamera | None]:
-    """Return the colour camera, and the depth sensor where it is another camera than that."""
+    """Return the colour camera, and the depth sensor if it is a different camera."""
     values: dict[str, list[float]] = {}
-    for row in read_rows(info, "the info.txt of 12-Scenes", "name = numbers"):
+    for row in read_rows(info, "12-Scenes' info.txt", "name = numbers"):
         name, _, text = row.text.partition("=")
         if name.strip().startswith(("m_calibration", "m_color", "m_depth")):
             values[name.strip()] = row.plain_numbers(text.split())

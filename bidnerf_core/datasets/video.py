@@ -1,8 +1,8 @@
-"""Video files as sequences; needs the extra ``video`` (PyAV, whose wheels hold FFmpeg's libraries).
+"""Video files as sequences; needs the extra ``video`` (PyAV, whose wheels include FFmpeg's libraries).
 
-Frames are decoded one after another, each with its time stamp from the file, in seconds from the start: phones record at a
-varying rate. A rotation in the file's metadata is applied, so the camera is that of the upright image. A video does not record
-its focal length, so the camera has to be given, or assumed.
+Frames are decoded one after another, each with its time stamp from the file, in seconds from the start:
+phones record at a varying rate. A rotation in the file's metadata is applied, so the camera is that of the
+upright image. A video does not record its focal length, so the camera has to be given or assumed.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from bidnerf_core.io.images import LARGEST_IMAGE, looks_like_image, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
 MICROSECONDS = 1_000_000
-"""The unit in which a file states its start, per second."""
+"""The unit of a file's start time, per second."""
 MATROSKA = b"\x1aE\xdf\xa3"
 """First bytes of Matroska and WebM."""
 BT_2020 = 9
-"""The matrix from luma and chroma to colours (ITU-T H.273) that stands in for those that FFmpeg lacks."""
+"""The YCbCr-to-RGB matrix (ITU-T H.273) used in place of those that FFmpeg lacks."""
 OPTIONS = {"protocol_whitelist": "file"}
-"""A playlist that is called a video must not open connections."""
+"""A playlist disguised as a video must not open connections."""
 
 
 @dataclass(frozen=True)
 class Video:
     """The frames of a video file in chronological order; see ``FrameSequence``.
 
-    Its length is the number of frames in the file. Iteration raises ``InputError`` where the file breaks off.
+    Its length is the number of frames in the file. Iteration raises ``InputError`` if the file is truncated.
     """
 
     path: Path
@@ -61,7 +61,7 @@ class Video:
             yield TimedFrame(time, self._frame(pixels, number))
 
     def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
-        rgb = as_floats(torch.from_numpy(pixels))  # at once, as a tracker reads them often
+        rgb = as_floats(torch.from_numpy(pixels))  # at once, since a tracker reads them often
         found = self.camera.find(self.path, Raster(pixels.shape[1], pixels.shape[0]))
         return Frame.taken(
             _name(number), found.camera, Images(rgb), camera_source=found.description,
@@ -74,9 +74,10 @@ def _name(number: int) -> str:
 
 
 def pictures(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
-    """Yield the time (seconds) and the upright pixels of each frame of a video that ``open_video`` has accepted.
+    """Yield the time (seconds) and the upright pixels of each frame of a video that ``open_video`` has
+    accepted.
 
-    Raises ``InputError`` where the file breaks off.
+    Raises ``InputError`` if the file is truncated.
     """
     number = 0
     with opened_video(path) as (container, stream):
@@ -97,11 +98,13 @@ def pictures(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
 
 
 def _broken(path: Path, number: int, error: Exception) -> InputError:
-    return InputError(f"{path}: breaks off at frame {number} ({reason(error)}), expected a whole video file")
+    return InputError(
+        f"{path}: breaks off at frame {number} ({reason(error)}), expected a complete video file"
+    )
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a file is a video by its name or by its first bytes; it is not decoded."""
+    """Return whether a file is a video, judging by its name or first bytes; it is not decoded."""
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return True
     try:
@@ -121,7 +124,7 @@ def open_video(path: Path, camera: CameraSource) -> Video:
 
 
 def frame_count(path: Path) -> int:
-    """Return the number of frames in a video file; none is decoded. Raises ``InputError`` as ``open_video`` does."""
+    """Return the number of frames in a video file without decoding any. Raises ``InputError`` as ``open_video`` does."""
     require_av(path)
     with open_binary(path, "a video file"):
         pass
@@ -140,7 +143,7 @@ def frame_count(path: Path) -> int:
 
 
 def require_av(path: Path) -> None:
-    """Raise ``InputError`` where the extra ``video`` is missing, which says what to install."""
+    """Raise ``InputError``, which says what to install, if the extra ``video`` is missing."""
     try:
         import av  # noqa: F401
     except ImportError as error:
@@ -151,7 +154,7 @@ def require_av(path: Path) -> None:
 
 @contextmanager
 def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a file of which only the first video stream is read. Raises ``InputError`` if it is no video."""
+    """Open a video file; only its first video stream is read. Raises ``InputError`` if it is not a video."""
     import av
 
     try:
@@ -160,7 +163,7 @@ def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
         raise _no_video(path, reason(error)) from error
     with container:
         if not container.streams.video:
-            raise _no_video(path, "it has no pictures")
+            raise _no_video(path, "it has no video stream")
         stream = container.streams.video[0]
         stream.codec_context.options = {"max_pixels": str(LARGEST_IMAGE)}
         yield container, stream
@@ -182,10 +185,10 @@ def _upright(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def stored_pixels(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pixels of a picture, of any bit depth; colours of HDR are as they are coded, without tone mapping."""
+    """Return the pixels of a picture of any bit depth; HDR colours are kept as coded, without tone mapping."""
     try:
         pixels: np.ndarray = picture.to_ndarray(format="rgb24")
-    except OSError:  # FFmpeg does not convert from the colour space that the file names, such as BT.2020 of constant luminance
+    except OSError:  # FFmpeg does not support the colour space that the file names, such as BT.2020 with constant luminance
         picture.colorspace = BT_2020
         pixels = picture.to_ndarray(format="rgb24")
     return pixels

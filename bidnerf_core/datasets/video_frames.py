@@ -16,13 +16,13 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io.images import reason
 
 FORWARD = 90
-"""Frames up to which decoding goes on instead of seeking; phones write a key frame about once a second."""
+"""Number of frames up to which decoding continues instead of seeking; phones write a key frame about once a second."""
 
 
 class VideoFrames:
-    """The frames of a video in the order of their times. The raster is the stored one, without the rotation of the metadata.
+    """The frames of a video in chronological order, as stored, without the rotation in the metadata.
 
-    Raises ``InputError`` where the file is no video, and where the extra ``video`` is missing.
+    Raises ``InputError`` if the file is not a video, and if the extra ``video`` is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,15 +40,15 @@ class VideoFrames:
                 raise self._broken(0, error) from error
         self._open: ExitStack | None = None
         self._decoded: Iterator[Any] = iter(())
-        self._next = 0  # number of the frame that is decoded next
+        self._next = 0  # number of the next frame to decode
 
     def __len__(self) -> int:
         return len(self._times)
 
     def read(self, number: int) -> UInt8[Tensor, "h w 3"]:
-        """Return the pixels of a frame. Raises ``InputError`` where the file breaks off before it."""
+        """Return the pixels of a frame. Raises ``InputError`` if the file ends before it."""
         if not 0 <= number < len(self):
-            raise InputError(f"{self.path}: has {len(self)} frames, expected one of number {number}")
+            raise InputError(f"{self.path}: has {len(self)} frames, but frame {number} is needed")
         try:
             if self._open is None or not self._next <= number <= self._next + FORWARD:
                 self._seek(number)
@@ -63,13 +63,13 @@ class VideoFrames:
         raise self._broken(number, ValueError("no further frame could be decoded"))
 
     def close(self) -> None:
-        """Close the file; the next frame that is read opens it again."""
+        """Close the file; reading another frame reopens it."""
         if self._open is not None:
             self._open.close()
         self._open, self._next = None, 0
 
     def _seek(self, number: int) -> None:
-        """Go to the key frame before a frame."""
+        """Seek to the key frame before a frame."""
         self.close()
         self._open = ExitStack()
         container, stream = self._open.enter_context(opened_video(self.path))
@@ -78,10 +78,10 @@ class VideoFrames:
         self._decoded = container.decode(stream)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the open file, which no other process can use."""
+        """Leave out the open file, which another process cannot use."""
         return {**self.__dict__, "_open": None, "_decoded": iter(()), "_next": 0}
 
     def _broken(self, number: int, error: Exception) -> InputError:
         return InputError(
-            f"{self.path}: breaks off at frame {number} ({reason(error)}), expected a whole video file"
+            f"{self.path}: breaks off at frame {number} ({reason(error)}), expected a complete video file"
         )

@@ -1,4 +1,4 @@
-"""All views of a dataset, whatever their split: ``--split all``."""
+"""All views of a dataset, regardless of their split: ``--split all``."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.units import LengthUnit
 
 ALL = "all"
-"""The name by which all splits together are asked for, unless a dataset has a split of that name."""
+"""The name that selects all splits together, unless a dataset has a split of that name."""
 
 
 @dataclass(frozen=True, eq=False)
 class WholeDataset:
-    """A ``Dataset`` with one split, ALL, that holds each view of another dataset once.
+    """A ``Dataset`` with one split, ALL, that contains each view of another dataset once.
 
-    Views of one name in two splits have the name of their split in front.
+    Views with the same name in two splits are prefixed with the name of their split.
     """
 
     parts: Dataset
@@ -36,12 +36,12 @@ class WholeDataset:
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of the poses, where the format says it."""
+        """The unit of the poses, if the format specifies it."""
         return getattr(self.parts, "unit", None)
 
     @property
     def up(self) -> tuple[float, float, float] | None:
-        """The upward direction in the world, where the capture measured gravity."""
+        """The upward direction in the world, if the capture measured gravity."""
         return getattr(self.parts, "up", None)
 
     @property
@@ -50,8 +50,8 @@ class WholeDataset:
 
     @cached_property
     def _listed(self) -> list[tuple[str, str]]:
-        """The split and the name in it of each view."""
-        if isinstance(self.parts, SplitDataset):  # which knows what its splits share
+        """Each view's split and its name there."""
+        if isinstance(self.parts, SplitDataset):  # it knows what its splits share
             return self.parts.distinct_names()
         return [(split, name) for split in self.parts.splits for name in self.parts.frame_names(split)]
 
@@ -81,7 +81,7 @@ class WholeDataset:
 
 
 def with_all(dataset: Dataset, split: str) -> Dataset:
-    """Return a dataset that has ``split``, where this is ALL, and otherwise the dataset itself."""
+    """Return a dataset that has ``split``, which may be ALL; any other split leaves the dataset unchanged."""
     return WholeDataset(dataset) if split == ALL and ALL not in dataset.splits else dataset
 
 

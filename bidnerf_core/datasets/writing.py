@@ -1,4 +1,4 @@
-"""Writing views to a folder of ``transforms_SPLIT.json``, images and depth, which the readers can read."""
+"""Writing views to a folder of ``transforms_SPLIT.json``, images and depth, in a form that the readers can read."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ LARGEST_DEPTH = 65534  # readers interpret the largest 16-bit number as "not mea
 def write_transforms(
     folder: str | Path, splits: Mapping[str, Sequence[View]], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> None:  # fmt: skip
-    """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bit) and ``depth/SPLIT/NAME.png`` (16 bit).
+    """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bits) and ``depth/SPLIT/NAME.png`` (16
+    bits).
 
-    ``background`` is the colour behind frames that have an alpha channel; it is removed from their colours. Depth is stored
-    in millimetres, or in larger steps where 16 bits would not suffice. A split without views is left out. Raises
-    ``InputError`` for an unknown split, a name that occurs twice, and a lens with more than five distortion coefficients.
+    ``background`` is the colour behind frames that have an alpha channel; it is removed from their colours.
+    Depth is stored in millimetres, or in larger steps if 16 bits would not suffice. A split without views is
+    left out. Raises ``InputError`` for an unknown split, a duplicate name, and a lens with more than five
+    distortion coefficients.
     """
     folder = Path(folder)
     for split, views in splits.items():
@@ -39,10 +41,10 @@ def write_transforms(
         names = [view.frame.name for view in views]
         if len(set(names)) != len(names):
             raise InputError(
-                f"{folder}: two frames of split {split!r} have one name, expected different ones"
+                f"{folder}: two frames of split {split!r} have the same name, expected different ones"
             )
         frames = [_written(folder, split, view, background) for view in views]
-        if not frames:  # readers refuse a file without any
+        if not frames:  # readers reject a file without any
             continue
         folder.mkdir(parents=True, exist_ok=True)
         write_file(
@@ -67,7 +69,8 @@ def _written(folder: Path, split: str, view: View, background: tuple[float, floa
 def frame_entry(
     file_path: str, name: str, camera: Intrinsics, T_world_camera: SE3, time: float | None = None
 ) -> dict[str, Any]:
-    """Return an entry of ``frames`` of a ``transforms.json``: an image, its camera, its pose and its time (seconds).
+    """Return an entry of ``frames`` for a ``transforms.json``: an image, its camera, its pose and its time
+    (seconds).
 
     Raises ``InputError`` for a lens that the format cannot describe.
     """
@@ -84,7 +87,7 @@ def camera_entry(camera: Intrinsics, name: str) -> dict[str, float]:
     """Return the ``transforms.json`` entries of a camera. Raises ``InputError`` for a lens that the format cannot describe."""
     if len(camera.distortion) > len(LENS):
         found = len(camera.distortion)
-        raise InputError(f"frame {name}: lens of {found} coefficients, expected at most {len(LENS)}")
+        raise InputError(f"frame {name}: the lens has {found} coefficients, expected at most {len(LENS)}")
     sizes = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     return {
         **sizes,
@@ -95,7 +98,7 @@ def camera_entry(camera: Intrinsics, name: str) -> dict[str, float]:
 
 
 def _colours(frame: Frame, background: tuple[float, float, float]) -> np.ndarray:
-    """Return RGB, or straight (not premultiplied) RGBA where the frame has alpha."""
+    """Return RGB, or straight (not premultiplied) RGBA if the frame has alpha."""
     colours = frame.rgb.detach().cpu()
     if frame.alpha is not None:
         cover = frame.alpha.detach().cpu()[..., None]
