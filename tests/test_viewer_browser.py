@@ -133,6 +133,13 @@ def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> N
         page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "dropped.png"])
         until(page, "page.answers.length === 3 && document.getElementById('note').textContent === ''")
         assert page.text_content("#answer .name") == "dropped.png"
+        page.fill("#hfov", "58.19")
+        page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "with field of view.png"])
+        until(page, "page.answers.length === 4 && document.getElementById('note').textContent === ''")
+        assert "horizontal field of view 58.19 deg" in page.evaluate("page.answer.camera")
+        page.fill("#hfov", "200")
+        page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "no camera.png"])
+        until(page, "document.getElementById('note').textContent.includes('from 1 to 179')")
 
 
 def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Path) -> None:

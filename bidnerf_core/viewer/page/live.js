@@ -11,7 +11,7 @@ export class Live {
     this.queries = page.state.queries;
     this.on = false;
     const choose = find("choose"), stage = find("stage"), drop = find("drop");
-    choose.hidden = false;
+    choose.hidden = find("fov").hidden = false;
     find("photo").addEventListener("change", (event) => { for (const file of event.target.files) this.upload(file); event.target.value = ""; });
     let inside = 0;
     document.addEventListener("dragenter", (event) => { if (event.dataTransfer?.types.includes("Files")) { inside++; drop.hidden = false; } });
@@ -53,7 +53,10 @@ export class Live {
   upload(file) {
     if (file.size > LARGEST) { this.page.note(`${file.name} has ${Math.round(file.size / 2 ** 20)} MiB, at most 32 are accepted.`); return null; }
     const name = file.name.slice(0, LONGEST) || "photo";
-    return this.ask(`/api/photo?name=${encodeURIComponent(name)}`, name, file);
+    const hfov = find("hfov");
+    if (!hfov.checkValidity()) { this.page.note("The field of view is a number of degrees from 1 to 179."); return null; }
+    const camera = hfov.value ? `&hfov=${encodeURIComponent(hfov.value)}` : "";
+    return this.ask(`/api/photo?name=${encodeURIComponent(name)}${camera}`, name, file);
   }
 
   async ask(path, name, body = null) {
