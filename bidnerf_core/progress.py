@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -41,6 +43,24 @@ def check_cancelled(cancel: Cancel | None, stage: str) -> None:
         )
     if cancel is not None and cancel():
         raise Cancelled(f"cancelled during stage {stage!r}")
+
+
+_STOP: ContextVar[Cancel | None] = ContextVar("stop", default=None)
+
+
+@contextmanager
+def stopped_by(cancel: Cancel) -> Iterator[None]:
+    """Let localizations and renderings of this thread within the block raise ``Cancelled`` soon after ``cancel`` returns True."""
+    token = _STOP.set(cancel)
+    try:
+        yield
+    finally:
+        _STOP.reset(token)
+
+
+def check_stopped() -> None:
+    """Raise ``Cancelled`` if what this thread does is to stop, see ``stopped_by``. Called once in each round of a long loop."""
+    check_cancelled(_STOP.get(), "localization")
 
 
 def counter(

@@ -15,6 +15,7 @@ import torch
 import viewed
 from bidnerf_core import SE3, InputError, Intrinsics, Localizer, view
 from bidnerf_core.cli.report import link_to
+from bidnerf_core.errors import Cancelled
 from bidnerf_core.evaluation.report import doubtful
 from bidnerf_core.evaluation.report import page as report_page
 from bidnerf_core.evaluation.results import ResultTable
@@ -28,6 +29,7 @@ from bidnerf_core.localization.recording import (
     current_record,
     recorded,
 )
+from bidnerf_core.progress import stopped_by
 from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid, shown_answer
 from bidnerf_core.viewer.figures import acceptance_figures
 from bidnerf_core.viewer.packing import packed_points
@@ -248,7 +250,7 @@ def test_a_report_links_to_the_frames_that_are_wrong_or_refused() -> None:
     assert link_to(Path("/a/pages/my map.html"), Path("/a/report")) == "../pages/my%20map.html"
 
 
-def test_a_rendering_in_strips_is_the_whole_one_and_stops_when_it_is_not_wanted(localizer: Localizer) -> None:
+def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted() -> None:
     scene, pose = viewed.room(), viewed.walk(3)[1]
     camera = Intrinsics.from_hfov(60, 160, 90)
     whole = render_image(scene.field, camera, pose, scene.bounds).rgb
@@ -258,10 +260,9 @@ def test_a_rendering_in_strips_is_the_whole_one_and_stops_when_it_is_not_wanted(
         asked.append(True)
         return len(asked) > 2
 
-    strips = field_image(scene, camera, pose, lambda: False)
-    assert strips is not None
-    torch.testing.assert_close(strips, whole, atol=1e-5, rtol=0)
-    assert field_image(scene, camera, pose, wanted_twice) is None
+    torch.testing.assert_close(field_image(scene, camera, pose), whole, atol=1e-5, rtol=0)
+    with pytest.raises(Cancelled), stopped_by(wanted_twice):
+        field_image(scene, camera, pose)
     assert len(asked) == 3
     assert quick_image(scene, camera, pose).shape == whole.shape
     assert quick_image(replace(scene, surface=None), camera, pose).equal(whole)

@@ -9,8 +9,9 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote
 
 import pytest
@@ -21,7 +22,12 @@ pytest.importorskip("uvicorn", reason="the extra 'viewer' is not installed")
 from PIL import Image
 
 import viewed
+from bidnerf_core import Localizer, settings_of
+from bidnerf_core.viewer.jobs import Jobs
 from viewer_client import Client, serving
+
+LONG = {"bid": {"max_steps": 100_000}, "bid-lm": {"fine_steps": 100_000, "stop_step": 0.0}}
+"""Methods, by Adam and by Newton's steps, with settings that make them take hours."""
 
 TOKEN = "a-token-of-enough-characters"
 VIEW = {"pose": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "width": 32, "height": 24}
@@ -100,6 +106,22 @@ def test_images_are_chosen_by_number_among_those_given(client: Client) -> None:
     answer = answer_of(client, client.post("/api/query/0"))
     assert answer["name"] == "photo"
     assert answer["accepted"]
+
+
+@pytest.mark.parametrize("method", LONG)
+def test_closing_ends_the_localization_at_work(method: str) -> None:
+    localizer = Localizer(viewed.room(), method, settings_of(method, LONG[method]), warm_up=False)
+    start = viewed.walk(15)[6]
+    jobs = Jobs(cast(Localizer, lambda views, depth_rays: localizer(views, start)))
+    running, waiting = (jobs.begin(name, partial(viewed.query, name)) for name in ("a", "b"))
+    time.sleep(1)
+    assert running.state == "searching"
+    began = time.monotonic()
+    jobs.close()
+    jobs._thread.shutdown(wait=True)
+    assert time.monotonic() - began < 2
+    assert running.answer is not None
+    assert (running.state, running.answer.outcome, waiting.state) == ("done", "stopped", "waiting")
 
 
 def test_thumbnails_and_renderings_are_images_of_the_size_asked_for(client: Client) -> None:

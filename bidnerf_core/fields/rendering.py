@@ -22,6 +22,7 @@ from bidnerf_core.fields.contract import (
     device_of,
 )
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.progress import check_stopped
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +186,7 @@ def render_image(
     times = exposure_times(pixels, intrinsics).to(T.translation).split(chunk)
     parts = []
     for directions, when in zip(ray.to(device).split(chunk), times, strict=True):
+        check_stopped()
         at = T if motion is None else T @ poses_of_rows(when, motion)
         turned = at.rotate(directions)
         rendering = render(field, bounds.rays(at.translation.expand_as(turned), turned), bounds.background)

@@ -30,6 +30,7 @@ from bidnerf_core.localization.settings import (
     rendered_depth_scale,
 )
 from bidnerf_core.localization.solvers.pivots import Pivot
+from bidnerf_core.progress import check_stopped
 
 LEAST_DECREASE = 0.1
 """Predicted decrease of the sum, which is a squared Mahalanobis distance, below which a step is the last."""
@@ -187,6 +188,7 @@ def fused_pose(measurements: Measurements, most_steps: int, start: FusedPose | N
     uncertain = UNSURE * position_deviation(covariance)
     here = measurements.at(PoseAndDepth(prior.mean) if start is None else start.state, uncertain)
     for _ in range(most_steps):
+        check_stopped()
         equations = here.equations
         if not bool(equations.hessian.isfinite().all() & equations.gradient.isfinite().all()):
             break

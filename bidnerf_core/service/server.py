@@ -105,17 +105,18 @@ def run_app(
     port: int,
     ready: Callable[[str], Any],
     stop: threading.Event | None = None,
+    grace: int = GRACE,
 ) -> None:
     """Run an application on a port until the process is interrupted, or ``stop`` is set; ``ready`` is called with its address.
 
-    Raises ``InputError`` for a port that is taken.
+    Requests at work then have ``grace`` seconds. Raises ``InputError`` for a port that is taken.
     """
     import uvicorn
 
     with _bound(host or LOOPBACK, port) as bound:
         options = uvicorn.Config(
             app, http=_patient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
-            server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=GRACE, backlog=CONNECTIONS,
+            server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=grace, backlog=CONNECTIONS,
         )  # fmt: skip
         asyncio.run(_run(app, uvicorn.Server(options), bound, ready, stop))
 

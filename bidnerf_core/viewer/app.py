@@ -26,10 +26,11 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.queries import Query, QuerySource
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.localization import Localizer
 from bidnerf_core.maps.map import Map
+from bidnerf_core.progress import stopped_by
 from bidnerf_core.service.access import Access
 from bidnerf_core.service.app import SAFE, problem
 from bidnerf_core.service.requests import Refused, body_of, json_of, query_of
@@ -218,8 +219,11 @@ async def _view(request: Request) -> Response:
         if cancelled.is_set():
             return None
         scene = state.shown.map
-        image = quick_image(scene, camera, T) if quick else field_image(scene, camera, T, cancelled.is_set)
-        return None if image is None else jpeg(image)
+        try:
+            with stopped_by(cancelled.is_set):
+                return jpeg(quick_image(scene, camera, T) if quick else field_image(scene, camera, T))
+        except Cancelled:
+            return None
 
     drawing = asyncio.ensure_future(asyncio.get_running_loop().run_in_executor(state.painter, render))
     leaving = asyncio.ensure_future(_left(request))

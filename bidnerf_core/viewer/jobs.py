@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from bidnerf_core.datasets.queries import Query
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import Localizer
 from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.progress import stopped_by
 from bidnerf_core.viewer.answer import ShownAnswer
 from bidnerf_core.viewer.view import localized
 
@@ -57,7 +58,7 @@ class Jobs:
     def __init__(self, localizer: Localizer) -> None:
         self._localizer, self._jobs = localizer, dict[str, Job]()
         self._thread = ThreadPoolExecutor(1, "localizing")
-        self._lock = threading.Lock()
+        self._lock, self._closed = threading.Lock(), threading.Event()
 
     def begin(self, name: str, read: Callable[[], Query]) -> Job:
         """Begin to localize what ``read`` returns. Raises ``Busy``."""
@@ -77,7 +78,8 @@ class Jobs:
         return self._jobs.get(id)
 
     def close(self) -> None:
-        """Drop those that wait."""
+        """Drop those that wait, and let the one at work end soon."""
+        self._closed.set()
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     def _work(self, job: Job, read: Callable[[], Query]) -> None:
@@ -89,7 +91,10 @@ class Jobs:
 
         job.state = "searching"
         try:
-            job.answer = localized(self._localizer, read(), begun=begun, found_pose=found_pose)
+            with stopped_by(self._closed.is_set):
+                job.answer = localized(self._localizer, read(), begun=begun, found_pose=found_pose)
+        except Cancelled:
+            job.answer = ShownAnswer(job.name, "stopped", False, "the viewer was closed")
         except InputError as error:
             job.answer = ShownAnswer(job.name, "bad input", False, str(error))
         except (

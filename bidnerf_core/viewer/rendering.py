@@ -1,9 +1,6 @@
-"""What is seen from a camera, quickly on the surface or in full by the field, as long as it is wanted."""
+"""What is seen from a camera, quickly on the surface or in full by the field."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -16,20 +13,12 @@ from bidnerf_core.localization.costs.images import SurfaceRenderer
 from bidnerf_core.localization.problem import SceneMap
 
 PIXELS_AT_A_TIME = 4096
-"""Pixels after which a rendering looks whether it is still wanted."""
+"""Pixels after which a rendering stops if it is no longer wanted, see ``stopped_by``."""
 
 
-def field_image(
-    scene: SceneMap, camera: Intrinsics, T_world_camera: SE3, cancelled: Callable[[], bool]
-) -> Float[Tensor, "h w 3"] | None:
-    """Return what the field shows from a camera without distortion; None once it is ``cancelled``."""
-    rows, parts = max(1, PIXELS_AT_A_TIME // camera.width), list[Tensor]()
-    for top in range(0, camera.height, rows):
-        if cancelled():
-            return None
-        strip = replace(camera, cy=camera.cy - top, height=min(rows, camera.height - top))
-        parts.append(render_image(scene.field, strip, T_world_camera, scene.bounds).rgb)
-    return torch.cat(parts)
+def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
+    """Return what the field shows from a camera."""
+    return render_image(scene.field, camera, T_world_camera, scene.bounds, PIXELS_AT_A_TIME).rgb
 
 
 @torch.no_grad()
@@ -39,7 +28,7 @@ def quick_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     A map without a surface is rendered by its field.
     """
     if scene.surface is None:
-        return render_image(scene.field, camera, T_world_camera, scene.bounds).rgb
+        return field_image(scene, camera, T_world_camera)
     surface = scene.surface
     rays, _ = camera.rays(camera.pixel_centres().reshape(-1, 2))
     T = T_world_camera.to(dtype=torch.float32, device=surface.device)

@@ -18,6 +18,8 @@ from bidnerf_core.viewer.table import ShownRow
 from bidnerf_core.viewer.trajectories import ShownTrajectory
 
 PORT = 8010
+GRACE = 1
+"""Seconds for requests at work when the viewer is told to end."""
 NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); --save writes a page without it"
 
 
@@ -61,4 +63,6 @@ def serve_view(
         if ready is not None:
             ready(address if token is None else f"{address}/?token={token}")
 
-    run_app(viewer_app(Shown(localizer, source, state), token, config), host, port, announce, stop)
+    run_app(
+        viewer_app(Shown(localizer, source, state), token, config), host, port, announce, stop, grace=GRACE
+    )

@@ -17,6 +17,7 @@ from bidnerf_core.localization.normal_equations import Cost
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.solvers.pivots import Pivot
+from bidnerf_core.progress import check_stopped
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,7 @@ def search(
     losses = [torch.zeros((0, len(T.translation)), dtype=torch.float64, device=device)]
     scores = losses[0]
     for stage in stages:
+        check_stopped()
         with without_waiting():
             done = descend(stage.cost, T, stage.steps, stage.pivot.to(device).moved, stage.damping)
             scores = done.equations.cost if stage.score is None else stage.score(done.T)

@@ -23,6 +23,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.settings import AdamSettings
 from bidnerf_core.localization.solvers.history import WINDOW, History
 from bidnerf_core.localization.solvers.pivots import Pivot
+from bidnerf_core.progress import check_stopped
 
 WARM_UP = 3
 """Steps to take before one is captured: caches are filled and kernels loaded in these, which a capture does not allow."""
@@ -151,6 +152,7 @@ def follow_gradient(
     steps = AdamSteps(loss, pivot, config, history.T.to(device))
     take: Callable[[], None] = steps
     for first in range(0, config.max_steps, WINDOW):
+        check_stopped()
         count = min(WINDOW, config.max_steps - first)
         with without_waiting():
             for step in range(count):

@@ -12,6 +12,7 @@ from torch import Tensor
 from bidnerf_core.devices import may_wait
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.normal_equations import Cost, NormalEquations
+from bidnerf_core.progress import check_stopped
 
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
 
@@ -47,6 +48,7 @@ def descend(
     converged = torch.zeros_like(here.cost, dtype=torch.bool)
     accepted, poses, costs = [], [T], [here.cost]
     for _ in range(steps):
+        check_stopped()
         delta = here.solve(factor)
         trial = retract(T, delta)
         there = cost(trial)
