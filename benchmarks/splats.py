@@ -1,0 +1,165 @@
+"""Gaussian splats that were trained here, beside hash grids of the same images.
+
+    python benchmarks/splats.py SPLAT:HASHGRID:DATA [SPLAT:HASHGRID:DATA ...] [--images 8] [--pairs 10]
+
+SPLAT and HASHGRID are maps of DATA (``bidnerf train --backend gaussians``, ``--backend hashgrid``). Recorded are the quality of rendered test
+images (``--images``, evenly spaced), the size of the weights, the time of a training step of 2048 rays (rendering, loss, derivatives, Adam),
+for which both fields take turns in one process, and the answers of method ``auto`` to test frames without a start, from RGB and from
+RGB-D, in turn as well. Answers are kept in a ``.rows.jsonl`` next to the record, so that an interrupted run resumes where it
+stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from _lab import (
+    RESULTS,
+    Row,
+    Scene,
+    answer,
+    cpu_seconds,
+    held_out,
+    in_turn,
+    judgement,
+    line,
+    modes,
+    one_thread,
+    parser,
+    rates,
+    record,
+)
+from map_quality import judge
+
+from bidnerf_core import Localizer
+from bidnerf_core.backend import load_backend
+from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.io.json import from_plain
+from bidnerf_core.training import Supervision
+
+RAYS = 2048
+"""Rays of the training step that is timed."""
+WARM_UP = 2
+"""Pairs of steps that are not counted."""
+
+
+def trainer(scene: Scene) -> Callable[[], float]:
+    """Return a function that trains a copy of a map's field by one step and returns the CPU time of that."""
+    info = scene.map.info
+    config = from_plain(load_backend(info.backend).config_type, info.config, "config")
+    field = copy.deepcopy(scene.map.field).train()
+    for parameter in field.parameters():
+        parameter.requires_grad_(True)
+    supervision = Supervision(scene.dataset.views("train"), scene.map.bounds, config, torch.device("cpu"))
+    optimizer = torch.optim.Adam(field.parameters(), lr=1e-5, fused=True)
+    generator = torch.Generator().manual_seed(0)
+
+    def step() -> float:
+        batch = supervision.draw(RAYS, generator)
+        began = time.process_time()
+        rendering = render(field, batch.rays, batch.background, generator)
+        loss, _ = supervision.loss(rendering, batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        return time.process_time() - began
+
+    return step
+
+
+def step_times(scenes: dict[str, Scene], pairs: int) -> dict[str, Any]:
+    """Return the median time (ms) of a step of each field, and how many times longer the splat's takes."""
+    steps = {name: trainer(scene) for name, scene in scenes.items()}
+    times: dict[str, list[float]] = {name: [] for name in scenes}
+    for turn in range(pairs + WARM_UP):
+        for name in in_turn(list(scenes), turn):
+            times[name].append(1000 * steps[name]())
+    kept = {name: some[WARM_UP:] for name, some in times.items()}
+    ratios = [a / b for a, b in zip(kept["gaussians"], kept["hashgrid"], strict=True)]
+    medians = {name: statistics.median(some) for name, some in kept.items()}
+    return {"pairs": pairs, "median_ms": medians, "times_longer": statistics.median(ratios)}
+
+
+def quality(scene: Scene, images: int) -> dict[str, Any]:
+    """Return the quality of renderings of test images, and the size of the map."""
+    views = scene.dataset.views("test", held_out(scene.dataset.frame_names("test"), count=images))
+    weights = sum(file.stat().st_size for file in scene.folder.glob("weights-*"))
+    found = judge(scene.map.field, scene.map.bounds, views)
+    names = ("frames", "psnr_mean_dB", "psnr_lowest_dB", "samples_per_ray", "depth_error_median")
+    return {
+        "steps": scene.map.info.steps,
+        "parameters": sum(p.numel() for p in scene.map.field.parameters()),
+        "weights_MB": weights / 1e6,
+        **{name: found[name] for name in names},
+    }
+
+
+def answers(scenes: dict[str, Scene], given: argparse.Namespace, store: RowStore) -> dict[str, Any]:
+    """Return summaries of the answers in each map, by the kind of input."""
+    localizers = {name: Localizer(scene.map) for name, scene in scenes.items()}
+    first, found = next(iter(scenes.values())), {}
+    for mode, views in modes(first.views(given.tuning_frames, given.frames)).items():
+        rows: dict[str, list[Row]] = {name: [] for name in scenes}
+        for place, view in enumerate(views):
+            for name in in_turn(list(scenes), place):
+                key = [*scenes[name].key, mode, view.frame.name]
+                rows[name].append(
+                    store.get(
+                        key, lambda view=view, name=name: answer(lambda: localizers[name](view.frame), view)
+                    )
+                )
+        for name in scenes:
+            print(line(f"{first.name} {mode} {name}", rows[name]), flush=True)
+        found[mode] = {
+            name: {"n": len(some), **rates(some), **judgement(some), **cpu_seconds(some)}
+            for name, some in rows.items()
+        }
+    return found
+
+
+def compared(triple: str, given: argparse.Namespace, store: RowStore) -> dict[str, Any]:
+    """Return all measurements of a splat and a hash grid of the same images."""
+    splat, grid, data = triple.split(":", 2)
+    scenes = {"gaussians": Scene.open(f"{splat}:{data}"), "hashgrid": Scene.open(f"{grid}:{data}")}
+    localized = answers(scenes, given, store)
+    measured = {}
+    for name, scene in scenes.items():
+        measured[name] = store.get(
+            [*scene.key, "quality", given.images], lambda scene=scene: quality(scene, given.images)
+        )
+    keys = [key for scene in scenes.values() for key in scene.key]
+    times = store.get([*keys, "steps", given.pairs], lambda: step_times(scenes, given.pairs))
+    print(measured, times, flush=True)
+    return {"data": Path(data).name, "maps": measured, "step_of_2048_rays": times, "answers": localized}
+
+
+def main() -> None:
+    arguments = parser(__doc__, "splats")
+    arguments.add_argument("scenes", nargs="+", metavar="SPLAT:HASHGRID:DATA")
+    arguments.add_argument("--frames", type=int, help="test frames of each scene (default: all)")
+    arguments.add_argument(
+        "--tuning-frames", action="store_true", help="only frames that settings are tuned on"
+    )
+    arguments.add_argument(
+        "--images", type=int, default=8, help="test images to render (default: %(default)s)"
+    )
+    arguments.add_argument(
+        "--pairs", type=int, default=10, help="timed steps of each field (default: %(default)s)"
+    )
+    given = arguments.parse_args()
+    one_thread()
+    with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store:
+        found = [compared(triple, given, store) for triple in given.scenes]
+    record(given.name, {"scenes": {result.pop("data"): result for result in found}})
+
+
+if __name__ == "__main__":
+    main()
