@@ -791,6 +791,19 @@ def scans(records: Records) -> str:
 
 
 @table
+def round_trips(records: Records) -> str:
+    """Maps beside those that come from their exports."""
+    rows = []
+    for scene, modes in records["round_trips"]["scenes"].items():
+        for mode, ways in modes.items():
+            for way, cell in ways.items():
+                accepted = f"{cell['converged']}, wrong {cell['silent']}"
+                seconds = _seconds(cell["median_cpu_seconds"])
+                rows.append((SCENES[scene], mode, way, *(_of(cell[c]) for c in LIMITS), accepted, seconds))
+    return _table(("scene", "input", "map", *LIMITS.values(), "accepted", "CPU time"), rows, records)
+
+
+@table
 def capture_size(records: Records) -> str:
     """Memory of captures of many photos of twelve megapixels."""
     sizes = records["capture_size"]["measurements"]

@@ -1,6 +1,6 @@
 """Compare all installed backends on one scene, from the same starts: success, steps, time and memory.
 
-    python examples/05_compare_backends.py [--steps 600] [--trials 4]
+    python examples/05_compare_backends.py [--backends hashgrid vanilla ...] [--steps 600] [--trials 4]
     python examples/05_compare_backends.py --data DATA --maps MAP MAP ...
 
 Without maps, each backend is trained briefly, in memory, on a scene in closed form. `bidnerf compare` draws a picture as well.
@@ -13,6 +13,7 @@ import bidnerf_core as bn
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--maps", nargs="+", default=[])
 parser.add_argument("--data", help="dataset of what the maps show")
+parser.add_argument("--backends", nargs="+", help="backends to train (default: all that are installed)")
 parser.add_argument("--steps", type=int, default=600, help="of each training")
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 parser.add_argument("--trials", type=int, default=4, help="starts")
@@ -21,10 +22,9 @@ if given.maps and given.data is None:
     parser.error("--maps needs --data, a dataset of what they show")
 
 data = given.data or bn.closed_form_data("demo:object")
+backends = given.backends or [info.name for info in bn.list_plugins("backends") if info.fault is None]
 scenes = {folder: folder for folder in given.maps} or {
-    info.name: bn.train(data, info.name, config={"steps": given.steps}, bake=False)
-    for info in bn.list_plugins("backends")
-    if info.fault is None
+    name: bn.train(data, name, config={"steps": given.steps}, bake=False) for name in backends
 }
 settings = {"rays": 512, "max_steps": given.descent}
 print(bn.compare(scenes, data, protocol="bid", size=0.5, method="bid", config=settings, trials=given.trials))
