@@ -310,6 +310,24 @@ def test_commands_that_compute_nothing_do_without_torch(words: list[str]) -> Non
     assert done.returncode == 0, done.stderr
 
 
+def test_localizing_imports_nothing_that_only_other_work_needs() -> None:
+    program = "import sys, bidnerf_core.cli.localize, bidnerf_core as bn; bn.Localizer, bn.load_map; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    others = {
+        "imageio",
+        "scipy.optimize",
+        "matplotlib",
+        "viser",
+        "pycolmap",
+        "av",
+        "jinja2",
+        "uvicorn",
+        "torch._dynamo",
+    }
+    assert not others & set(done.stdout.split())
+
+
 def test_public_names_are_there_and_no_others() -> None:
     import bidnerf_core
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import imageio.v3 as iio
 import numpy as np
 from jaxtyping import UInt8
 from rich.table import Table
@@ -26,6 +25,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
+from bidnerf_core.io.images import png_bytes
 from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.maps.map import Map
 from bidnerf_core.maps.training import train
@@ -143,8 +143,7 @@ def _shown(error: PoseError, digits: int, digits_of_angle: int) -> tuple[str, st
 def _draw(stored: Map, trials: Sequence[DemoTrial], out: Path) -> None:
     for trial in trials:
         painter = Painter(stored, trial.view.frame)
-        picture = iio.imwrite("<bytes>", _overlay(painter, trial), extension=".png")
-        write_file(out / f"overlay-{trial.view.frame.name}.png", bytes(picture))
+        write_file(out / f"overlay-{trial.view.frame.name}.png", png_bytes(_overlay(painter, trial)))
     first = trials[0]
     painter, path = Painter(stored, first.view.frame), first.from_start.poses
     with console.status("drawing the animation"):

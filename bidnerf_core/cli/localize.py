@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import imageio.v3 as iio
 import tyro
 
 from bidnerf_core.camera.source import CameraSource
@@ -38,6 +37,7 @@ from bidnerf_core.frames.frame import BLACK
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
+from bidnerf_core.io.images import png_bytes
 from bidnerf_core.localization import METHODS, Localization, Localizer
 from bidnerf_core.localization.methods import (
     USUAL_METHOD,
@@ -256,7 +256,7 @@ class _Output:
         """Draw an answer. A picture that cannot be written does not end the run."""
         picture = overlay(self._stored, query.frame, answer.found, start)
         try:
-            write_file(file, bytes(iio.imwrite("<bytes>", picture, extension=".png")))
+            write_file(file, png_bytes(picture))
         except OSError as error:
             self._not_drawn += 1
             say(f"{file}: not drawn: {error.strerror or error}")

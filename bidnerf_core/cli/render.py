@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import imageio.v3 as iio
 import numpy as np
 import torch
 from rich.text import Text
@@ -23,6 +22,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
+from bidnerf_core.io.images import png_bytes
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.rendering import RenderingScores, rendering_scores
 
@@ -90,12 +90,8 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
     """Write ``NAME.png`` and ``NAME.depth.png``."""
-    write_file(out / f"{name}.png", _as_png((image.rgb * 255).round().to(torch.uint8).numpy()))
+    write_file(out / f"{name}.png", png_bytes((image.rgb * 255).round().to(torch.uint8).numpy()))
     if float(image.depth.max()) > DEEPEST:
         say(f"{name}: depth beyond {DEEPEST} units does not fit a 16-bit image of thousandths and is cut off")
     millimetres = (image.depth.clamp(0, DEEPEST) * 1000).round().numpy().astype(np.uint16)
-    write_file(out / f"{name}.depth.png", _as_png(millimetres))
-
-
-def _as_png(pixels: np.ndarray) -> bytes:
-    return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))
+    write_file(out / f"{name}.depth.png", png_bytes(millimetres))

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import torch
 
@@ -17,6 +16,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
+from bidnerf_core.io.images import png_bytes
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
 LENS = ("k1", "k2", "p1", "p2", "k3")
@@ -109,4 +109,4 @@ def _colours(frame: Frame, background: tuple[float, float, float]) -> np.ndarray
 
 def _write(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, pixels)
+    path.write_bytes(png_bytes(pixels))

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.optimize import nnls
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
@@ -108,6 +107,8 @@ def _fitted(ranges: Float[Tensor, "b 2"]) -> DepthNoise:
     depth, noise = ranges.numpy().T
     if depth.max() < ENOUGH_SPREAD * depth.min():
         return DepthNoise(linear=float(np.median(noise)))
+    from scipy.optimize import nnls  # imported here, since it takes as long as the rest of scipy
+
     (linear, quadratic), _ = nnls(np.stack([np.ones_like(depth), depth], axis=-1), noise)
     return DepthNoise(linear=float(linear), quadratic=float(quadratic))
 

@@ -441,3 +441,10 @@ def reason(error: Exception) -> str:
     """Return the first line of a decoder's message, which may have many."""
     text = str(error).strip()
     return text.splitlines()[0][:120] if text else type(error).__name__
+
+
+def png_bytes(pixels: Shaped[np.ndarray, "h w *channels"]) -> bytes:
+    """Return an image of 8 bits, or a grey one of 16, as the content of a PNG file."""
+    import imageio.v3 as iio  # imported here, since reading does without it
+
+    return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))

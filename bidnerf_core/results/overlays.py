@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
@@ -220,5 +219,7 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
         raise InputError(f"{path}: an animation of no frames")
     require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
     Path(path).parent.mkdir(parents=True, exist_ok=True)
+    import imageio.v3 as iio  # imported here, since few commands draw
+
     content = iio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=1000 / fps, loop=0)
     write_file(Path(path), bytes(content))

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -26,6 +25,7 @@ from bidnerf_core.camera.colmap_models import MODELS
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.wgs84 import Geodetic
+from bidnerf_core.io.images import png_bytes
 from bidnerf_core.io.json import Record
 from bidnerf_core.localization import Localization
 from bidnerf_core.maps.anchor import Anchor, GeographicPose
@@ -180,9 +180,7 @@ def _encoded(record: Record, content: bytes, size: tuple[int, int] | None) -> by
             f"{len(content)} bytes of {kind}, expected size and width x height x {channels} bytes"
         )
     pixels = np.frombuffer(content, np.uint8).reshape(size[1], size[0], channels)
-    return bytes(
-        iio.imwrite("<bytes>", pixels[..., :3] if channels > 1 else pixels[..., 0], extension=".png")
-    )
+    return png_bytes(pixels[..., :3] if channels > 1 else pixels[..., 0])
 
 
 def _camera(reading: _Reading) -> dict[str, bytes]:
