@@ -59,7 +59,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (view,) = tiny.views(1)
     with pytest.raises(InputError, match="split 'all'"):
         write_transforms(tmp_path, {"all": [view]})
-    with pytest.raises(InputError, match="one name"):
+    with pytest.raises(InputError, match="the same name"):
         write_transforms(tmp_path, {"test": [view, view]})
     fisheye = replace(view.frame, intrinsics=replace(tiny.CAMERA, distortion=(0.0,) * 8))
     with pytest.raises(InputError, match="lens of 8"):
