@@ -100,8 +100,8 @@ def test_shards_share_all_trials_between_them(shards: int) -> None:
         ({"protocol": "inerf", "sizes": ((0.5,),)}, "has no sizes"),
         ({"frames": ("nope",)}, "no frame 'nope'"),
         ({"split": "train"}, "no split 'train'"),
-        ({"protocol": "parallel", "frames": ("0000",)}, "has its own frames"),
-        ({"protocol": "parallel", "seed": 3}, "fixed list"),
+        ({"protocol": "parallel", "frames": ("0000",)}, "defines its own frames"),
+        ({"protocol": "parallel", "seed": 3}, "list is fixed"),
         ({"map": "demo:object"}, "train one with 'bidnerf demo'"),
         ({"map": "demo:blops"}, "expected demo:blobs"),
         ({"data": "demo:rom"}, "expected demo:room"),
@@ -279,7 +279,7 @@ def test_a_file_is_written_by_one_at_a_time(tmp_path: Path, evaluate: Evaluate) 
     with ResultsFile(tmp_path / "r.jsonl"):
         status, err = evaluate("--trials", 1)
     assert status == 1
-    assert "another process is writing it" in err
+    assert "another process is writing to it" in err
 
 
 def test_results_come_in_the_order_of_the_plan(tmp_path: Path) -> None:
@@ -313,7 +313,7 @@ def test_another_training_of_the_map_is_not_mixed_in(tmp_path: Path, evaluate: E
     path.write_text(content.replace('"weights": "exact"', '"weights": "other"'))
     status, err = evaluate("--trials", 1, "--size", 0.3)
     assert status == 1
-    assert "another training of map demo:blobs (other, expected exact)" in err
+    assert "another training run of map demo:blobs (other, expected exact)" in err
     path.write_text(content.replace('"depth_weight": 1.0', '"depth_weight": 0.5'))
     assert "was made with depth_weight 0.5, expected 1.0" in evaluate("--trials", 1, "--size", 0.3)[1]
 
@@ -388,7 +388,7 @@ def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced:
         path.unlink()
         if replaced:
             path.write_text("")
-        with pytest.raises(InputError, match="was removed or replaced while it was written"):
+        with pytest.raises(InputError, match="was removed or replaced while it was being written"):
             file.add(results[1])
         with pytest.raises(InputError, match="was removed or replaced"):
             file.put_in_order([blob_trial(0)])

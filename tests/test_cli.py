@@ -102,7 +102,7 @@ def assert_refused(outcome: CommandResult, status: int, *fragments: str) -> None
         assert fragment in outcome.err
 
 
-@pytest.mark.parametrize(("samples", "shown"), [(math.nan, ""), (31.5, "  31.5 samples a ray")])
+@pytest.mark.parametrize(("samples", "shown"), [(math.nan, ""), (31.5, "  31.5 samples per ray")])
 def test_a_line_of_progress_leaves_out_what_the_recipe_does_not_tell(
     samples: float, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -179,7 +179,7 @@ BAD_DATA: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "truncated image": (cut(IMAGE), (IMAGE, "expected a complete image file")),
     "image of another size": (resize(IMAGE, (8, 9, 3)), ("r_0001.png is 9x8, expected 24x24",)),
     "truncated depth": (cut(DEPTH), (DEPTH, "expected a complete image file")),
-    "depth of another shape": (resize(DEPTH, (8, 9)), (DEPTH, "is 9x8, its image 24x24")),
+    "depth of another shape": (resize(DEPTH, (8, 9)), (DEPTH, "is 9x8, but its image is 24x24")),
     "depth in colours": (resize(DEPTH, (24, 24, 3)), (DEPTH, "expected one channel")),
     "mirrored pose": (of_matrix(mirror), ("frame 1", "mirror image", "expected a rigid transform")),
     "bad last row": (set_entry(3, 3, -2.0), ("frame 1", "last row", "expected [0, 0, 0, 1]")),
@@ -315,15 +315,15 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no folder": (shutil.rmtree, ("no such folder", "expected a map")),
     "empty folder": (
         empty,
-        ("no map.json in it", "expected a map as written by 'bidnerf train'"),
+        ("no map.json found", "expected a map as written by 'bidnerf train'"),
     ),
     "another version": (
         of_description(lambda content: content.update(version=99)),
-        ("map.json", "version 99, expected 1", "by a newer bidnerf, update yours"),
+        ("map.json", "version 99, expected 1", "by a newer bidnerf; upgrade bidnerf"),
     ),
     "an older version": (
         of_description(lambda content: content.update(version=0)),
-        ("map.json", "version 0, expected 1", "train the map anew"),
+        ("map.json", "version 0, expected 1", "retrain the map"),
     ),
     "a file": (
         into_a_file,
@@ -370,7 +370,7 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "weights elsewhere": (
         of_description(lambda content: content.update(weights="../x.safetensors")),
-        ("'../x.safetensors'", "expected the name of a file beside it"),
+        ("'../x.safetensors'", "expected the name of a file next to it"),
     ),
     "corrupt weights": (cut_weights, ("weights-", "expected a safetensors file")),
     "weight of another shape": (
@@ -423,12 +423,12 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
         bidnerf("train", other, "--resume", "--out", interrupted), 1, str(other), "expected those of"
     )
     assert_refused(bidnerf(*resume, interrupted, "--split", "test"), 1, "'test'", "expected those of 'data'")
-    assert_refused(bidnerf(*resume, interrupted, "--steps", "99"), 2, "begun with steps 12, got 99")
+    assert_refused(bidnerf(*resume, interrupted, "--steps", "99"), 2, "started with steps 12, got 99")
     assert_refused(bidnerf(*resume, interrupted, "--overwrite"), 2, "expected one of them")
     assert_refused(
         bidnerf(*resume, interrupted, "--background", "black"),
         2,
-        "begun over background",
+        "started with background",
         "got (0.0, 0.0, 0.0)",
     )
     assert contents(interrupted) == before
@@ -443,7 +443,7 @@ def test_settings_are_compared_one_by_one_with_those_of_the_interrupted_training
 ) -> None:
     """An option for one setting of the encoding says nothing about the others, whose defaults may have changed since."""
     resume = ["train", shared / "data", "--resume", "--no-bake", "--out", interrupted]
-    assert_refused(bidnerf(*resume, "--base-resolution", "8"), 2, "begun with base_resolution 4.0, got 8.0")
+    assert_refused(bidnerf(*resume, "--base-resolution", "8"), 2, "started with base_resolution 4.0, got 8.0")
     assert bidnerf(*resume, "--base-resolution", "4").status == 0
 
 
@@ -780,7 +780,7 @@ def test_a_window_is_the_frame_and_those_before_it(
     for frame, size in (("t_0002", 2), ("t_0001", 3), ("t_0001", 1)):
         found = bidnerf(*place, "--frame", frame, "--window", size)
         assert found.status == 0
-        cut = "--window 3: t_0001 has 1 before it in split 'test'; a rig of 2" in found.err
+        cut = "--window 3: t_0001 has only 1 before it in split 'test'; a rig of 2" in found.err
         assert cut == (size == 3)
     assert asked == [["t_0001", "t_0002"], ["t_0000", "t_0001"], ["t_0001"]]
     assert_refused(
@@ -798,7 +798,7 @@ def test_points_of_a_sensor_are_used(bidnerf: Run, shared: Path, tmp_path: Path)
     without, with_points = bidnerf(*place), bidnerf(*place, "--depth-points", points)
     assert json.loads(without.out)["loss"] != json.loads(with_points.out)["loss"]
     for_all = bidnerf("localize", shared / "map", shared / "data", "--depth-points", points)
-    assert_refused(for_all, 2, str(points), "points of one camera, but 3 frames")
+    assert_refused(for_all, 2, str(points), "points of a single camera, but 3 frames")
     points.write_text("far away")
     assert_refused(bidnerf(*place, "--depth-points", points), 1, str(points), "rows of x, y, z")
 
@@ -867,7 +867,7 @@ def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
     shown = bidnerf("info", shared / "map").out
     assert f"{facts['step']} steps of backend hashgrid" in shown
     assert "data, 6 images" in shown
-    assert "surface:     none; 'bidnerf bake MAP' makes one" in shown
+    assert "surface:     none; 'bidnerf bake MAP' builds it" in shown
     assert "landmarks:   none; 'bidnerf bake MAP --data DATA' builds them" in shown
     assert "levels 3" in shown
     assert "nothing beyond it" in shown
@@ -882,7 +882,7 @@ def test_render_refuses_names_whose_files_would_collide(bidnerf: Run, shared: Pa
     (data / second).rename(data / other)
     path.write_text(path.read_text().replace(second, other))
     refused = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
-    assert_refused(refused, 1, "would have the file of the depth of", "--frame")
+    assert_refused(refused, 1, "would overwrite the depth of", "--frame")
     assert not (tmp_path / "out").exists()
 
 
@@ -980,7 +980,7 @@ def test_a_stopped_training_goes_on_as_if_nothing_had_happened(
     assert bidnerf("info", interrupted).status == 0
     resumed = bidnerf("train", shared / "data", "--out", interrupted, "--resume", "--no-bake")
     assert (resumed.status, resumed.out) == (0, "")
-    assert f"going on from step {tiny.STEPS // 2}" in resumed.err
+    assert f"resuming from step {tiny.STEPS // 2}" in resumed.err
     assert load_info(interrupted).complete
     assert sorted(f.suffix for f in interrupted.iterdir()) == [".json", ".safetensors"]
     assert_same_map(interrupted, shared / "map")
@@ -1088,7 +1088,7 @@ def test_ctrl_c_saves_and_resuming_loses_nothing(
     info = load_info(out)
     assert (process.returncode, said) == (130, "")
     assert complaints.splitlines()[-2:] == [
-        f"{out}: saved after step {info.step}; resuming it (--resume) goes on from there",
+        f"{out}: saved after step {info.step}; --resume continues from there",
         "bidnerf train: interrupted",
     ]
     assert 0 < info.step < LONG

@@ -183,7 +183,7 @@ def test_a_map_without_a_surface_to_bake_is_a_map(
         (["{map}", "--data", "{none}"], 1, "none"),
         (["{map}", "--split", "x", "--data", "{data}"], 1, "no split 'x'"),
         (["{map}", "--frobnicate"], 2, "--frobnicate"),
-        (["{map}", "--rendered-landmarks", "--data", "{data}"], 2, "--rendered-landmarks takes no photos"),
+        (["{map}", "--rendered-landmarks", "--data", "{data}"], 2, "--rendered-landmarks uses no photos"),
     ],
 )
 def test_mistakes_are_told(
@@ -231,7 +231,7 @@ def test_landmarks_of_photos_are_kept(with_photo_landmarks: Path, bidnerf: Run) 
     before = load_info(with_photo_landmarks)
     status, out, err = bidnerf("bake", with_photo_landmarks)
     assert (status, out, err.count("\n")) == (0, "", 1)
-    assert "landmarks of its photos are kept; --rendered-landmarks" in err
+    assert "its landmarks from photos are kept; --rendered-landmarks" in err
     assert load_info(with_photo_landmarks) == before
 
 

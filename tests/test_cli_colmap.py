@@ -151,7 +151,9 @@ def test_a_bench_takes_them_too(bidnerf: Run, shared: Path, tmp_path: Path) -> N
     training = sparse_model.write(tmp_path / "training", known)
     refused = bidnerf(*bench, "--depth-points", training)
     assert_refused(refused, 1, "no points for 2 of 2 frames (t_0002,", "choose others with --frame")
-    assert_refused(bidnerf("evaluate", "demo:blobs", "--out", tmp_path / "x", *points), 1, "without cameras")
+    assert_refused(
+        bidnerf("evaluate", "demo:blobs", "--out", tmp_path / "x", *points), 1, "no training cameras"
+    )
 
 
 def test_a_model_that_is_of_no_use_is_told_in_a_line(bidnerf: Run, shared: Path, tmp_path: Path) -> None:

@@ -285,7 +285,7 @@ def test_help_hides_what_experts_need(capsys: pytest.CaptureFixture[str]) -> Non
         assert "inner options" in page
         assert "config.inner" not in page
         assert ("--second" in page) == ("--rare" in page) == (option == "--help-all")
-        assert ("3 settings for experts are not shown; --help-all" in page) == (option == "--help")
+        assert ("3 expert settings are not shown; --help-all" in page) == (option == "--help")
 
 
 def test_experts_settings_are_parsed_though_they_are_not_shown(bidnerf: Run) -> None:

@@ -99,7 +99,7 @@ def test_a_resumed_training_takes_the_refined_poses_again(
         assert bidnerf(*train, "--out", tmp_path / "half").status == 130
     monkeypatch.setattr(training_views, "training_poses", None)  # it is not called again
     other = bidnerf("train", data, "--resume", "--refine-poses", "never", "--out", tmp_path / "half")
-    assert (other.status, "was begun with refined poses" in other.err) == (2, True)
+    assert (other.status, "was started with refined poses" in other.err) == (2, True)
     assert bidnerf("train", data, "--resume", "--no-bake", "--out", tmp_path / "half").status == 0
     assert_same_map(tmp_path / "half", tmp_path / "whole")
     assert load_info(tmp_path / "half").cameras == load_info(tmp_path / "whole").cameras

@@ -94,7 +94,7 @@ def test_frames_that_trained_the_map_are_counted(
     track = ("track", "MAP", data, "--out", tmp_path / "path.txt")
     assert "training" not in bidnerf(*track).out
     monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
-    assert "2 frames; errors of frames that trained the map are no test" in bidnerf(*track).out
+    assert "2 frames; errors on training frames of the map are no test" in bidnerf(*track).out
 
 
 def test_images_without_a_focal_length_begin_with_the_camera_of_the_map(

@@ -600,7 +600,9 @@ def test_images_of_different_size(nerfstudio: Callable[..., Path]) -> None:
 def test_depth_of_another_aspect_ratio(nerfstudio: Callable[..., Path]) -> None:
     folder = nerfstudio()
     write_depth(folder, ["depth/r_0.png"], (H, W // 2))
-    assert "depth/r_0.png: depth is 6x8, its image 12x8; expected the same aspect ratio" in message(folder)
+    assert "depth/r_0.png: depth is 6x8, but its image is 12x8; expected the same aspect ratio" in message(
+        folder
+    )
 
 
 def test_an_image_of_another_size_is_not_decoded(nerfstudio: Callable[..., Path]) -> None:

@@ -232,7 +232,7 @@ def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
         if progress.done == 2:
             stop.set()
 
-    with pytest.raises(bn.Cancelled, match=r"3 trials are left in .*, the same command goes on"):
+    with pytest.raises(bn.Cancelled, match=r"3 trials are left in .*, the same command resumes"):
         bn.evaluate(BLOBS, BLOBS, trials=5, out=out, progress=stop_at_two, cancel=stop.is_set, **QUICK)
     assert [(p.stage, p.done, p.total, p.unit) for p in seen] == [("trials", n, 5, "trials") for n in (1, 2)]
     before = out.read_bytes()

@@ -81,7 +81,7 @@ def test_a_photo_that_was_added_under_another_name_is_known(stored: Path) -> Non
 def test_another_scene_is_refused(map_folder: Path) -> None:
     before = files(map_folder)
     others = [replace(view(each.T_ref_camera, f"x{n}", 9)) for n, each in enumerate(training_views()[:2])]
-    with pytest.raises(InputError, match="recognises 0 of 2 photos, expected photos of its scene"):
+    with pytest.raises(InputError, match="localizes 0 of 2 photos, expected photos of its scene"):
         bn.extend(map_folder, others, steps=STEPS, config=BAKE)
     assert files(map_folder) == before
 
@@ -106,7 +106,7 @@ def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
     assert after.folder is None
     truth = training_views()[7].T_ref_camera.translation
     assert float((after.info.cameras[7].pose.translation - 2 * truth).norm()) < 0.06
-    with pytest.raises(InputError, match="none of the images that the map was made of"):
+    with pytest.raises(InputError, match="none of the images that the map was built from"):
         bn.extend(large, training_views()[7:8], [replace(old[0], frame=replace(old[0].frame, name="z"))])
 
 

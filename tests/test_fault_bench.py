@@ -41,7 +41,7 @@ def test_a_plan_tries_each_fault_on_the_same_frames() -> None:
     assert [t.fault for t in trials] == [fault for fault in faults for _ in range(3)]
     assert len({(t.frames, t.seed) for t in trials}) == 3
     assert len({key_of(t) for t in trials}) == 9
-    with pytest.raises(InputError, match="which the method does not get"):
+    with pytest.raises(InputError, match="which the method does not receive"):
         planned(Plan("demo:blobs", "demo:blobs", "none", depth=False, faults=faults))
     with pytest.raises(InputError, match="no fault 'blurr'"):
         planned(Plan("demo:blobs", "demo:blobs", "none", faults=("blurr:1",)))

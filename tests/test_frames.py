@@ -17,9 +17,9 @@ CAMERA = Intrinsics(10.0, 10.0, 4.0, 3.0, 8, 6)
 
 
 def test_a_frame_of_another_size_than_its_camera_is_told() -> None:
-    with pytest.raises(InputError, match="frame f: rgb is 6x8, its camera expects 8x6"):
+    with pytest.raises(InputError, match="frame f: rgb is 6x8, but its camera expects 8x6"):
         Frame("f", torch.zeros(8, 6, 3), CAMERA)
-    with pytest.raises(InputError, match="frame f: depth is 4x3, its camera expects 8x6"):
+    with pytest.raises(InputError, match="frame f: depth is 4x3, but its camera expects 8x6"):
         Frame("f", torch.zeros(6, 8, 3), CAMERA, torch.zeros(3, 4))
 
 
@@ -48,9 +48,9 @@ WRONG = [
     ({"rgb": NO_VALUES.numpy()}, "rgb is a ndarray, expected a tensor; Frame.from_numpy"),
     ({"rgb": NO_VALUES.index_fill(0, torch.tensor([3]), torch.nan)}, "rgb has values that are NaN"),
     ({"rgb": NO_VALUES.index_fill(2, torch.tensor([1]), torch.inf)}, "rgb has values that are NaN or inf"),
-    ({"rgb": NO_VALUES.short()}, "rgb is of int16, expected bytes or floats"),
+    ({"rgb": NO_VALUES.short()}, "rgb has dtype int16, expected bytes or floats"),
     ({"rgb": NO_VALUES.bool()}, "rgb is of bool"),
-    ({"rgb": NO_VALUES.long()}, "rgb is of int64"),
+    ({"rgb": NO_VALUES.long()}, "rgb has dtype int64"),
     ({"rgb": NO_VALUES.to(torch.complex64)}, "rgb is of complex64"),
     ({"rgb": NO_VALUES.to_sparse()}, "rgb is a sparse tensor"),
     ({"rgb": NO_VALUES.to("meta")}, "has no values"),

@@ -57,7 +57,7 @@ def assert_equal(found: LandmarkMap | None, expected: LandmarkMap) -> None:
 def test_landmarks_of_a_detector_without_a_name_are_not_stored(
     tmp_path: Path, landmarks: LandmarkMap
 ) -> None:
-    with pytest.raises(InputError, match="a detector without a name"):
+    with pytest.raises(InputError, match="detector has no name"):
         save_landmarks(tmp_path, saved(tmp_path), replace(landmarks, features=""))
 
 
@@ -100,7 +100,7 @@ def test_training_drops_landmarks_and_what_was_measured_of_the_field(
 
 def test_landmarks_of_other_weights_are_refused(landmarks: LandmarkMap, tmp_path: Path) -> None:
     before, after = saved(tmp_path), saved(tmp_path)
-    with pytest.raises(InputError, match="trained anew while its landmarks"):
+    with pytest.raises(InputError, match="retrained while its landmarks"):
         save_landmarks(tmp_path, before, landmarks)
     assert load_info(tmp_path) == after
 
@@ -143,7 +143,7 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(
     save_landmarks(tmp_path, saved(tmp_path), landmarks)
     path = tmp_path / "map.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"landmarks": name}))
-    with pytest.raises(InputError, match="expected the name of a file beside it"):
+    with pytest.raises(InputError, match="expected the name of a file next to it"):
         load_map(tmp_path)
 
 

@@ -108,7 +108,7 @@ def names_of_callers() -> set[str]:
 
 def test_cancelled_and_resumed_equals_uninterrupted(tmp_path: Path) -> None:
     whole = trained(tmp_path / "whole")
-    with pytest.raises(bn.Cancelled, match=r"saved after step 5; resuming it"):
+    with pytest.raises(bn.Cancelled, match=r"saved after step 5; --resume"):
         trained(tmp_path / "half", cancel=after(5))
     info = load_info(tmp_path / "half")
     assert (info.step, info.complete) == (5, False)
@@ -216,7 +216,7 @@ def test_baking_stores_what_it_made_where_the_map_is(scene: bn.Map, tmp_path: Pa
     assert again.info.surface != baked.info.surface
     with pytest.raises(bn.Cancelled):
         baked.bake(tiny.views(), config=BAKE, cancel=lambda: True)
-    with pytest.raises(bn.InputError, match="rendered_landmarks takes no photos"):
+    with pytest.raises(bn.InputError, match="rendered_landmarks uses no photos"):
         baked.bake(tiny.views(), rendered_landmarks=True)
     assert load_info(tmp_path / "map") == again.info
 

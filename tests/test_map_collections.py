@@ -95,7 +95,7 @@ def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:
 def test_what_is_no_map_is_refused(grounds: list[Map], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no map in it"):
         bn.MapCollection(tmp_path)
-    with pytest.raises(InputError, match="two maps are called 'ground0'"):
+    with pytest.raises(InputError, match="two maps are named 'ground0'"):
         bn.MapCollection([grounds[0], grounds[0]])
     with pytest.raises(InputError, match="no map 'x', expected one of ground0"):
         bn.MapCollection(grounds[:1]).localizer("x")

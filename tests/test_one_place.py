@@ -99,7 +99,7 @@ def test_training_goes_on_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureF
         for i, v in enumerate(tiny.views(3))
     ]
     train(photos, out=tmp_path / "still", config=tiny.config(2), background=tiny.BACKGROUND, bake=False)
-    assert caplog.text.count("from one place and show no distances") == 1
+    assert caplog.text.count("from one place and do not determine distances") == 1
     assert not load_info(tmp_path / "still").distances
     assert not load_map(tmp_path / "still").has_distances
     moved = [

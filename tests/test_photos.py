@@ -156,7 +156,7 @@ def test_depth_of_another_resolution_takes_the_nearest(photo: Path, tmp_path: Pa
     torch.testing.assert_close(depth, torch.from_numpy(expected))
     other = save_depth(tmp_path / "e.png", steps[:, 3:])
     with pytest.raises(
-        InputError, match=r"e\.png: depth is 17x15, its image 40x30; expected the same aspect"
+        InputError, match=r"e\.png: depth is 17x15, but its image is 40x30; expected the same aspect"
     ):
         Frame.open(photo, depth=other, depth_unit=0.001)
 
@@ -210,9 +210,11 @@ def test_alpha_apart_or_as_a_channel() -> None:
 def test_arrays_that_do_not_fit_are_refused() -> None:
     rgb = noise(HEIGHT, WIDTH)
     assert Frame.from_numpy(rgb, CAMERA.scaled(2)).intrinsics.fx == pytest.approx(CAMERA.fx)
-    with pytest.raises(InputError, match="frame image: rgb is 40x30, its camera expects 30x40 or a size of"):
+    with pytest.raises(
+        InputError, match="frame image: rgb is 40x30, but its camera expects 30x40 or a size of"
+    ):
         Frame.from_numpy(rgb, Intrinsics(33.0, 34.0, 19.0, 16.0, HEIGHT, WIDTH))
-    with pytest.raises(InputError, match="frame b: depth is 30x40, its image 40x30"):
+    with pytest.raises(InputError, match="frame b: depth is 30x40, but its image is 40x30"):
         Frame.from_numpy(rgb, CAMERA, depth=np.ones((WIDTH, HEIGHT)), depth_unit=1.0, name="b")
     with pytest.raises(InputError, match=r"frame image: rgb has floats from 0 to 255"):
         Frame.from_numpy(rgb.astype(float), CAMERA)

@@ -90,7 +90,7 @@ def test_the_reader_finds_the_poses_and_cameras_again(orientation: int, tmp_path
 def test_a_mirror_image_has_no_pose(tmp_path: Path) -> None:
     file = write_photo(tmp_path / "one.png", noise(12, 16), 2)
     mirrored = PosedImage("one", 0, CAMERA, SE3.identity(), file)
-    with pytest.raises(InputError, match="mirror image"):
+    with pytest.raises(InputError, match="stored mirrored"):
         write_pose_transforms(tmp_path / "transforms.json", [mirrored])
     assert not (tmp_path / "transforms.json").exists()
 

@@ -104,7 +104,7 @@ def test_parallel_numbers_are_these() -> None:
 
 @pytest.mark.parametrize(("trials", "seed"), [(26, 1234), (5, 0)])
 def test_parallel_is_a_fixed_list(trials: int, seed: int) -> None:
-    with pytest.raises(InputError, match="fixed list"):
+    with pytest.raises(InputError, match="list is fixed"):
         PROTOCOLS["parallel"].cases(50, trials, seed)
     with pytest.raises(InputError, match="seed is 1259"):
         PROTOCOLS["parallel"].start(TRUE, (), 1259, 50)

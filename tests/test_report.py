@@ -237,7 +237,7 @@ def test_a_report_replaces_a_report_and_nothing_else(
         assert main(["report", str(file), "--out", str(other)]) == 1
         error = capsys.readouterr().err
         assert error.count("\n") == 1
-        assert f"{other}: holds something that is no report" in error
+        assert f"{other}: holds something other than a bidnerf report" in error
         assert [path.read_text() for path in other.iterdir()] == ["<html>mine</html>"]
 
 

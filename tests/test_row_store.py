@@ -38,7 +38,7 @@ def test_rows_of_something_else_are_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
     for content in ("notes\n", '{"a": 1}\n', "[1]\n"):
         path.write_text(content)
-        with pytest.raises(InputError, match="expected lines as a benchmark keeps"), RowStore(path):
+        with pytest.raises(InputError, match="expected lines in the format of benchmark"), RowStore(path):
             pass
         assert path.read_text() == content
 

@@ -114,7 +114,5 @@ def test_poses_that_are_written_are_read_again(name: str, written: list[View], t
         )
         torch.testing.assert_close(path.rotations[number], view.T_ref_camera.rotation, atol=1e-9, rtol=0)
     if name.endswith(".kitti.txt"):
-        with pytest.warns(
-            InputWarning, match="image 1 has no pose; rows of KITTI's format do not say which image"
-        ):
+        with pytest.warns(InputWarning, match="image 1 has no pose; KITTI rows do not state their image"):
             write_poses(tmp_path / name, [posed[0], *posed[2:]])

@@ -518,7 +518,7 @@ def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> Non
     client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
     found = client.localize(place.folder / "photo.png", focal=32, start=json.loads(place.start))
     assert (found["frame"], found["method"]) == ("photo", "bid")
-    with pytest.raises(ServiceError, match="no map of that name") as refused:
+    with pytest.raises(ServiceError, match="no map with that name") as refused:
         client.localize(place.photo, map="other")
     assert refused.value.status == 404
 
@@ -627,7 +627,7 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     for maps, part in (
         ([], "no map"),
         ({"a/b": "x"}, "its name is 'a/b'"),
-        (["x/a", "y/a"], "another map is named 'a'"),
+        (["x/a", "y/a"], "another map is also named 'a'"),
     ):
         with pytest.raises(InputError, match=part):
             named(maps)

@@ -110,16 +110,16 @@ def test_the_largest_of_several_models_is_kept_and_every_photo_accounted_for(sea
     assert (found.photos, found.placed, found.models) == (PLACED + OTHERS + 3, PLACED, (PLACED, OTHERS))
     reasons = {left.photo: left.reason for left in found.left_out}
     assert sorted(reasons) == ["100", "101", "102", "103", "200", "201", "202"]
-    assert all("another model, of 4 photos" in reasons[name] for name in ("100", "101", "102", "103"))
+    assert all("another model, with 4 photos" in reasons[name] for name in ("100", "101", "102", "103"))
     assert "keypoint" in reasons["200"]
     assert "not readable as an image" in reasons["202"]
     assert "not readable as an image" in reasons["201"]
-    assert "2 models without a connection, of 9, 4 photos" in str(found)
+    assert "2 unconnected models of 9, 4 photos" in str(found)
     assert json.loads((search.out / "poses.json").read_text())["placed"] == PLACED
 
 
 def test_interrupted_work_goes_on(search: Search) -> None:
-    assert "the same command goes on" in search.cancelled
+    assert "the same command resumes" in search.cancelled
     assert "finding keypoints" in search.stages[0]
     assert "finding keypoints" in search.stages[1]  # of the file that cannot be decoded, which is tried again
     assert search.stages[1].count("finding keypoints") == 1
@@ -161,7 +161,7 @@ def test_train_takes_photos_without_poses(
     try:
         ran = bidnerf("train", search.photos, "--out", out, "--split", "all", *tiny.options())
         assert ran.status == 0, ran.err
-        assert "has the poses of these photos already" in ran.err
+        assert "already has the poses of these photos" in ran.err
         assert len(bn.load_map(out).info.cameras) == PLACED
         with caplog.at_level("INFO", "bidnerf"), posed_images(search.photos, "train", out) as (data, _):
             assert data == str(beside)
@@ -178,7 +178,7 @@ def test_photos_inside_the_folder_of_the_poses_are_never_removed(tmp_path: Path)
         Image.new("RGB", (64, 48)).save(photos / f"{number:06d}.jpg")
     with pytest.raises(bn.InputError, match="2 photos, expected at least 3"):
         bn.find_poses(photos, tmp_path / "capture", overwrite=True)
-    with pytest.raises(bn.InputError, match="exists already, and the frames"):
+    with pytest.raises(bn.InputError, match="exists already, and the video's frames"):
         begin(tmp_path / "capture", "a video", video=True)
     assert len(list(photos.iterdir())) == 2
     begin(tmp_path / "other", "a video", video=True)
@@ -228,7 +228,7 @@ def test_too_few_photos_and_photos_without_overlap(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
     for found_again in (3, 0, 3):
         stages = list[bn.Progress]()
-        with pytest.raises(bn.InputError, match="no two show enough of the same"):
+        with pytest.raises(bn.InputError, match="no two of them overlap enough"):
             bn.find_poses(apart, tmp_path / "out", progress=stages.append)
         assert sum(now.stage == "finding keypoints" for now in stages) == found_again
         if found_again == 0:  # half of the keypoints are lost
@@ -263,9 +263,7 @@ def test_damaged_files_of_earlier_work_are_made_anew(search: Search, tmp_path: P
 
 def test_photos_from_one_place_are_refused(tmp_path: Path) -> None:
     write_photos(tmp_path / "turned", [looking((0, 0, 0), (1.7, 0.5 + 0.25 * n, 0.1)) for n in range(4)])
-    with pytest.raises(
-        bn.InputError, match=r"no three of 4 photos could be placed.*(one place|show the same)"
-    ):
+    with pytest.raises(bn.InputError, match=r"no three of 4 photos could be placed.*(one place|overlap)"):
         bn.find_poses(tmp_path / "turned", tmp_path / "out")
 
 

@@ -252,7 +252,9 @@ def test_a_binary_list_is_refused(folder: Path) -> None:
 
 def test_depth_of_another_aspect_ratio_is_refused(folder: Path) -> None:
     iio.imwrite(next(iter(sorted((folder / "depth").iterdir()))), np.ones((6, 6), np.uint16))
-    with pytest.raises(InputError, match=r"depth is 6x6, its image 16x12; expected the same aspect ratio"):
+    with pytest.raises(
+        InputError, match=r"depth is 6x6, but its image is 16x12; expected the same aspect ratio"
+    ):
         next(iter(open_sequence(folder)))
 
 

@@ -220,7 +220,7 @@ def test_masks_of_a_video_are_named_after_its_frames(tmp_path: Path) -> None:
         write_photo(folder / f"{name}.png", mask)
     hidden = [f.frame.hidden is not None for f in open_sequence(video, camera=camera, masks=masks[names[1]])]
     assert hidden == [False, True, False]
-    with pytest.raises(InputError, match="no mask in it belongs to any of 3 images"):
+    with pytest.raises(InputError, match="no mask in it matches any of 3 images"):
         open_sequence(video, camera=camera, masks=masks["other"])
 
 
@@ -238,5 +238,5 @@ class Stream:
 
 def test_a_stream_without_masks_says_so_at_its_end(tmp_path: Path) -> None:
     write_photo(tmp_path / "b.png", np.eye(8, dtype=np.uint8) * 255)
-    with pytest.warns(InputWarning, match="no mask in it belongs to any of 1 image "):
+    with pytest.warns(InputWarning, match="no mask in it matches any of 1 image "):
         assert len(list(masked_sequence(Stream(), MaskFolder(tmp_path)))) == 1

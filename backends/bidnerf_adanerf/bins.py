@@ -17,8 +17,8 @@ from bidnerf_core.fields.sampling import Stratified
 class Bins:
     """A ``RaySampler`` that returns all bins of each ray, as dense training needs them.
 
-    A ray's bins depend on the box alone. They are cut off where the ray's own [near, far] is narrower, and do not reach
-    beyond the box where it is wider.
+    A ray's bins depend only on the box. They are truncated if the ray's own [near, far] is narrower, and do
+    not extend beyond the box if it is wider.
     """
 
     bounds: SceneBounds
@@ -33,7 +33,7 @@ class Bins:
 
     @torch.no_grad()
     def through(self, rays: Rays) -> Rays:
-        """Return the rays limited to the box alone, whatever their own [near, far]."""
+        """Return the rays limited to the box only, ignoring their own [near, far]."""
         return self.bounds.rays(rays.origins.detach(), rays.directions.detach())
 
 
@@ -81,6 +81,6 @@ def chosen(samples: RaySamples, scores: Float[Tensor, "*r n"], threshold: float,
     best, index = scores.topk(min(most, count), dim=-1)
     taken: Bool[Tensor, "*r k"] = best > threshold
     taken[..., 0] = best[..., 0] >= 0
-    index = index.masked_fill(~taken, count).sort(dim=-1).values  # nearest first, the others last
+    index = index.masked_fill(~taken, count).sort(dim=-1).values  # nearest first, unused ones last
     valid, index = index < count, index.clamp(max=count - 1)
     return RaySamples(samples.starts.gather(-1, index), samples.ends.gather(-1, index), valid)

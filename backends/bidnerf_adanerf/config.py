@@ -24,8 +24,8 @@ class AdaNerfConfig(SupervisionConfig):
     oracle_layers: Layers = 3  # hidden layers of the oracle
     ray_points: Annotated[int, Range(2, 10**7)] = 16  # points that describe a ray to the oracle
     ray_frequencies: Annotated[int, Range(0, 64)] = 3  # octaves of sines and cosines of each of these points
-    # How many samples a ray takes. The last two may be changed in a trained map. Fewer samples are faster, but missed bins
-    # leave holes, which mislead pose estimation long before they are visible.
+    # Number of samples per ray. The last two may be changed in a trained map. Fewer samples are faster, but
+    # missed bins leave holes, which mislead pose estimation long before they are visible.
     bins: Count = 64  # number of equal parts of a ray's segment in the scene's box, each with a score
     threshold: NotNegative = 0.03  # score above which a bin is shaded
     max_samples: Count = 16  # maximum number of bins shaded along a ray: those of the highest scores
@@ -52,7 +52,7 @@ class AdaNerfConfig(SupervisionConfig):
         super().__post_init__()
         if not self.dense_part + self.soft_part <= 1:
             parts = self.dense_part + self.soft_part
-            raise InputError(f"dense_part and soft_part make {parts:g}, expected 1 or less together")
+            raise InputError(f"dense_part and soft_part sum to {parts:g}, expected at most 1")
 
     @classmethod
     def paper(cls) -> AdaNerfConfig:

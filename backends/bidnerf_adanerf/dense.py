@@ -14,7 +14,7 @@ from bidnerf_core.fields.rendering import Rendering
 from bidnerf_core.fields.voxel_grid import OccupancyMask
 
 PROBED = 1 / 16
-"""Fraction of the bins known to be empty that are shaded nevertheless, so that the field learns that they are empty."""
+"""Fraction of the bins known to be empty that are shaded anyway, so that the field learns that they are empty."""
 
 
 def dense_samples(
@@ -36,7 +36,7 @@ def dense_samples(
 def soft_weights(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:
     """Return the weights of bins in the soft phase: 1 above the threshold, as afterwards, and proportional to the score below.
 
-    In the paper the weight is the score itself. Where scores are intermediate, the density is then driven too high, and it
+    In the paper the weight is the score itself. Intermediate scores then drive the density too high, and it
     stays too high once those bins count fully: on Lego the dense rendering lost 1 dB in this phase.
     """
     return (scores / max(threshold, 1e-6)).clamp(max=1)

@@ -51,7 +51,7 @@ class AdaNerfField(nn.Module):
 
 @dataclass(frozen=True)
 class DenseField:
-    """The field with all bins shaded, without the oracle: its rendering is what the sparse field is to reproduce."""
+    """The field with all bins shaded, without the oracle: the sparse field is trained to reproduce its rendering."""
 
     sparse: AdaNerfField
 

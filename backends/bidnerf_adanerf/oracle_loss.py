@@ -40,7 +40,9 @@ def by_weight(weights: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:
 
 
 def by_depth(samples: RaySamples, batch: TrainingBatch) -> Float[Tensor, "r n"]:
-    """Return targets that are 1 at the measured depth and fall off with distance from it; 0 on rays without a measurement."""
+    """Return targets that are 1 at the measured depth and fall off with distance from it; 0 on rays without a
+    measurement.
+    """
     width = (samples.ends - samples.starts).clamp(min=1e-9)
     away = (samples.middles - batch.observed.distance[:, None]).abs() / width  # in bins
     near = (1 - away / BLUR).clamp(min=0)

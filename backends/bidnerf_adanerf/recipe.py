@@ -1,4 +1,4 @@
-"""Training of an AdaNeRF: with all bins, then with ever fewer of them, then only with those that the oracle keeps."""
+"""Training of an AdaNeRF: first with all bins, then with fewer and fewer, then only with those the oracle keeps."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
 
 
 def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:
-    """Return the cells that may hold matter according to the training views; used in training only and not saved."""
+    """Return the cells that may hold matter according to the training views; used only in training and not saved."""
     room = OccupancyMask(VoxelGrid.cube(bounds, resolution))
     room.cells.copy_(occupied_voxels(views, room.grid))
     return room

@@ -124,7 +124,9 @@ def _encode_group(
     values: Float[Tensor, "k c w"],
     slopes: Float[Tensor, "k c 3 w"] | None,
 ) -> None:
-    """Write the levels' features to ``values``, and their derivatives with respect to position (in cells) to ``slopes``."""
+    """Write the levels' features to ``values``, and their derivatives with respect to position (in cells) to
+    ``slopes``.
+    """
     unit, count = _unit(table.shape[1]), len(group)
     columns = _as_units(table, unit).unbind(1)
     for chunk in _chunks(points, group):
@@ -252,7 +254,7 @@ class _Encode(torch.autograd.Function):
 class HashEncoding(nn.Module):
     """Maps positions in the unit cube to the concatenated features of all levels (figure 3 of the paper).
 
-    Positions outside of [0, 1] are clamped to it: their encoding is that of the nearest point of the cube, and a
+    Positions outside [0, 1] are clamped to it: their encoding is that of the nearest point of the cube, and a
     clamped coordinate gets no gradient. Gradients are computed only for what requires them. They cannot be
     differentiated again: double backward raises an error.
     """

@@ -29,7 +29,8 @@ class FieldConfig(Settings):
     encoding: HashEncodingConfig = field(
         default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=18, finest_resolution=1024)
     )
-    # cells of the finest level across what a pixel shows; finest_resolution limits them, and decides alone where this is 0
+    # cells of the finest level per pixel footprint; limited by finest_resolution, which is used alone if this
+    # is 0
     cells_per_pixel: NotNegative = 2.5
     width: Count = 64  # units of a hidden layer
     colour_layers: Layers = 2  # hidden layers of the colour network
@@ -68,8 +69,8 @@ class HashGridField(nn.Module):
             nn.Linear(config.width, 3),
             nn.Sigmoid(),
         )
-        # In a contracted scene, the samples of most rays are concentrated by the density of whole cells, about which shorter
-        # steps would give no more information.
+        # In a contracted scene, the samples of most rays are concentrated by the density of whole cells,
+        # within which shorter steps would give no more information.
         single = bounds.contracted and config.samples_per_ray > 0
         self.occupancy = OccupancyGrid(bounds, config.grid_resolution, steps_per_cell=1 if single else 2)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
@@ -83,10 +84,10 @@ class HashGridField(nn.Module):
         return CoarseField(self), self
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a stored state with the present names.
+        """Rename a stored state's tensors to the present names.
 
-        In earlier versions the occupancy grid was called ``sampler``, and it observed no densities: only contracted scenes
-        need them, which did not exist then.
+        In earlier versions the occupancy grid was called ``sampler``, and it observed no densities: only
+        contracted scenes need them, which did not exist then.
         """
         old = "sampler."
         state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
@@ -116,7 +117,7 @@ class HashGridField(nn.Module):
 
 
 def _resolving(config: FieldConfig, bounds: SceneBounds) -> HashEncodingConfig:
-    """Return an encoding that is as fine as the images: finer levels would collide in their tables to no purpose."""
+    """Return an encoding as fine as the images: finer levels would only cause collisions in their tables."""
     encoding = config.encoding
     finest = encoding.finest_resolution
     if config.cells_per_pixel > 0 and bounds.footprint > 0:
@@ -131,10 +132,11 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
 
 
 def limited(grid: OccupancyGrid, count: int) -> RaySampler:
-    """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed density.
+    """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed
+    density.
 
-    With a count of 0, or where the grid has observed nothing, as in maps that earlier versions stored, it is the grid
-    itself, which samples all occupied cells.
+    With a count of 0, or if the grid has observed nothing, as in maps stored by earlier versions, it is the
+    grid itself, which samples all occupied cells.
     """
     return Concentrated(GridDensity(grid), count) if count and grid.observed else grid
 

@@ -17,10 +17,11 @@ from bidnerf_core.fields.sampling import rows_of
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 
 BLOCK = 8
-"""Steps along a ray that are skipped together where no occupied cell is near."""
+"""Steps along a ray that are skipped together if no occupied cell is near."""
 
 MOST = 96
-"""Maximum number of samples per ray where the host must not wait to count them; the nearest ones in occupied cells are kept."""
+"""Maximum number of samples per ray if the host must not wait to count them; the nearest ones in occupied
+cells are kept."""
 
 
 class OccupancyGrid(nn.Module):
@@ -98,7 +99,9 @@ class OccupancyGrid(nn.Module):
     def split_by_count(
         self, rays: Rays, count: int, jitter: Generator | None = None
     ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
-        """Return the intervals that ``__call__`` returns, apart for rays with many of them, see ``SplittingSampler``."""
+        """Return the intervals that ``__call__`` returns, separately for rays with many of them, see
+        ``SplittingSampler``.
+        """
         march = self._march(rays, jitter)
         place, ray = self._occupied_steps(march)
         counts = _counts(ray, march)

@@ -33,7 +33,7 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     coarse_every: Annotated[int, Range(0)] = 4
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     rays_at_most: Count = 16384  # maximum number of rays per step
-    prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
+    prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are skipped
     prune_every: Count = 16  # steps from one update of the occupied cells to the next
     prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it
     prune_threshold: NotNegative = 0.01  # rendering weight up to which a cell is empty
@@ -54,11 +54,11 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
 
 
 def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
-    """Return the config with slower pruning, and half the learning rate, where the scene is contracted.
+    """Return the config with slower pruning, and half the learning rate, if the scene is contracted.
 
-    There, a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a cell that is
-    pruned too early is rarely found again. Training at the full rate was less stable there: of twelve unseen photos of a
-    phone's capture, one lost 5 dB.
+    There, a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a
+    cell that is pruned too early is rarely found again. Training at the full rate was less stable there: of
+    twelve unseen photos of a phone capture, one lost 5 dB.
     """
     if not bounds.contracted:
         return config
@@ -105,7 +105,7 @@ def _update(
     """Update the occupancy grid with one step's rendering."""
     samples, density = rendering.samples, rendering.density
     assert density is not None  # it comes from ``render``
-    # Weights as if samples were one step of the grid long: concentrated samples are longer or shorter.
+    # Weights as if samples were one grid step long: concentrated samples are longer or shorter.
     place = grid.bounds.spacing(batch.rays).place
     weights = (
         rendering.weights.detach() * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)

@@ -1,4 +1,4 @@
-"""Threads for what torch itself does on one core: gathering from a table and scattering into it."""
+"""Threads for operations that torch runs on one core: gathering from a table and scattering into it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ _for_pools: ContextVar[int | None] = ContextVar("for_pools", default=None)  # th
 
 @contextmanager
 def pools_only(device: torch.device) -> Iterator[None]:
-    """Within the block, only ``concurrently`` uses several threads: torch's own operators use one. On a GPU, it does nothing.
+    """Within the block, only ``concurrently`` uses several threads: torch's own operators use one. On a GPU,
+    it does nothing.
 
-    A training step consists of hundreds of short operators. On two cores, waking threads for each of them took longer than these
-    saved.
+    A training step consists of hundreds of short operators. On two cores, waking threads for each of them
+    took longer than they saved.
     """
     if device.type != "cpu":
         yield
@@ -39,7 +40,7 @@ def pools_only(device: torch.device) -> Iterator[None]:
 
 
 def threads_for(points: int, device: torch.device) -> int:
-    """Return how many threads to use for ``points`` points: one on a GPU, and where there is too little work for more."""
+    """Return how many threads to use for ``points`` points: one on a GPU, and if there is too little work for more."""
     worth = device.type == "cpu" and points >= THREADED
     return (_for_pools.get() or torch.get_num_threads()) if worth else 1
 
@@ -52,7 +53,8 @@ def slices(count: int, size: int) -> list[slice]:
 def concurrently(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     """Run independent tasks on CPU threads, each of which uses one core; no task may record gradients.
 
-    Torch's operators release Python's global interpreter lock while they compute. Whatever a task raises is raised here.
+    Torch's operators release Python's global interpreter lock while they compute. Exceptions raised in a task
+    are raised here.
     """
     if threads < 2:
         for task in tasks:
@@ -76,7 +78,9 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def _opened(threads: int) -> ThreadPoolExecutor:
-    """Return a pool whose threads are all running, each limited to one core: a fork finds none of them at its start."""
+    """Return a pool whose threads are all running, each limited to one core, so that a fork finds none of
+    them starting.
+    """
     all_run = Barrier(threads + 1)
 
     def begin() -> None:

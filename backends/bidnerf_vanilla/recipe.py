@@ -74,7 +74,7 @@ def step_outcome(
 
 @torch.no_grad()
 def _rays_per_step(field: VanillaField, supervision: Supervision, config: VanillaConfig) -> int:
-    """Return the number of rays per step: the fewer samples a ray takes, the more rays."""
+    """Return the number of rays per step: the fewer samples per ray, the more rays."""
     rays = supervision.draw(PROBE, Generator().manual_seed(config.seed)).rays
     coarse = field.coarse.sampler(rays).valid
     samples = float(coarse.sum() + config.fine_samples * coarse.any(-1).sum()) / PROBE

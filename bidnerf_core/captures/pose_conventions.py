@@ -29,7 +29,7 @@ MOST_PAIRS = 40
 """Largest number of examined pairs among those suggested by poses and order, and among those suggested by
 image similarity."""
 COMPARED_IMAGES, COMPARED_KEYPOINTS = 60, 300
-"""Number of images of which all pairs are compared, and number of strongest keypoints used from each."""
+"""Number of images whose pairs are all compared, and number of strongest keypoints used from each."""
 PARTNERS, SIMILAR_MATCHES = 2, 12
 """Number of partners suggested per image, and smallest number of matches with each."""
 ENOUGH_PAIRS = 8

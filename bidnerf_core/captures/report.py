@@ -21,7 +21,7 @@ place."""
 
 @dataclass(frozen=True)
 class PhotoRecord:
-    """What is known about one photo of a capture."""
+    """Information about one photo of a capture."""
 
     name: str
     position: tuple[float, float, float]  # of the camera, metres, world
@@ -78,7 +78,7 @@ class CoverageRecord:
 
 @dataclass(frozen=True)
 class CaptureReport:
-    """What is known about the photos of a map."""
+    """Information about the photos of a map."""
 
     photos: tuple[PhotoRecord, ...]
     coverage: CoverageRecord

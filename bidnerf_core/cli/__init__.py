@@ -16,25 +16,25 @@ from bidnerf_core.cli.interruptions import Interrupted, interruptions
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelling_hint
 
 COMMANDS = {
-    "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
+    "demo": "train a closed-form scene, localize unseen frames in it, and draw the result",
     "backends": "list the installed kinds of field",
-    "plugins": "list all that is registered by name: backends, readers, methods and others",
-    "poses": "find the poses of photos, or of a video's frames, that have none",
-    "train": "make a map from a dataset, or from photos without poses",
-    "import": "make a map of a field that others trained: splats, a checkpoint",
+    "plugins": "list everything registered by name: backends, readers, methods and others",
+    "poses": "find the poses of photos or video frames without poses",
+    "train": "build a map from a dataset, or from photos without poses",
+    "import": "build a map from a field trained elsewhere: splats, a checkpoint",
     "bake": "add to a map what localization without a start needs, as train does",
     "info": "describe a map",
-    "extend": "add photos of its scene to a map",
-    "export": "write the surface, landmarks and cameras of a map for other software",
-    "scale": "change the unit of a map to metres",
+    "extend": "add photos of the same scene to a map",
+    "export": "export the surface, landmarks and cameras of a map for other software",
+    "scale": "convert a map to metres",
     "render": "render images and depth of a map from a dataset's poses",
     "localize": "find the poses of photos, or of a dataset's frames, in a map",
-    "track": "find the poses of a sequence's frames in a map, in the order of time",
+    "track": "find the poses of a sequence's frames in a map, in chronological order",
     "evaluate": "localize many frames from perturbed starts, one JSON line per trial",
-    "view": "look at a map and at localizations in it, on a page",
-    "serve": "answer over HTTP: photos in, poses out",
-    "compare": "try the same starts in several maps: success, steps, time, memory",
-    "report": "make one page of tables, figures and tests of an evaluation",
+    "view": "view a map, and localizations in it, on a web page",
+    "serve": "serve localization over HTTP: photos in, poses out",
+    "compare": "compare several maps from the same starts: success, steps, time, memory",
+    "report": "make one page of tables, figures and tests from an evaluation",
 }
 
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
@@ -64,7 +64,7 @@ def _guarded(name: str, given: list[str]) -> int:
     try:
         with interruptions(), _warnings_as_lines(name), _remarks_as_lines():
             return _dispatch(given)
-    except SystemExit as stopped:  # the parser has printed why
+    except SystemExit as stopped:  # the parser has already printed the reason
         return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
     except Interrupted as stopped:
         return _failed(name, "interrupted", 128 + stopped.number)
@@ -82,7 +82,7 @@ def _guarded(name: str, given: list[str]) -> int:
     except RuntimeError as error:
         if (
             type(error).__name__ != "OutOfMemoryError"
-        ):  # an error of torch, which is not imported here, so that --help is quick
+        ):  # a torch error; torch is not imported here, so that --help is quick
             raise
         return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
 
@@ -115,7 +115,7 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
             if issubclass(category, InputWarning):
                 _failed(name, str(message), DONE)
                 return
-            from bidnerf_core.cli.output import PrintableStream  # here, since few commands warn
+            from bidnerf_core.cli.output import PrintableStream  # imported here, since few commands warn
 
             with contextlib.redirect_stderr(PrintableStream(sys.stderr)):
                 others(message, category, *place)
@@ -137,7 +137,7 @@ def _remarks_as_lines() -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
-        logger.setLevel(before[0])  # which, unlike assigning it, clears what the logger has cached
+        logger.setLevel(before[0])  # which, unlike assigning it, clears the logger's cache
         logger.propagate = before[1]
 
 
@@ -145,7 +145,7 @@ class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from bidnerf_core.cli.output import (
             say,
-        )  # here, because importing rich takes longer than --help should
+        )  # imported here, because importing rich takes longer than --help should
 
         say(record.getMessage())
 
@@ -161,8 +161,8 @@ def _failed(name: str, message: str, status: int, more: str = "") -> int:
 def _open_streams() -> None:
     """Make stdout and stderr accept every character.
 
-    Streams that the shell closed (``>&-``), which are None in Python, are replaced by ones that discard everything; a character
-    that a stream's encoding lacks is written as a backslash escape.
+    Streams that the shell closed (``>&-``), which are None in Python, are replaced by streams that discard
+    everything; characters that a stream's encoding lacks are written as backslash escapes.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -173,7 +173,7 @@ def _open_streams() -> None:
 
 
 def _discard(stream: TextIO) -> None:
-    """Discard what is left in a stream's buffer, since flushing it when Python exits would fail again."""
+    """Discard the rest of a stream's buffer, since flushing it when Python exits would fail again."""
     with contextlib.suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())

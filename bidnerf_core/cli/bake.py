@@ -55,13 +55,15 @@ def bake(
 ) -> None:
     """Find the surface and the landmarks of a map, and store them in the map.
 
-    Depth is rendered from where the training images were taken; what several of these views agree on is kept. With
-    --data, views with measured depth are taken as they are instead, and landmarks are built from the photos; without it
-    they are built from images that the field renders, which are as sharp as the field. Landmarks of photos are kept
-    unless --data gives new photos or --rendered-landmarks asks for others.
+    Depth is rendered from the poses of the training images; what several of these views agree on is kept.
+    With --data, measured depth is used directly where views have it, and landmarks are built from the photos;
+    without --data they are built from images rendered by the field, which are only as sharp as the field.
+    Landmarks from photos are kept unless --data gives new photos or --rendered-landmarks is set.
     """
     if rendered_landmarks and data is not None:
-        raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
+        raise UsageError(
+            "--rendered-landmarks uses no photos, but --data gives some; expected only one of them"
+        )
     if masks is not None and data is None:
         raise UsageError("--masks was given without --data, expected the dataset that they belong to")
     registration, hiding = depth_registration(register_depth), mask_folder(masks, mask_hides)

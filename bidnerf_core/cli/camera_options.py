@@ -1,4 +1,4 @@
-"""The options for the cameras of images whose format has none."""
+"""The options for the cameras of images whose format stores none."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from bidnerf_core.errors import UsageError
 from bidnerf_core.frames.masks import HiddenColour, MaskFolder
 
 NO = "no"
-"""The value of ``--register-depth`` for which depth is used as it is."""
+"""The value of ``--register-depth`` with which depth is used as it is."""
 
 one_camera = tyro.conf.create_mutex_group(
     required=False,
-    title="camera of images whose format has none (default: from EXIF or the map)",
+    title="camera of images whose format stores none (default: from EXIF or the map)",
 )
 CameraFile = Annotated[
     Path | None,
     one_camera,
     option(
         "CAMERA.json",
-        "file with intrinsics: of nerfstudio, COLMAP (cameras.txt), ROS or OpenCV (YAML), Open3D, hloc or 3D Gaussian Splatting; of"
-        " a folder of TUM RGB-D also freiburg1, freiburg2 or freiburg3",
+        "file with intrinsics from nerfstudio, COLMAP (cameras.txt), ROS or OpenCV (YAML), Open3D, hloc or"
+        " 3D Gaussian Splatting; for a TUM RGB-D folder also freiburg1, freiburg2 or freiburg3",
         "",
     ),
 ]
@@ -40,9 +40,9 @@ DatasetCamera = Annotated[
     Path | None,
     option(
         "CAMERA.json",
-        "camera of a dataset in whose files there is none (TUM RGB-D: freiburg1, freiburg2, freiburg3, or a file; 7-Scenes:"
-        " a file)",
-        "as the folder has it",
+        "camera of a dataset whose files have none (TUM RGB-D: freiburg1, freiburg2, freiburg3, or a file;"
+        " 7-Scenes: a file)",
+        "as in the folder",
     ),
 ]
 RegisterDepth = Annotated[
@@ -51,14 +51,14 @@ RegisterDepth = Annotated[
         "SENSOR.json",
         "file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour"
         " images; 'no' if depth is already registered",
-        "as the format has it",
+        "as in the format",
     ),
 ]
 
 DatasetDepthUnit = Annotated[
     float | None,
     option(
-        "METRES", "metres per step of the depth images, such as 0.001 for millimetres", "as the format has it"
+        "METRES", "metres per step of the depth images, such as 0.001 for millimetres", "as in the format"
     ),
 ]
 
@@ -66,16 +66,17 @@ Masks = Annotated[
     Path | None,
     option(
         "DIR",
-        "masks of the images, called as they are: what is black (--mask-hides) is not used, such as people or the robot itself",
+        "masks named like the images: black pixels (--mask-hides) are ignored, such as people or the robot"
+        " itself",
         "",
     ),
 ]
-MaskHides = Annotated[HiddenColour, option("COLOUR", "colour in --masks of what is not used: black or white")]
-DepthSensorName = Annotated[str, option("NAME", "what measured the depth: " + ", ".join(DEPTH_SENSORS))]
+MaskHides = Annotated[HiddenColour, option("COLOUR", "colour in --masks that is ignored: black or white")]
+DepthSensorName = Annotated[str, option("NAME", "what measured the depth:" + ", ".join(DEPTH_SENSORS))]
 
 
 def mask_folder(masks: Path | None, hides: HiddenColour) -> MaskFolder | None:
-    """Return the folder of masks that ``--masks`` and ``--mask-hides`` name. Raises ``UsageError`` for the second alone."""
+    """Return the mask folder given by ``--masks`` and ``--mask-hides``. Raises ``UsageError`` for the latter alone."""
     if masks is None and hides != "black":
         raise UsageError(f"--mask-hides {hides} was given without --masks, expected the folder of masks")
     return None if masks is None else MaskFolder(masks, hides)

@@ -28,12 +28,12 @@ from bidnerf_core.progress import Progress
 Folders = Annotated[
     tuple[str, ...],
     tyro.conf.Positional,
-    option("MAP... DATA", "folders of maps, and last the folder of a dataset of the same scene", ""),
+    option("MAP... DATA", "folders of maps, followed by the folder of a dataset of the same scene", ""),
 ]
 
 
 def run(arguments: list[str]) -> None:
-    """Run the command; its options include the settings of the method that the arguments name."""
+    """Run the command; its options include the settings of the method named in the arguments."""
     settings = chosen_settings(arguments, "bid")
 
     def compare(
@@ -54,13 +54,14 @@ def run(arguments: list[str]) -> None:
         mask_hides: MaskHides = "black",
         seed: Annotated[int | None, option("N", "seed of every random choice", "the protocol's")] = None,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
-        overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
+        overwrite: Annotated[Flag, option(None, "replace the contents of --out", "")] = False,
         preset: Preset = None,
         config: Any = None,
     ) -> None:
-        """Localize the same frames from the same starts in several maps, and compare success, time and memory.
+        """Localize the same frames from the same starts in several maps, and compare success, time and
+        memory.
 
-        Each map has a process of its own, and the maps take turns at each start.
+        Each map has its own process, and the maps take turns at each start.
         """
         if len(folders) < 2:
             raise UsageError(
@@ -68,7 +69,7 @@ def run(arguments: list[str]) -> None:
                 "expected the folders of one or more maps, then that of a dataset"
             )
         *maps, data = folders
-        mask_folder(masks, mask_hides)  # refuses what is no folder of masks
+        mask_folder(masks, mask_hides)  # rejects anything but a folder of masks
         with wrong_usage():
             plan = Plan(
                 maps[0], data, protocol, read_sizes([] if size is None else [size]) or find_protocol(protocol).sizes[:1],

@@ -45,7 +45,7 @@ ANIMATED = 14  # frames of the animation
 
 @dataclass(frozen=True, eq=False)
 class DemoTrial:
-    """An unseen frame, a start that is far off, and the answers of two methods: one without the start, one from it."""
+    """An unseen frame, a distant start, and the answers of two methods: one without the start, one from it."""
 
     view: View
     start: SE3
@@ -70,14 +70,14 @@ def demo(
     backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
     out: Annotated[Path, option("DIR", "folder for the map and the pictures")] = Path("demo-out"),
     frames: Annotated[int, option("N", "number of unseen frames to localize")] = 4,
-    steps: Annotated[int | None, option("N", "training steps", "what the backend finds quick")] = None,
-    seed: Annotated[int, option("N", "seed of the views and of the starts")] = 0,
-    overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
+    steps: Annotated[int | None, option("N", "training steps", "the backend's quick choice")] = None,
+    seed: Annotated[int, option("N", "seed of the views and the starts")] = 0,
+    overwrite: Annotated[Flag, option(None, "replace the contents of --out", "")] = False,
 ) -> None:
-    """Train a closed-form scene, localize unseen frames in it, draw the result.
+    """Train a closed-form scene, localize unseen frames in it, and draw the result.
 
-    The frames are RGB-D images from poses that training never saw. Each is localized twice: by method auto with no
-    start, and by method bid from a start far from its pose.
+    The frames are RGB-D images from poses that training never saw. Each is localized twice: by method auto
+    without a start, and by method bid from a start far from its pose.
     """
     require("--frames", frames, 1)
     require("--steps", 1 if steps is None else steps, 1)
@@ -99,7 +99,7 @@ def _demonstrated(
         config = quick_config(chosen)
         config = config if steps is None else dataclasses.replace(config, steps=steps)
     except TypeError as error:
-        raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has") from error
+        raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has it") from error
     with (
         timed(f"trained on {len(seen)} views of the closed-form scene, and baked"),
         stopped_by_ctrl_c() as cancel,
@@ -159,7 +159,7 @@ def _draw(stored: Map, trials: Sequence[DemoTrial], out: Path) -> None:
 
 
 def _overlay(painter: Painter, trial: DemoTrial) -> UInt8[np.ndarray, "H W 3"]:
-    """Return two rows of pictures: the pose found without a start, and that found from one."""
+    """Return two rows of pictures: the pose found without a start, and the one found from a start."""
     auto, bid = trial.without_start.T_world_camera, trial.from_start.T_world_camera
     rows = (
         painter.row(painter.observed, "observed", auto, "found by auto, no start"),
@@ -169,5 +169,5 @@ def _overlay(painter: Painter, trial: DemoTrial) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _moments(steps: int) -> list[int]:
-    """Return the steps to show, which are close together at the beginning, where most happens."""
+    """Return the steps to show, which are denser at the beginning, where most of the motion happens."""
     return sorted({round(steps * (i / (ANIMATED - 1)) ** 2) for i in range(ANIMATED)})

@@ -28,7 +28,7 @@ STOPPING = "waiting for the trials under way (Ctrl-C again: at once)"
 
 
 def run(arguments: list[str]) -> None:
-    """Run the command; its options include the settings of the method that the arguments name."""
+    """Run the command; its options include the settings of the method named in the arguments."""
     settings = chosen_settings(arguments, USUAL_METHOD)
 
     def evaluate(
@@ -39,9 +39,7 @@ def run(arguments: list[str]) -> None:
             option("[DATA]", "folder of a dataset, or demo:object, demo:room, demo:blobs", ""),
         ] = None,
         *,
-        out: Annotated[
-            Path, option("RESULTS.jsonl", "file of results; trials that it already holds are not run again")
-        ],
+        out: Annotated[Path, option("RESULTS.jsonl", "results file; trials already in it are not run again")],
         protocol: Annotated[str, option("NAME", "how starts are chosen: " + ", ".join(PROTOCOLS))] = "bid",
         size: Annotated[
             tuple[str, ...],
@@ -52,7 +50,7 @@ def run(arguments: list[str]) -> None:
             int | None,
             option(
                 "N",
-                "number of trials of each size; without a start, at most one a frame",
+                "number of trials per size; without a start, at most one per frame",
                 "the protocol's, 24 or 25",
             ),
         ] = None,
@@ -61,7 +59,7 @@ def run(arguments: list[str]) -> None:
         frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
         images: Annotated[int, option("K", "localize a sequence of K images around the object at once")] = 1,
         angle: Annotated[float, option("DEGREES", "angle between neighbours of a sequence")] = 15.0,
-        depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
+        depth: Annotated[bool, option(None, "use measured depth if available")] = True,
         depth_points: Annotated[
             Path | None,
             option(
@@ -74,14 +72,14 @@ def run(arguments: list[str]) -> None:
             Names,
             option(
                 "NAME:SIZE...",
-                "try every trial with each of these faults of the images; NAME:SIZE,SIZE names several, A:SIZE+B:SIZE both "
-                "at once, none the images as they are; names: " + ", ".join(FAULTS),
+                "repeat every trial with each of these image faults; NAME:SIZE,SIZE gives several sizes,"
+                " A:SIZE+B:SIZE combines two, none leaves the images unchanged; names: " + ", ".join(FAULTS),
                 "none",
             ),
         ] = (),
         device: Device = "cpu",
         workers: Annotated[
-            int | None, option("N", "number of processes, of one thread each", "one a core; one on a GPU")
+            int | None, option("N", "number of single-threaded processes", "one per core; one on a GPU")
         ] = None,
         dask: Annotated[
             str | None, option("ADDRESS", "address of a dask scheduler whose workers run the trials", "")
@@ -93,10 +91,10 @@ def run(arguments: list[str]) -> None:
     ) -> None:
         """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
 
-        Finished trials are kept whatever happens: the same command resumes where it stopped. 'bidnerf report' makes tables
-        and figures of the results.
+        Finished trials are always kept: the same command resumes where it stopped. 'bidnerf report' makes
+        tables and figures from the results.
         """
-        mask_folder(masks, mask_hides)  # refuses what is no folder of masks
+        mask_folder(masks, mask_hides)  # rejects anything but a folder of masks
         with wrong_usage():
             plan = Plan(
                 map, data or _own_data(map), protocol, read_sizes(size) or None, method, changed_settings(method, config),
@@ -121,14 +119,14 @@ def run(arguments: list[str]) -> None:
 
 
 def read_sizes(words: Sequence[str]) -> tuple[Size, ...]:
-    """Return sizes from words such as 0.5 or 0.2:10."""
+    """Parse sizes such as 0.5 or 0.2:10."""
     try:
         return tuple(tuple(float(number) for number in word.split(":")) for word in words)
     except ValueError as error:
-        raise UsageError(f"--size is {' '.join(words)}, expected numbers as 0.5, or 0.2:10") from error
+        raise UsageError(f"--size is {' '.join(words)}, expected numbers such as 0.5, or 0.2:10") from error
 
 
 def _own_data(map: str) -> str:
     if not map.startswith("demo:"):
-        raise UsageError(f"no DATA after map {map}; only closed-form maps have data of their own")
+        raise UsageError(f"no DATA after map {map}; only closed-form maps have their own data")
     return map

@@ -23,14 +23,14 @@ def export(
         option(
             "FORMAT",
             "ply: surface, landmarks and cameras as point clouds and meshes; colmap: a text model of cameras and landmarks;"
-            " transforms.json: cameras as nerfstudio reads them, with landmarks as its sparse points; or another one of"
+            " transforms.json: cameras in nerfstudio's format, with landmarks as sparse points; or another one of"
             " 'bidnerf plugins exporters'",
         ),
     ],
     out: Annotated[Path, option("DIR", "folder for the files")],
-    overwrite: Annotated[Flag, option(None, "write into a folder that is not empty", "")] = False,
+    overwrite: Annotated[Flag, option(None, "write into a non-empty folder", "")] = False,
 ) -> None:
-    """Write the surface, the landmarks and the cameras of a map for other software, in the frame and the unit of the map."""
+    """Export the surface, landmarks and cameras of a map for other software, in the map's frame and unit."""
     check_folder(out, (map,))
     for file in export_map(load_map(map), out, to, overwrite):
         show(f"{file}: {file.stat().st_size / 1e6:.2f} MB")

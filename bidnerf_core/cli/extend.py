@@ -25,29 +25,31 @@ def extend(
     new: Annotated[
         Path,
         tyro.conf.Positional,
-        option("NEW", "photo, folder of photos, or dataset, whose own poses are not used"),
+        option("NEW", "photo, folder of photos, or dataset (whose own poses are ignored)"),
     ],
     data: Annotated[
         Path | None,
         option(
             "DATA",
-            "dataset that the map was made of",
-            "none: what the field renders stands in for its images",
+            "dataset that the map was built from",
+            "none: images rendered by the field replace it",
         ),
     ] = None,
     split: Annotated[str, option("NAME", "split of the datasets")] = "train",
     steps: Annotated[
         int | None,
         option(
-            "N", "training steps", "in proportion to the new photos, a quarter of the usual ones at least"
+            "N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"
         ),
     ] = None,
     config: BakeConfig = BakeConfig(),
 ) -> None:
-    """Add photos of its scene to a map: locate them, train the field on, and complete landmarks and surface.
+    """Add photos of the same scene to a map: localize them, continue training the field, and update landmarks
+    and surface.
 
-    Photos that cannot be read, that the map does not recognise, or that it was made of, are left out. The map is replaced once
-    all is done: Ctrl-C, or a kill, leaves it as it was, and localizers may go on reading it.
+    Photos are left out if they cannot be read, if they are not localized in the map, or if the map was built
+    from them. The map is replaced only when everything is done: after Ctrl-C, or a kill, it is unchanged, and
+    localizers may keep reading it meanwhile.
     """
     if steps is not None:
         require("--steps", steps, 1)

@@ -21,10 +21,11 @@ _T = TypeVar("_T")
 
 
 def without_expert_settings(function: Callable[..., _T]) -> tuple[Callable[..., _T], int]:
-    """Return a function without the options for experts, for a short help page, and the number of options left out.
+    """Return a function without the expert options, for a short help page, and the number of options left
+    out.
 
-    Settings are the parameters whose default is a dataclass. The parser removes hidden options altogether, so the returned
-    function is only for the page: arguments are parsed with ``function`` itself.
+    Settings are the parameters whose default is a dataclass. The parser removes hidden options altogether, so
+    the returned function is only for the page: arguments are parsed with ``function`` itself.
     """
     shorter, left_out = dict[str, Any](), 0
     for name, parameter in inspect.signature(function).parameters.items():
@@ -35,7 +36,7 @@ def without_expert_settings(function: Callable[..., _T]) -> tuple[Callable[..., 
 
 
 def retyped(function: Callable[..., _T], defaults: Mapping[str, Any]) -> Callable[..., _T]:
-    """Return the function with other defaults, whose types are also the types of their parameters to the parser."""
+    """Return the function with other defaults, whose types the parser also uses for the parameters."""
     signature, hints = inspect.signature(function), dict(function.__annotations__)
     parameters = dict(signature.parameters)
     for name, default in defaults.items():
@@ -52,7 +53,7 @@ def retyped(function: Callable[..., _T], defaults: Mapping[str, Any]) -> Callabl
 
 
 def _short(settings: Any) -> tuple[Any, int]:
-    """Return the same settings as an instance of a type that hides those for experts, and the number of hidden settings."""
+    """Return the same settings as an instance of a type without the expert ones, and the number of hidden settings."""
     kind, hidden = type(settings), 0
     hints = typing.get_type_hints(kind, include_extras=True)
     notes, values = dict[str, Any](), dict[str, Any]()
@@ -90,7 +91,7 @@ class Page(io.StringIO):
 
 
 def _headed(line: str) -> str:
-    """Return the heading of a box without the names of outer groups: ``steps`` for ``config.by-colour.steps options``."""
+    """Return the heading of a box without outer group names: ``steps`` for ``config.by-colour.steps options``."""
     found = re.search(r"\bconfig\.([\w-]+\.)*(?=[\w-]+ options )", line)
     if found is None:
         return line
@@ -99,7 +100,7 @@ def _headed(line: str) -> str:
 
 
 def _quoted(line: str) -> str:
-    """Return a line with plain quotes instead of the double backticks of docstrings, padded to keep the boxes' width."""
+    """Return a line with plain quotes instead of the double backticks of docstrings, padded to keep the box width."""
     cells = re.split(r"([│|])", line)
     return "".join(cell.replace("``", "'") + " " * cell.count("``") for cell in cells).rstrip()
 

@@ -24,11 +24,11 @@ LEAST_SCALE = 1e-9
 
 @dataclass(frozen=True)
 class NoSettings:
-    """Stands for the settings of an importer where the arguments do not tell which one it is."""
+    """Placeholder for an importer's settings if the arguments do not determine the importer."""
 
 
 def run(arguments: list[str]) -> None:
-    """Parse with the options of the importer that the arguments name or that recognises the file, and import."""
+    """Parse with the options of the importer that is named, or that recognizes the file, and import."""
     default = _settings(arguments)
 
     def import_file(
@@ -40,7 +40,7 @@ def run(arguments: list[str]) -> None:
                 name="as",
                 metavar="NAME",
                 help="one of 'bidnerf plugins importers'",
-                help_behavior_hint="(default: the one that recognises the file)",
+                help_behavior_hint="(default: the one that recognizes the file)",
             ),
         ] = None,
         scale: Annotated[float, option("FACTOR", "metres per unit of length in the file")] = 1.0,
@@ -56,23 +56,25 @@ def run(arguments: list[str]) -> None:
         photos: Annotated[
             Path | None,
             option(
-                "DATA", "dataset whose photos, with poses in the world, give the landmarks", "rendered images"
+                "DATA",
+                "dataset whose photos, with poses in the world, provide the landmarks",
+                "rendered images",
             ),
         ] = None,
         split: Annotated[str, option("NAME", "split of the dataset")] = "train",
         landmark_features: FeaturesName = USUAL_FEATURES,
         overwrite: Annotated[Flag, option(None, "replace the map in --out", "")] = False,
         no_bake: Annotated[
-            Flag, option(None, "leave the surface and the landmarks to 'bidnerf bake'", "")
+            Flag, option(None, "leave the surface and landmarks to 'bidnerf bake'", "")
         ] = False,
         device: Device = "cpu",
         config: Any = None,
     ) -> None:
-        """Make a map of a field that others trained.
+        """Build a map from a field that was trained elsewhere.
 
-        The installed importers are asked which of them reads the file. What was found is told: counts, what was left out, and
-        the extent, since most files do not store a unit. With --photos, landmarks are built from photos, as 'train' does;
-        without, from images that the field renders, which photos match less well.
+        The installed importer that recognizes the file reads it. The command reports what it found: counts,
+        what was left out, and the extent, since most files store no unit. With --photos, landmarks are built
+        from photos, as in 'train'; otherwise from images rendered by the field, which match photos less well.
         """
         require("--scale", scale, LEAST_SCALE)
         check_folder(out, (file, photos), may_be_map=True)
@@ -91,7 +93,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _settings(arguments: list[str]) -> Any:
-    """Return the default settings of the importer, as far as the arguments tell which it is."""
+    """Return the default settings of the importer, if the arguments determine it."""
     name = value_of("--as", arguments)
     if name is not None:
         with wrong_usage():
@@ -100,6 +102,6 @@ def _settings(arguments: list[str]) -> Any:
         try:
             if not word.startswith("-"):
                 return importer_of(Path(word))[1].config_type()
-        except InputError:  # not the file; or a bad one, which is reported later
+        except InputError:  # not the file; or an invalid one, which is reported later
             continue
     return NoSettings()

@@ -20,10 +20,10 @@ def info(
     map: MapFolder,
     json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
     draw: Annotated[
-        Path | None, option("PNG", "picture of the capture from above, to be written", "no picture")
+        Path | None, option("PNG", "file for a picture of the capture from above", "no picture")
     ] = None,
 ) -> None:
-    """Describe a map and the photos that it was made of. It is loaded whole, so that damage is found here."""
+    """Describe a map and the photos it was built from. The whole map is loaded, so that damage is detected."""
     scene = load_map(map)
     summary = scene.describe()
     if draw is not None:
@@ -39,7 +39,7 @@ def _draw(scene: Map, out: Path) -> None:
     """Draw the capture from above. Raises ``InputError`` if the map has no record of it."""
     if scene.capture is None:
         raise InputError(
-            f"{scene.folder}: has no record of its photos to draw; 'bidnerf bake MAP --data DATA' makes one"
+            f"{scene.folder}: has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one"
         )
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: expected the name of a PNG file")

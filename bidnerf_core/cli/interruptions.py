@@ -1,4 +1,4 @@
-"""Signals that ask a command to stop: each raises an exception in the main thread, so that results can be kept."""
+"""Signals that ask a command to stop: each raises an exception in the main thread, so that results can be saved."""
 
 from __future__ import annotations
 

@@ -54,11 +54,11 @@ from bidnerf_core.results.overlays import overlay
 from bidnerf_core.results.pose_files import OPENCV_AXES, pose_format, read_poses
 from bidnerf_core.settings import LARGEST_SEED
 
-one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
+one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start)")
 
 
 def run(arguments: list[str]) -> None:
-    """Parse with the settings of the method that the arguments name, and localize."""
+    """Parse with the settings of the method named in the arguments, and localize."""
     settings = chosen_settings(arguments, USUAL_METHOD)
 
     def localize(
@@ -68,8 +68,8 @@ def run(arguments: list[str]) -> None:
             tyro.conf.Positional,
             option(
                 "[MAP...] QUERY...",
-                "image files, folders of photos, or one folder of a dataset (required); before them, more maps or folders of maps:"
-                " the one that an image shows is found",
+                "image files, folders of photos, or one dataset folder (required); before them, further"
+                " maps or folders of maps: each image is localized in the one it shows",
                 "",
             ),
         ],
@@ -77,7 +77,9 @@ def run(arguments: list[str]) -> None:
         depth: Annotated[
             tuple[Path, ...],
             option(
-                "FILE...", "depth images or .npy of the photos, in the same order, or matched by name", ""
+                "FILE...",
+                "depth images or .npy files of the photos, in the same order, or matched by name",
+                "",
             ),
         ] = (),
         camera: CameraFile = None,
@@ -88,7 +90,7 @@ def run(arguments: list[str]) -> None:
             option(
                 "METRES",
                 "metres per step of depth images",
-                "0.001 for integers, 1 for floats; or as a dataset has it",
+                "0.001 for integers, 1 for floats; or as in the dataset",
             ),
         ] = None,
         register_depth: RegisterDepth = None,
@@ -96,7 +98,7 @@ def run(arguments: list[str]) -> None:
         mask_hides: MaskHides = "black",
         frame: Annotated[
             Names,
-            option("NAME...", "frames of a dataset, together as a rig", "each of the split, on its own"),
+            option("NAME...", "frames of a dataset, together as a rig", "each frame of the split on its own"),
         ] = (),
         split: Annotated[str, option("NAME", "split of the dataset")] = "test",
         method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
@@ -105,7 +107,7 @@ def run(arguments: list[str]) -> None:
             one_start,
             option(
                 "POSE.json",
-                "file with a 4x4 T_world_camera to start from, or one for each query by its name",
+                "file with a 4x4 T_world_camera to start from, or with one per query by name",
                 "",
             ),
         ] = None,
@@ -114,16 +116,16 @@ def run(arguments: list[str]) -> None:
             one_start,
             option("T R", "start from the dataset's pose moved by T metres and R degrees", ""),
         ] = None,
-        no_start: Annotated[Flag, one_start, option(None, "no start is known, as by default", "")] = False,
+        no_start: Annotated[Flag, one_start, option(None, "no start is known (the default)", "")] = False,
         window: Annotated[
-            int, option("K", "take a frame and those before it in the split, K in all, as a rig")
+            int, option("K", "combine each frame with those before it in the split, K in all, as a rig")
         ] = 1,
         depth_points: Annotated[
             Path | None,
             option(
                 "FILE",
-                "points that a sensor measured from the camera, metres: x y z a row, .npy, or .npz; or the folder of"
-                " a COLMAP sparse model, of which the points that the frames observe are taken",
+                "points measured by a sensor, in the camera frame, metres: rows of x y z, .npy, or .npz; or"
+                " the folder of a COLMAP sparse model, whose points are used where the frames observe them",
                 "",
             ),
         ] = None,
@@ -136,7 +138,7 @@ def run(arguments: list[str]) -> None:
             ),
         ] = None,
         draw: Annotated[
-            Path | None, option("DIR", "draw each photo beside the map rendered from the pose found", "")
+            Path | None, option("DIR", "draw each photo next to the map rendered from the pose found", "")
         ] = None,
         seed: Annotated[int, option("N", "seed of every random choice")] = 0,
         json: Annotated[Flag, option(None, "print one JSON object per query, each on a line", "")] = False,
@@ -144,13 +146,13 @@ def run(arguments: list[str]) -> None:
         preset: Preset = None,
         config: Any = None,
     ) -> None:
-        """Find the poses of photos, or of frames of a dataset, in a map, or in the one of several maps that they show.
+        """Find the poses of photos or dataset frames in a map, or in the one of several maps that they show.
 
-        QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF
-        has no focal length, method auto begins with that of the map's images.
-        Frames of a dataset that are named by --frame form a rig: their relative poses come from the dataset, and the
-        pose found is that of the last one's camera. Poses are camera to world with OpenCV axes (x right, y down, z forward).
-        Points have the camera's axes, unless a .npz holds T_camera_sensor as well.
+        QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it
+        is given; if EXIF has no focal length, method auto begins with the camera of the map's images. Dataset
+        frames named by --frame form a rig: their relative poses come from the dataset, and the pose found is
+        that of the last one's camera. Poses are camera to world with OpenCV axes (x right, y down, z
+        forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.
         """
         require("--seed", seed, 0, LARGEST_SEED)
         if frame and not any(frame):
@@ -221,7 +223,7 @@ def _localize(
                 each=lambda query, answer: output.show(query, answer, None if isinstance(answer, Failure) else begin.pose(query, seed)),
                 progress=lambda p: report(p.done, p.total),
             )  # fmt: skip
-        except BaseException:  # whatever ended it: Ctrl-C, SIGTERM, a reader that went away, a full disk
+        except BaseException:  # whatever ended it: Ctrl-C, SIGTERM, a closed pipe, a full disk
             with uninterrupted():
                 output.keep()
             raise
@@ -230,7 +232,7 @@ def _localize(
 
 
 class _Output:
-    """What is done with the answers: they are printed, drawn, and written to the file of poses at the end."""
+    """Output of answers: printed, drawn, and written to the pose file at the end."""
 
     def __init__(self, stored: Map, out: Path | None, draw: Path | None, json: bool, total: int) -> None:
         self._stored, self._out, self._draw, self._json, self._total = stored, out, draw, json, total
@@ -262,9 +264,10 @@ class _Output:
             say(f"{file}: not drawn: {error.strerror or error}")
 
     def finish(self) -> None:
-        """Write the file of poses, and print how many of several queries converged.
+        """Write the pose file, and print how many of several queries converged.
 
-        Raises ``InputError`` if a file of accepted poses would be empty, if a query failed, and if a picture is missing.
+        Raises ``InputError`` if a file of accepted poses would be empty, if a query failed, and if a picture
+        is missing.
         """
         answers, out, accepted = self.answers, self._out, len(self.answers.accepted)
         if self._total > 1:
@@ -272,7 +275,7 @@ class _Output:
         if out is not None:
             if not accepted and pose_format(out) != ".json":
                 raise InputError(
-                    f"{out}: not written, since no pose converged; a name ending with .json takes all"
+                    f"{out}: not written, since no pose converged; a .json file takes all of them"
                 )
             answers.save(out)
         if failed := len(answers) - len(answers.answers):
@@ -281,7 +284,7 @@ class _Output:
             raise InputError(f"{amount(self._not_drawn, 'picture')} could not be written, see above")
 
     def keep(self) -> None:
-        """Write the file of poses with the answers so far, after a run that did not come to its end."""
+        """Write the pose file with the answers so far, after a run that was stopped early."""
         out, answers = self._out, self.answers
         if out is None or not (answers.accepted or (answers.given and pose_format(out) == ".json")):
             return
@@ -294,7 +297,7 @@ def _picture_file(folder: Path, name: str) -> Path:
 
 
 def _show_in_full(answer: Answer, start: SE3 | None) -> None:
-    """Print an answer in several lines: its errors where the truth is known, its uncertainty, the matrix."""
+    """Print an answer on several lines: its errors if the truth is known, its uncertainty, the matrix."""
     found = answer.found
     show(f"{answer.name}: {_verdict(found)} ({found.reason})")
     if answer.error is not None and answer.truth is not None:
@@ -325,7 +328,7 @@ def _show_in_short(answer: Answer) -> None:
 
 
 def _verdict(found: Localization) -> str:
-    """Return the verdict in words; the troubleshooting page of the documentation explains each outcome."""
+    """Return the outcome in words; the troubleshooting page of the documentation explains each one."""
     return "converged" if found.converged else f"NOT converged: {found.outcome.value}"
 
 

@@ -1,4 +1,4 @@
-"""The options that choose a method's settings, on which the parser of the other settings depends."""
+"""The options that select a method's settings, on which the parser of the other settings depends."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from bidnerf_core.localization import find_method
 
 Preset: TypeAlias = Annotated[
     str | None,
-    option("NAME", "settings of the method to begin with, such as the paper's", "the defaults"),
+    option("NAME", "method settings to begin with, such as the paper's", "the defaults"),
 ]
 
 
 def chosen_settings(arguments: Sequence[str], usual: str) -> Any:
-    """Return the settings of the method that ``--method`` names: its defaults, or those of the ``--preset``."""
+    """Return the settings of the method given by ``--method``: its defaults, or those of ``--preset``."""
     with wrong_usage():
         method = find_method(value_of("--method", arguments) or usual)
         return method.settings(value_of("--preset", arguments))

@@ -1,4 +1,4 @@
-"""Parsing of a command's arguments: the options that several commands share, their checks, and the help page."""
+"""Parsing of a command's arguments: options shared by several commands, their checks, and the help page."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _T = TypeVar("_T")
 
 DEFAULT_BACKEND = "hashgrid"
 LEAST_WIDTH = 40
-"""Characters in a line of help, even where the terminal has fewer."""
+"""Minimum line width of help, even in narrower terminals."""
 
 
 def option(metavar: str | None, help: str, default: str | None = None) -> Any:
-    """Describe an option for the help page; ``default`` explains in words a default value such as None."""
+    """Describe an option for the help page; ``default`` explains a default value such as None in words."""
     hint = None if default is None else default and f"(default: {default})"
     return tyro.conf.arg(metavar=metavar, help=help, help_behavior_hint=hint)
 
 
 MapFolder: TypeAlias = Annotated[
-    Path, tyro.conf.Positional, option("MAP", "folder of a map, as 'bidnerf train' writes it")
+    Path, tyro.conf.Positional, option("MAP", "folder of a map, as written by 'bidnerf train'")
 ]
 FeaturesName: TypeAlias = Annotated[
     str, option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
@@ -42,7 +42,7 @@ FeaturesName: TypeAlias = Annotated[
 Device: TypeAlias = Annotated[str, option("NAME", "device on which the field computes: cpu, cuda ...")]
 Largest: TypeAlias = Annotated[
     int | None,
-    option("PX", "longer side to which larger images are reduced", "1600, or less where memory is short"),
+    option("PX", "longer side to which larger images are downscaled", "1600, or less if memory is short"),
 ]
 DataFolder: TypeAlias = Annotated[
     Path, tyro.conf.Positional, option("DATA", "folder of a dataset, or a .r3d file")
@@ -55,9 +55,10 @@ Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAct
 def parse(command: str, function: Callable[..., _T], arguments: list[str], config: Any = None) -> _T:
     """Call ``function`` with the parsed arguments; wrong usage ends the program with status 2.
 
-    ``config`` holds the default settings where their type is known only at run time, such as those of the method or backend
-    that the arguments name: the parameter ``config`` of ``function`` then takes its type and default from them.
-    ``--help`` shows all options except settings that are marked ``EXPERT``, and ``--help-all`` shows those as well.
+    ``config`` holds the default settings if their type is known only at run time, such as those of the method
+    or backend named in the arguments: the parameter ``config`` of ``function`` then takes its type and
+    default from them. ``--help`` shows all options except settings marked ``EXPERT``, and ``--help-all``
+    shows those as well.
     """
     if config is not None:
         function = retyped(function, {"config": config})
@@ -70,7 +71,8 @@ def parse(command: str, function: Callable[..., _T], arguments: list[str], confi
 
 def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
     odd = any(printable(word) != word for word in arguments)
-    # The parser repeats the arguments in its messages, which may be coloured, but must not let them control the terminal.
+    # The parser repeats the arguments in its messages, which may be coloured but must not control the
+    # terminal.
     with (
         contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext(),
         _wide_enough(),
@@ -82,7 +84,7 @@ def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> 
 
 @contextlib.contextmanager
 def _wide_enough() -> Iterator[None]:
-    """Give the parser's help and messages a least width: in narrower terminals it never ends to break lines."""
+    """Give the parser's help and messages a minimum width: in narrower terminals it never finishes breaking lines."""
     before = os.environ.get("COLUMNS")
     width = shutil.get_terminal_size().columns
     if width < LEAST_WIDTH:
@@ -103,7 +105,7 @@ def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
             return _called(command, function, ["--help"])
     finally:
         if hidden:
-            page.write(f"\n{hidden} settings for experts are not shown; --help-all shows them.\n")
+            page.write(f"\n{hidden} expert settings are not shown; --help-all shows them.\n")
         sys.stdout.write(page.wrapped(max(LEAST_WIDTH, shutil.get_terminal_size().columns)))
 
 
@@ -130,7 +132,7 @@ def _require_finite(settings: Any) -> None:
 
 
 def require(what: str, value: float, least: float, most: float = math.inf) -> None:
-    """Check a number from the command line. Raises ``UsageError`` where it is out of range."""
+    """Check a number from the command line. Raises ``UsageError`` if it is out of range."""
     if not least <= value <= most:
         expected = f"{least} or more" if most == math.inf else f"{least} to {most}"
         raise UsageError(f"{what} is {value}, expected {expected}")
@@ -145,7 +147,7 @@ def require_different(what: str, names: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
-    """Turn an ``InputError`` into a ``UsageError``, where the arguments are wrong whatever the files contain."""
+    """Convert an ``InputError`` to a ``UsageError`` if the arguments are wrong regardless of the files' contents."""
     try:
         yield
     except InputError as error:

@@ -1,4 +1,4 @@
-"""What a command prints: progress and remarks on stderr, results on stdout."""
+"""Output of commands: progress and remarks on stderr, results on stdout."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ else:
 
 
 class _Progress(Console):
-    """A console that becomes silent when its reader goes away, so that work continues."""
+    """A console that falls silent when its pipe is closed, so that work continues."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
 
 
 console = _Progress(stderr=True, highlight=False, soft_wrap=True)
-"""The console for everything but the result: progress, remarks, errors."""
+"""The console for everything except results: progress, remarks, errors."""
 
 
 def say(message: str) -> None:
@@ -39,7 +39,7 @@ def say(message: str) -> None:
 
 
 def show(line: str) -> None:
-    """Print a line of the result on stdout."""
+    """Print one line of the result on stdout."""
     sys.stdout.write(printable(line) + "\n")
 
 
@@ -55,15 +55,13 @@ def print_table(table: Table) -> None:
         part if part.text.strip("\n") == "" else Segment(printable(part.text), part.style, part.control)
         for part in screen.render(table)
     ]
-    with (
-        screen.capture() as drawn
-    ):  # written below, since rich has its own way of handling a reader that goes away
+    with screen.capture() as drawn:  # written below, since rich handles a closed pipe in its own way
         screen.print(Segments(parts), end="")
     sys.stdout.write(drawn.get())
 
 
 def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None) -> list[View]:
-    """Read views of a split, with a progress display if they are many. Raises ``InputError`` for an empty split."""
+    """Read the views of a split, with a progress display if there are many. Raises ``InputError`` for an empty split."""
     total = len(dataset.frame_names(split)) if names is None else len(names)
     if total == 0:
         raise InputError(f"{dataset.path}: split {split!r} has no frames")
@@ -80,7 +78,7 @@ def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None)
 
 
 class PrintableStream(io.TextIOBase):
-    """A stream that passes on what is written to it, line by line, as ``printable`` text."""
+    """A stream that passes on written text, line by line, as ``printable`` text."""
 
     def __init__(self, stream: TextIO | io.TextIOBase) -> None:
         self._stream = stream

@@ -23,7 +23,7 @@ def plugins(
     ] = None,
     json: Annotated[Flag, option(None, "print a JSON list", "")] = False,
 ) -> None:
-    """List what is registered under a name: backends, readers, methods, features, faults, writers, importers and exporters."""
+    """List everything registered by name: backends, readers, methods, features, faults, writers, importers and exporters."""
     groups = list(GROUPS) if group is None else [group]
     infos = [info for of in groups for info in list_plugins(of)]
     if json:
@@ -33,7 +33,7 @@ def plugins(
 
 
 def print_infos(infos: list[PluginInfo], with_group: bool = False) -> None:
-    """Print a table of plugins, with their faults where there are any."""
+    """Print a table of plugins, with their faults if any."""
     faults = ["fault"] if any(info.fault for info in infos) else []
     groups = ["group"] if with_group else []
     table = Table(*groups, "name", "summary", "distribution", "version", *faults, box=None, pad_edge=False)
@@ -45,7 +45,7 @@ def print_infos(infos: list[PluginInfo], with_group: bool = False) -> None:
 
 
 def plain(info: PluginInfo) -> dict[str, str | None]:
-    """Return the JSON values of a plugin."""
+    """Return a plugin's description as JSON values."""
     return {
         "name": info.name,
         "summary": summary(info),
@@ -57,7 +57,7 @@ def plain(info: PluginInfo) -> dict[str, str | None]:
 
 
 def summary(info: PluginInfo) -> str:
-    """Return the summary from the docstring or the metadata or, without these, from the imported plugin itself."""
+    """Return the summary from the docstring or the metadata or, failing these, from the imported plugin itself."""
     if info.summary or info.fault:
         return info.summary
     try:

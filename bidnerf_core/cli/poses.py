@@ -28,8 +28,8 @@ def poses(
         Path | None,
         option(
             "CAMERA.json",
-            "file with the intrinsics of all photos, which are kept as they are",
-            "estimated, beginning with EXIF",
+            "file with the intrinsics of all photos, which are then kept fixed",
+            "estimated, starting from EXIF",
         ),
     ] = None,
     overwrite: Annotated[Flag, option(None, "replace the poses in --out", "")] = False,
@@ -37,11 +37,12 @@ def poses(
 ) -> None:
     """Find the poses of photos by structure from motion, and write them as a dataset.
 
-    The dataset refers to the photos where they are; poses.json in it lists those that were left out, and why. The unit of
-    length is arbitrary. Ctrl-C stops, and the same command goes on from there. 'bidnerf train PHOTOS' does the same first.
+    The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The
+    unit of length is arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs
+    this step first.
     """
     check_folder(out, (photos,))
-    stopping = "stopping (Ctrl-C again: at once); what is found is kept"
+    stopping = "stopping (Ctrl-C again: at once); what was found is kept"
     with stopped_by_ctrl_c(stopping) as cancel, Display() as progress:
         found = find_poses(photos, out, camera, overwrite, progress, cancel)
     if json:

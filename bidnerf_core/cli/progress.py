@@ -1,4 +1,4 @@
-"""The display of progress on stderr, and Ctrl-C."""
+"""The progress display on stderr, and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from bidnerf_core.cli.output import console, say
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.progress import Cancel, Progress, duration_text
 
-LINE_EVERY = 10.0  # seconds, where stderr is not a terminal
+LINE_EVERY = 10.0  # seconds, if stderr is not a terminal
 
 
 class Display:
-    """Shows progress that it is called with: a bar for each stage on a terminal, else occasional lines.
+    """Displays progress when called with it: a bar for each stage on a terminal, else occasional lines.
 
-    A stage begins when it is first named, or named with nothing done. One of a single unit shows only the elapsed time, and
-    nothing where stderr is not a terminal.
+    A stage begins when it is first named, or named with nothing done. A stage with a single unit shows only
+    the elapsed time, and nothing if stderr is not a terminal.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class Display:
         )  # fmt: skip
         if now.total == 1:
             columns = (SpinnerColumn(), TextColumn(now.stage), TimeElapsedColumn())
-        # Results on the same terminal go above the bar.
+        # Results on the same terminal appear above the bar.
         self._bar = Bar(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
         self._bar.add_task("", total=now.total, text="")
         self._bar.start()
@@ -83,7 +83,7 @@ class Display:
 
 @contextlib.contextmanager
 def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
-    """Show how many of ``unit`` are done. Yields a function of the number done and the total."""
+    """Show how many of ``unit`` are done. Yields a function of (done, total)."""
     with Display() as display:
         if total is not None:
             display(Progress(what, 0, total, unit))
@@ -94,7 +94,8 @@ def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable
 def stopped_by_ctrl_c(
     announcement: str = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)",
 ) -> Iterator[Cancel]:
-    """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises ``KeyboardInterrupt`` at once.
+    """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises ``KeyboardInterrupt``
+    at once.
 
     Work that stopped for that reason ends as interrupted, after the line that says what was kept.
     """

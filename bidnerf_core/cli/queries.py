@@ -1,4 +1,4 @@
-"""The arguments of ``bidnerf localize`` that name its queries: the user's own photos, or frames of a dataset."""
+"""The arguments of ``bidnerf localize`` that specify its queries: the user's own photos, or frames of a dataset."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class PhotoOptions:
         return [option for option, value in values.items() if value is not None]
 
     def check_depth(self) -> None:
-        """Raise ``UsageError`` for options that belong to depth images where none are given."""
+        """Raise ``UsageError`` for options of depth images if none are given."""
         for option, value in (("--depth-unit", self.depth_unit), ("--register-depth", self.registration)):
             if value and not self.depth:
                 raise UsageError(
@@ -49,10 +49,10 @@ class PhotoOptions:
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """The choice of the frames of a dataset that are queries."""
+    """The choice of dataset frames used as queries."""
 
     split: str = "test"
-    names: tuple[str, ...] = ()  # a rig; none: each frame of the split on its own
+    names: tuple[str, ...] = ()  # a rig; empty: each frame of the split on its own
     window: int = 1
 
     def check(self) -> None:
@@ -69,9 +69,10 @@ def open_queries(
     paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float],
     points: DepthPoints | None,
 ) -> QuerySource:  # fmt: skip
-    """Return the queries that QUERY stands for: image files and folders of them, or one dataset.
+    """Return the queries for the QUERY arguments: image files and folders of them, or one dataset.
 
-    Raises ``InputError`` where there is nothing of either kind, and ``UsageError`` for options of the other kind.
+    Raises ``InputError`` if there is nothing of either kind, and ``UsageError`` for options that belong to
+    the other kind.
     """
     datasets = [
         path for path in paths if path.suffix.lower() not in IMAGE_SUFFIXES and find_reader(path) is not None
@@ -93,11 +94,11 @@ def _dataset(
     points: DepthPoints | None,
 ) -> QuerySource:  # fmt: skip
     if len(paths) > 1:
-        raise UsageError(f"{len(paths)} queries with a dataset among them, expected the dataset alone")
+        raise UsageError(f"{len(paths)} queries including a dataset, expected only the dataset")
     if photos.for_photos:
         raise UsageError(
-            f"{photos.for_photos[0]} is for photos, but {paths[0]} is a dataset, which has its own; to take its images as"
-            " photos, name the files"
+            f"{photos.for_photos[0]} is for photos, but {paths[0]} is a dataset, which has its own; to use"
+            " its images as photos, name the files"
         )
     dataset = open_dataset(
         paths[0],
@@ -114,4 +115,4 @@ def _dataset(
 
 def _check_points(points: DepthPoints | None, queries: int, expected: str) -> None:
     if points is not None and points.sparse is None and queries > 1:
-        raise UsageError(f"{points.path}: points of one camera, but {queries} {expected}")
+        raise UsageError(f"{points.path}: points of a single camera, but {queries} {expected}")

@@ -26,7 +26,7 @@ from bidnerf_core.io.images import png_bytes
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.rendering import RenderingScores, rendering_scores
 
-DEEPEST = 65.535  # metres that a 16-bit image of millimetres can hold
+DEEPEST = 65.535  # largest depth in metres that a 16-bit image in millimetres can hold
 
 
 def run(arguments: list[str]) -> None:
@@ -48,8 +48,8 @@ def _render(
 ) -> None:
     """Render a map from the poses of a dataset.
 
-    Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where nothing was met) per frame into --out,
-    and prints PSNR and depth error against the dataset's images.
+    Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) per
+    frame into --out, and prints PSNR and depth error against the dataset's images.
     """
     check_folder(out, (map, data))
     with output_folder(out, overwrite):
@@ -63,11 +63,11 @@ def _render(
 
 
 def _check_file_names(names: Sequence[str]) -> None:
-    """Raise ``InputError`` where one frame's colour image would have the same name as another's depth image."""
+    """Raise ``InputError`` if one frame's colour image would have the same name as another's depth image."""
     for name in {f"{name}.depth" for name in names} & set(names):
         raise InputError(
-            f"frame {name!r} would have the file of the depth of {name.removesuffix('.depth')!r}; render them"
-            " one by one with --frame, into different folders"
+            f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one"
+            " by one with --frame, into different folders"
         )
 
 
@@ -92,6 +92,9 @@ def write_images(out: Path, name: str, image: RenderedImage) -> None:
     """Write ``NAME.png`` and ``NAME.depth.png``."""
     write_file(out / f"{name}.png", png_bytes((image.rgb * 255).round().to(torch.uint8).numpy()))
     if float(image.depth.max()) > DEEPEST:
-        say(f"{name}: depth beyond {DEEPEST} units does not fit a 16-bit image of thousandths and is cut off")
+        say(
+            f"{name}: depth beyond {DEEPEST} units does not fit a 16-bit image in steps of 0.001 and is"
+            " clipped"
+        )
     millimetres = (image.depth.clamp(0, DEEPEST) * 1000).round().numpy().astype(np.uint16)
     write_file(out / f"{name}.depth.png", png_bytes(millimetres))

@@ -24,21 +24,21 @@ def run(arguments: list[str]) -> None:
 
 def report(
     results: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, option("RESULTS...", "files that 'bidnerf evaluate' wrote", "")
+        tuple[Path, ...], tyro.conf.Positional, option("RESULTS...", "files written by 'bidnerf evaluate'", "")
     ],
     out: Annotated[Path, option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[
         CriterionName | None,
-        option(None, "what counts as success where one criterion is shown", "10%; 5deg 0.05 if trials had no start"),
+        option(None, "success criterion for displays that use only one", "10%; 5deg 0.05 if trials had no start"),
     ] = None,
     title: Annotated[str, option("TEXT", "title of the page")] = "Localization results",
     view: Annotated[
-        Path | None, option("PAGE.html", "page of 'bidnerf view --results', to whose frames the report links", "")
+        Path | None, option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", "")
     ] = None,
 ) -> None:  # fmt: skip
-    """Write tables, figures and statistical tests of results as one page that needs no network.
+    """Write tables, figures and statistical tests of results as one page that works offline.
 
-    Trials are compared by map, data, start, method and settings. A trial that several files hold counts once.
+    Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """
     # Imported when a report is made, since help pages do not need it.
     from bidnerf_core.evaluation.provenance import read_runs
@@ -46,7 +46,7 @@ def report(
     from bidnerf_core.evaluation.results import ResultTable
 
     if not results:
-        raise UsageError("no file of results, expected at least one that 'bidnerf evaluate' wrote")
+        raise UsageError("no results file, expected at least one written by 'bidnerf evaluate'")
     table = ResultTable.load(*results)
     if not table.rows:
         raise InputError(f"{', '.join(map(str, results))}: no finished trial in it, nothing to report")
@@ -54,7 +54,7 @@ def report(
         chosen = chosen_criterion(criterion, table.groups)
     if view is not None and not view.is_file():
         raise InputError(
-            f"{view}: no such page, expected one that 'bidnerf view MAP --results ... --save' wrote"
+            f"{view}: no such page, expected one written by 'bidnerf view MAP --results ... --save'"
         )
     check_folder(out, results)
     runs = [(path.name, read_runs(path)) for path in results]
@@ -66,5 +66,5 @@ def report(
 
 
 def link_to(page: Path, folder: Path) -> str:
-    """Return the address of a page as a page in a folder refers to it."""
+    """Return the link to a page from another page in a folder."""
     return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())

@@ -17,7 +17,7 @@ from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scaling import factor_of_distance, factor_of_poses
 from bidnerf_core.results.pose_files import read_poses
 
-one_way = tyro.conf.create_mutex_group(required=True, title="how long a unit is (one of them)")
+one_way = tyro.conf.create_mutex_group(required=True, title="length of a unit (one of them)")
 
 
 def run(arguments: list[str]) -> None:
@@ -31,7 +31,8 @@ def scale(
         one_way,
         option(
             "A B METRES",
-            "the true distance of two places: names of cameras, NAME@U,V for what a camera shows at a pixel, or X,Y,Z",
+            "true distance between two places: camera names, NAME@U,V for what a camera shows at a pixel,"
+            " or X,Y,Z",
             "",
         ),
     ] = None,
@@ -39,23 +40,23 @@ def scale(
         Path | None,
         one_way,
         option(
-            "JSON", "true positions of cameras of the map in metres, as --out POSES.json writes poses", ""
+            "JSON", "true positions of the map's cameras in metres, in the format of --out POSES.json", ""
         ),
     ] = None,
     factor: Annotated[
         float | None,
         one_way,
-        option("F", "metres in a unit of the map; 1 says that its unit is the metre", ""),
+        option("F", "metres per unit of the map; 1 states that its unit is the metre", ""),
     ] = None,
-    out: Annotated[Path | None, option("MAP2", "leave the map as it is and write another one", "")] = None,
+    out: Annotated[Path | None, option("MAP2", "leave the map unchanged and write a new one", "")] = None,
 ) -> None:
-    """Change the unit of a map to metres: of its field, bounds, surface, landmarks, record and anchor.
+    """Convert a map to metres: its field, bounds, surface, landmarks, capture record and anchor.
 
-    Poses, covariances and errors are in metres from then on, and depth of sensors fits.
+    Poses, covariances and errors are then in metres, and the depth of sensors fits.
     """
     if out is not None:
         check_folder(out, (map,))
-    load_info(map)  # raises where there is no map
+    load_info(map)  # raises if there is no map
     place = out or map
     with map_folder(
         place, overwrite=out is None
@@ -64,7 +65,7 @@ def scale(
         found = _factor(scene, distance, poses, factor)
         stored = scene.scaled(found).stored_in(place)
     sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
-    show(f"{place}: all lengths multiplied by {found:.6g}; in metres now, the scene is a box of {sides}")
+    show(f"{place}: all lengths multiplied by {found:.6g}; the scene is now in metres, in a box of {sides}")
 
 
 def _factor(

@@ -17,7 +17,8 @@ from bidnerf_core.service import server
 from bidnerf_core.service.settings import ServiceConfig
 
 TOKEN = "BIDNERF_TOKEN"
-"""The environment variable that may hold the token; an argument would be visible to all users of the machine."""
+"""The environment variable that may hold the token; a command-line argument would be visible to all users of
+the machine."""
 
 
 def run(arguments: list[str]) -> None:
@@ -41,10 +42,10 @@ def serve(
             "this machine only",
         ),
     ] = None,
-    port: Annotated[int, option("N", "port to listen on; 0 takes a free one")] = server.PORT,
+    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = server.PORT,
     token_file: Annotated[
         Path | None,
-        option("FILE", f"file with the token; or set {TOKEN}", "with --host one is made up and shown"),
+        option("FILE", f"file with the token; or set {TOKEN}", "with --host, one is generated and shown"),
     ] = None,
     method: Annotated[str, option("NAME", "how poses are found")] = "auto",
     settings: Annotated[
@@ -53,10 +54,12 @@ def serve(
     device: Device = "cpu",
     config: ServiceConfig = ServiceConfig(),
 ) -> None:
-    """Answer over HTTP: POST a photo to /localize, get the JSON of 'bidnerf localize'. Ctrl-C ends it.
+    """Serve localization over HTTP: POST a photo to /localize to get the JSON of 'bidnerf localize'. Ctrl-C
+    stops it.
 
-    Photos come as the body of a request or in a form, with depth, camera and start if they are known; /geopose answers the GeoPose
-    Protocol. The description of all paths is at /openapi.json. Each request is a line of JSON on stderr.
+    Photos come as the request body or in a form, with depth, camera and start if known; /geopose implements
+    the GeoPose Protocol. All paths are described at /openapi.json. Each request is logged as a line of JSON
+    on stderr.
     """
     require("--port", port, 0, 65535)
     if not maps:
@@ -70,14 +73,16 @@ def serve(
 
 
 def _named(maps: tuple[str, ...]) -> dict[str, str | Path]:
-    """Return the folders by name. An argument that is a folder is one, even if there is an equals sign in its name."""
+    """Return the folders by name. An argument that is a folder is taken as one, even if its name contains an
+    equals sign.
+    """
     found = dict[str, str | Path]()
     for given in maps:
         name, equals, folder = given.partition("=")
         if not equals or Path(given).is_dir():
             name, folder = Path(given).resolve().name, given
         if name in found:
-            raise UsageError(f"two maps are named {name!r}, expected a name of its own for each: NAME=MAP")
+            raise UsageError(f"two maps are named {name!r}, expected a different name for each: NAME=MAP")
         found[name] = folder
     return found
 
@@ -95,7 +100,7 @@ def _token(file: Path | None) -> str | None:
 
 
 def _announce(address: str, token: str | None) -> None:
-    """Say where the service is; ``token``: one that was made up, since one that was given belongs in no log."""
+    """Print where the service is. ``token``: only a generated one, since a given token must not be logged."""
     say(f"serving at {address}; Ctrl-C ends")
     if token is not None:
         say(f"clients need the header  Authorization: Bearer {token}")

@@ -1,4 +1,4 @@
-"""``bidnerf localize`` in several maps: which one an image shows, the runner-up, and the pose."""
+"""``bidnerf localize`` in several maps: the map that an image shows, the runner-up, and the pose."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bidnerf_core.results.pose_files import pose_format
 
 
 def named_maps(first: Path, others: Sequence[Path]) -> tuple[list[Path], tuple[Path, ...]]:
-    """Return the maps, or folders of maps, that the arguments begin with, and the queries after them."""
+    """Split the arguments into the maps, or folders of maps, that they begin with, and the queries after them."""
     count = 0
     while count < len(others) and _holds_maps(others[count]):
         count += 1
@@ -44,14 +44,12 @@ def collected(maps: Sequence[Path], method: str, config: Any) -> MapCollection:
 
 
 def check_for_several(given: dict[str, bool], out: Path | None) -> None:
-    """Raise ``UsageError`` for options that belong to one map, by whether each was given, and for a file of poses other than JSON."""
+    """Raise ``UsageError`` for given options that apply only to one map, and for a pose file other than JSON."""
     for option, is_given in given.items():
         if is_given:
-            raise UsageError(f"{option} is for one map, but several are named")
+            raise UsageError(f"{option} applies to one map, but several are given")
     if out is not None and pose_format(out) != ".json":
-        raise UsageError(
-            f"{out}: poses in several maps have different worlds, expected a name that ends with .json"
-        )
+        raise UsageError(f"{out}: poses in several maps have different worlds, expected a .json file")
 
 
 def localize_in_several(

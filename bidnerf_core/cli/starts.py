@@ -14,9 +14,9 @@ from bidnerf_core.results.pose_files import pose_of
 
 @dataclass(frozen=True)
 class StartSpec:
-    """A start as given by the arguments: one of the two, or none. ``file`` is the one that ``fixed`` was read from."""
+    """The start given by the arguments: one of the two fields, or neither. ``file`` is the file of ``fixed``."""
 
-    fixed: dict[str, SE3] | None = None  # T_world_camera by the names of the queries; a single one is for all
+    fixed: dict[str, SE3] | None = None  # T_world_camera by query name; a single one applies to all
     perturb: tuple[float, float] | None = None  # length in the unit of the map, degrees
     file: Path | None = None
 
@@ -33,9 +33,10 @@ class StartSpec:
         return self.fixed is not None or self.perturb is not None
 
     def pose(self, query: Query, seed: int) -> SE3 | None:
-        """Return T_world_camera to start from. ``seed`` determines the direction in which the true pose is perturbed.
+        """Return T_world_camera to start from. ``seed`` determines the direction in which the true pose is
+        perturbed.
 
-        Raises ``InputError`` where a file of several poses has none for this query.
+        Raises ``InputError`` if a file of several poses has none for this query.
         """
         if self.perturb is not None and query.truth is not None:
             return protocols.perturb(query.truth, *self.perturb, seed)

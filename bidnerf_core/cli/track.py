@@ -52,7 +52,7 @@ def run(arguments: list[str]) -> None:
             tyro.conf.Positional,
             option(
                 "SEQUENCE",
-                "folder of a dataset or of images, a video; with --follow a folder, or - for stdin",
+                "folder of a dataset or images, or a video; with --follow a folder, or - for stdin",
             ),
         ],
         *,
@@ -60,17 +60,18 @@ def run(arguments: list[str]) -> None:
             Path | None,
             option(
                 "TRAJECTORY",
-                "file of poses, needed without --follow: .txt or .tum, transforms.json, or .json with all details",
+                "pose file, required without --follow: .txt or .tum, transforms.json, or .json with all"
+                " details",
                 "",
             ),
         ] = None,
         plot: Annotated[
             Path | None,
-            option("PNG", "draw the path over the map's surface, coloured by its uncertainty", ""),
+            option("PNG", "draw the path over the map's surface, coloured by uncertainty", ""),
         ] = None,
         video: Annotated[
             Path | None,
-            option("MP4", "draw each image beside the map as rendered from its pose; takes far longer", ""),
+            option("MP4", "draw each image next to the map rendered from its pose; takes far longer", ""),
         ] = None,
         camera: CameraFile = None,
         focal: FocalLength = None,
@@ -79,29 +80,30 @@ def run(arguments: list[str]) -> None:
         depth_unit: DatasetDepthUnit = None,
         masks: Masks = None,
         mask_hides: MaskHides = "black",
-        depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
+        depth: Annotated[bool, option(None, "use measured depth if available")] = True,
         depth_sensor: DepthSensorName = "unknown",
         risk: Annotated[
             float | None,
             option(
                 "SHARE",
-                "tolerated share of wrong poses among those accepted after a search of the map; it does not apply to the frames"
-                " tracked from there",
+                "tolerated fraction of wrong poses among those accepted after a search of the map; does not"
+                " apply to the frames tracked from there",
                 "accepted as usual",
             ),
         ] = None,
         split: Annotated[
-            str | None, option("NAME", "take the frames of one split of a dataset only", "all")
+            str | None, option("NAME", "use only the frames of one split of a dataset", "all")
         ] = None,
-        every: Annotated[int, option("N", "take every Nth frame only")] = 1,
+        every: Annotated[int, option("N", "use only every Nth frame")] = 1,
         start: Annotated[
-            Path | None, option("POSE.json", "file with a 4x4 T_world_camera of about the first frame", "")
+            Path | None,
+            option("POSE.json", "file with the approximate 4x4 T_world_camera of the first frame", ""),
         ] = None,
         follow: Annotated[
             Flag,
             option(
                 None,
-                "answer frames as they come, one JSON object per line on stdout, until Ctrl-C or the end",
+                "answer frames as they arrive, one JSON object per line on stdout, until Ctrl-C or the end",
                 "",
             ),
         ] = False,
@@ -109,20 +111,21 @@ def run(arguments: list[str]) -> None:
     ) -> None:
         """Find the poses of a sequence's frames in a map, in chronological order.
 
-        Each pose is predicted from those before it, refined and judged. A frame whose pose is not accepted counts as lost;
-        the following ones are searched in the whole map. Where the sequence has true poses, a table shows the errors.
+        Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted
+        counts as lost; the following ones are searched for in the whole map. If the sequence has true poses,
+        a table shows the errors.
         """
         require("--every", every, 1)
         if follow and split is not None:
-            raise UsageError("--split is for datasets, expected none with --follow")
+            raise UsageError("--split is for datasets, leave it out with --follow")
         if follow and depth_unit is not None:
-            raise UsageError("--depth-unit with --follow, expected depth_unit in each request")
+            raise UsageError("--depth-unit does not work with --follow, expected depth_unit in each request")
         if follow and masks is not None:
             raise UsageError(
-                '--masks names images that are there already; with --follow, lines of stdin may name a "mask"'
+                '--masks needs the images in advance; with --follow, lines of stdin may name a "mask"'
             )
         if out is None and not follow:
-            raise UsageError("no --out, expected the name of a file of poses")
+            raise UsageError("no --out, expected the name of a pose file")
         inputs = (sequence, camera, start, register_depth)
         if out is not None:
             check_pose_file(out, inputs)
@@ -177,7 +180,7 @@ def run(arguments: list[str]) -> None:
 
 def _finish(path: TrackedPath, stored: Map, out: Path | None, plot: Path | None, seconds: float | None, config: TrackerConfig
 ) -> None:  # fmt: skip
-    """Write and draw the frames so far, if any; where ``seconds`` are given, print a summary of the run."""
+    """Write and draw the frames so far, if any; if ``seconds`` are given, print a summary of the run."""
     if not path.given:
         return
     try:
@@ -194,8 +197,8 @@ def _finish(path: TrackedPath, stored: Map, out: Path | None, plot: Path | None,
     print_table(table)
     if path.lost and path.without_times:
         say(
-            f"the frames have no time stamps, so the first ones count as {config.frame_seconds:.3g} s apart; "
-            "if they were taken farther apart, set --frame-seconds"
+            f"the frames have no time stamps, so the first ones are assumed to be {config.frame_seconds:.3g}"
+            " s apart; if they are farther apart, set --frame-seconds"
         )
     if not path.accepted:
         say(f"no pose of {amount(len(path), 'frame')} was accepted{path.question}")
@@ -203,7 +206,7 @@ def _finish(path: TrackedPath, stored: Map, out: Path | None, plot: Path | None,
 
 def _of_split(frames: FrameSequence, split: str) -> FileSequence:
     if not isinstance(frames, FileSequence):
-        raise InputError(f"{frames.path}: a video has no splits, expected none (--split {split})")
+        raise InputError(f"{frames.path}: a video has no splits, leave out --split {split}")
     return frames.of_split(split)
 
 
@@ -211,7 +214,7 @@ def _follow(
     source: str, tracker: Tracker, path: TrackedPath, video: TrackingVideo | None, depth: bool, camera: CameraSource,
     sensor: DepthCamera | None,
 ) -> None:  # fmt: skip
-    """Answer each frame that arrives, at once, with one JSON object on a line of its own."""
+    """Answer each frame on arrival with one JSON object on a line of its own."""
     say(f"waiting for {'JSON lines on stdin' if source == STDIN else f'images in {source}'}; Ctrl-C ends")
     for request in requests(source):
         try:

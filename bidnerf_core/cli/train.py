@@ -48,7 +48,7 @@ from bidnerf_core.structure.sources import lacks_poses
 
 
 def run(arguments: list[str]) -> None:
-    """Parse with the options of the backend that the arguments name, and train."""
+    """Parse with the options of the backend named in the arguments, and train."""
     named = value_of("--backend", arguments)
     resumed = None if named else _resumed_map(arguments)
     name = named or (resumed[1].backend if resumed else DEFAULT_BACKEND)
@@ -58,7 +58,7 @@ def run(arguments: list[str]) -> None:
         data: Annotated[
             Path,
             tyro.conf.Positional,
-            option("DATA", "folder of a dataset, or of photos without poses; or a video"),
+            option("DATA", "folder of a dataset or of photos without poses, or a video"),
         ],
         out: Annotated[Path, option("MAP", "folder for the map")],
         backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
@@ -71,25 +71,24 @@ def run(arguments: list[str]) -> None:
         largest: Largest = None,
         background: Annotated[
             str | None,
-            option("COLOUR", "colour behind images with alpha: white or black", "as the dataset has it"),
+            option("COLOUR", "colour behind images with alpha: white or black", "as in the dataset"),
         ] = None,
         resume: Annotated[Flag, option(None, "continue the interrupted training in --out", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace the map in --out", "")] = False,
         checkpoint_every: Annotated[
             float,
-            option(
-                "SECONDS", "time between checkpoints: at most this much work is lost if the program is killed"
-            ),
+            option("SECONDS", "time between checkpoints: the most work lost if the program is killed"),
         ] = CHECKPOINT_SECONDS,
         depth_points: Annotated[
             Path | None,
-            option("MODEL", "COLMAP sparse model whose points give depth to images that have none", ""),
+            option("MODEL", "COLMAP sparse model whose points provide depth for images without any", ""),
         ] = None,
         refine_poses: Annotated[
             RefinementChoice,
             option(
                 "WHEN",
-                "refine the given poses by the keypoints that images share: always, never, or auto: if inconsistent",
+                "refine the given poses with the keypoints that images share: always, never, or auto (if"
+                " inconsistent)",
             ),
         ] = "auto",
         trust_poses: Annotated[
@@ -98,21 +97,23 @@ def run(arguments: list[str]) -> None:
         landmark_features: FeaturesName = USUAL_FEATURES,
         device: Device = "cpu",
         no_bake: Annotated[
-            Flag, option(None, "leave the surface and the landmarks to 'bidnerf bake'", "")
+            Flag, option(None, "leave the surface and landmarks to 'bidnerf bake'", "")
         ] = False,
         model_points: SparseChoice = SparseChoice(),
         config: Any = None,
     ) -> None:
-        """Make a map of a dataset, or of photos without poses.
+        """Build a map from a dataset, or from photos without poses.
 
-        The poses of photos, or of a video's frames, that have none are found first, as by 'bidnerf poses', and kept in the
-        folder MAP-poses. Ctrl-C stops after a step and saves the map; --resume continues from there, or from the last checkpoint if the
-        program was killed, with the same result as an uninterrupted training. It also bakes a map that is trained but not
-        baked.
+        Poses that photos or video frames lack are found first, as by 'bidnerf poses', and kept in the folder
+        MAP-poses. Ctrl-C stops after a step and saves the map; --resume continues from there, or from the
+        last checkpoint if the program was killed, with the same result as an uninterrupted training. It also
+        bakes a map that is trained but not baked.
         """
         require("--checkpoint-every", checkpoint_every, 0)
         if resume and overwrite:
-            raise UsageError("--resume goes on with a map, --overwrite begins anew; expected one of them")
+            raise UsageError(
+                "--resume continues a map, --overwrite starts a new one; expected only one of them"
+            )
         if largest is not None:
             require("--largest", largest, 1)
         if background is not None:
@@ -124,25 +125,26 @@ def run(arguments: list[str]) -> None:
         photos = lacks_poses(data)
         if photos and (depth_unit is not None or register_depth is not None):
             raise UsageError(
-                f"{data}: photos without poses have no depth; leave --depth-unit and --register-depth out"
+                f"{data}: photos without poses have no depth; leave out --depth-unit and --register-depth"
             )
         if photos and masks is not None:
             raise UsageError(
                 f"{data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
             )
         if photos and not (out / DESCRIPTION).exists():
-            resume = False  # it was interrupted while poses were sought, which go on by themselves
+            resume = False  # it was interrupted during pose estimation, which resumes by itself
         if resume:
             info = training.interrupted(out, not no_bake)
             _check_unchanged(out, info, named, default, config)
             _check_refinement(out, info, refine_poses)
             if largest is not None and largest != longest_side(info):
                 raise UsageError(
-                    f"{out}: was begun with images of {longest_side(info)} px, got --largest {largest}; leave it out"
+                    f"{out}: was started with images of {longest_side(info)} px, got --largest {largest}; leave"
+                    " it out"
                 )
             if landmark_features not in (USUAL_FEATURES, info.landmark_features):
                 began = f"--landmark-features {info.landmark_features}"
-                raise UsageError(f"{out}: was begun with {began}, got {landmark_features}; leave it out")
+                raise UsageError(f"{out}: was started with {began}, got {landmark_features}; leave it out")
             begun = info.bounds.background if background is None else background
         images: Images = data
         if not photos:
@@ -185,20 +187,23 @@ def _resumed_map(arguments: list[str]) -> tuple[Path, MapInfo] | None:
         return None
     try:
         return Path(out), load_info(Path(out))
-    except InputError:  # reported later, if the arguments are otherwise right
+    except InputError:  # reported later, if the arguments are otherwise valid
         return None
 
 
 def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any, config: Any) -> None:
-    """Raise ``UsageError`` for settings that differ from the interrupted training's, since they would be ignored."""
+    """Raise ``UsageError`` for settings that differ from those of the interrupted training, since they would
+    be ignored.
+    """
     if backend not in (None, info.backend):
-        raise UsageError(f"{out}: is of backend {info.backend!r}, cannot resume it with {backend!r}")
+        raise UsageError(f"{out}: uses backend {info.backend!r}, cannot resume it with {backend!r}")
     began = from_plain(type(config), info.config, f"{out}: config")
     stored, given, usual = (to_flat(settings) for settings in (began, config, default))
     for key, value in given.items():
         if value not in (usual[key], stored[key]):
             raise UsageError(
-                f"{out}: was begun with {key} {stored[key]}, got {value}; --resume keeps settings, --overwrite begins anew"
+                f"{out}: was started with {key} {stored[key]}, got {value}; --resume keeps settings,"
+                " --overwrite starts again"
             )
 
 
@@ -210,5 +215,5 @@ def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) ->
     if refinement == ("never" if refined else "always"):
         has = "refined" if refined else "given"
         raise UsageError(
-            f"{out}: was begun with {has} poses, got --refine-poses {refinement}; --resume keeps the poses"
+            f"{out}: was started with {has} poses, got --refine-poses {refinement}; --resume keeps the poses"
         )

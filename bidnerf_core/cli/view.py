@@ -34,17 +34,17 @@ def view(
     query: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,
-        option("[QUERY...]", "photos, folders of photos, or one dataset, to localize and to show", ""),
+        option("[QUERY...]", "photos, folders of photos, or one dataset, to localize and show", ""),
     ] = (),
     *,
     save: Annotated[
-        Path | None, option("PAGE.html", "write one page that opens without a server or a network, and end", "")
+        Path | None, option("PAGE.html", "write a page that opens without a server or a network, and exit", "")
     ] = None,
     results: Annotated[
-        Path | None, option("FILE", "results of 'bidnerf evaluate', as a table that leads to their frames", "")
+        Path | None, option("FILE", "results of 'bidnerf evaluate', as a table with links to their frames", "")
     ] = None,
     trajectory: Annotated[
-        Path | None, option("FILE", "poses of 'bidnerf track', or of TUM, EuRoC or KITTI", "")
+        Path | None, option("FILE", "poses from 'bidnerf track', or in the format of TUM, EuRoC or KITTI", "")
     ] = None,
     depth: Annotated[tuple[Path, ...], option("FILE...", "depth images of the photos, in the same order", "")] = (),
     camera: CameraFile = None,
@@ -53,19 +53,20 @@ def view(
     depth_unit: Annotated[float | None, option("METRES", "metres per step of depth images", "")] = None,
     frame: Annotated[Names, option("NAME...", "frames of a dataset, each on its own", "all of the split")] = (),
     split: Annotated[str, option("NAME", "split of the dataset")] = "test",
-    most: Annotated[int, option("N", "images that a saved page holds, spread over all")] = 24,
+    most: Annotated[int, option("N", "number of images in a saved page, spread over all")] = 24,
     method: Annotated[str, option("NAME", "how poses are found")] = "auto",
     host: Annotated[
         str | None,
-        option("ADDRESS", "let other machines look, which need the address with its token", "this machine only"),
+        option("ADDRESS", "allow other machines to view the page; they need the address with its token", "this machine only"),
     ] = None,
-    port: Annotated[int, option("N", "port to listen on; 0 takes a free one")] = server.PORT,
+    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = server.PORT,
     device: Device = "cpu",
 ) -> None:  # fmt: skip
-    """Look at a map in a browser, drop photos on it, and see how and why a pose was found or refused. Ctrl-C ends it.
+    """View a map in a browser, drop photos on it, and see how and why a pose was found or rejected. Ctrl-C
+    stops it.
 
-    The photos and frames of QUERY are offered for choice. With --save, they are localized at once, and the page that is
-    written shows the same without a server.
+    The photos and frames of QUERY can be selected there. With --save, they are localized immediately, and the
+    saved page shows the same without a server.
     """
     # Imported when a page is made, since help pages do not need it.
     from bidnerf_core.localization import Localizer
@@ -118,7 +119,7 @@ def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, 
 
 
 def rows_of(results: Path) -> tuple[ShownRow, ...]:
-    """Return the trials of a file of results as rows of the page's table."""
+    """Return the trials in a results file as rows of the page's table."""
     from bidnerf_core.evaluation.results import read_results
     from bidnerf_core.viewer.table import shown_row
 
@@ -132,7 +133,7 @@ def rows_of(results: Path) -> tuple[ShownRow, ...]:
 
 
 class Chosen:
-    """Some of the queries of a source."""
+    """A subset of a source's queries."""
 
     def __init__(self, source: QuerySource, places: Sequence[int]) -> None:
         self._source, self._places = source, places
@@ -148,7 +149,7 @@ class Chosen:
 
 
 def places_of(names: Sequence[str], asked: Sequence[str], most: int) -> list[int]:
-    """Return the places of the frames that were asked for, or of at most ``most``, spread over all."""
+    """Return the indices of the requested frames, or of at most ``most`` spread over all."""
     unknown = [name for name in asked if name not in names]
     if unknown:
         raise InputError(f"no frame {unknown[0]!r}{spelling_hint(unknown[0], names)}")

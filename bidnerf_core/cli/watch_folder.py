@@ -20,7 +20,7 @@ STDIN = "-"
 POLL = 0.05
 """Seconds between two checks of a watched folder."""
 STEADY = 2
-"""Number of checks for which a file's size has to stay the same before it is read, since it may still be being written."""
+"""Number of checks for which a file's size must stay the same before it is read, since it may still be being written."""
 KEYS = {"image", "depth", "time", "depth_unit", "mask"}
 
 
@@ -32,20 +32,17 @@ class FrameRequest:
     depth: Path | None = None
     time: float | None = None  # seconds
     depth_unit: float | None = None  # metres per step
-    mask: Path | None = None  # black is not used
+    mask: Path | None = None  # black is ignored
 
     @staticmethod
     def parse(line: str) -> FrameRequest:
-        """Return the request in a line ``{"image": path, "depth": path, "time": s}``, of which only the image is required.
-
-        Raises ``InputError`` for anything that is not such an object.
-        """
+        """Parse the request in a line ``{"image": path, "depth": path, "time": s}``; only the image is required."""
         request = parse_record("request", line, '{"image": path, "depth": path, "time": seconds}')
         image, depth = request.text("image"), request.text("depth")
         if image is None:
             raise request.error(f'no "image" in {line.strip()[:80]!r}')
         if unknown := sorted(request.values.keys() - KEYS):
-            raise request.error(f"unknown key {unknown[0]!r}, expected some of {', '.join(sorted(KEYS))}")
+            raise request.error(f"unknown key {unknown[0]!r}, expected any of {', '.join(sorted(KEYS))}")
         time, unit = request.number("time"), request.number("depth_unit")
         mask = request.text("mask")
         return FrameRequest(
@@ -57,7 +54,7 @@ class FrameRequest:
         )
 
     def read(self, camera: CameraSource, sensor: DepthCamera | None, background: Background) -> Frame:
-        """Read the image and its depth. Raises ``InputError`` if they are not readable or the camera is not known."""
+        """Read the image and its depth. Raises ``InputError`` if they cannot be read or the camera is unknown."""
         return Frame.read(
             self.image, camera, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
             background=background, mask=self.mask,
@@ -65,7 +62,8 @@ class FrameRequest:
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:
-    """Yield frames as they arrive: lines of stdin until it ends, or the images of a folder until the program is stopped.
+    """Yield frames as they arrive: lines of stdin until it ends, or the images of a folder until the program
+    is stopped.
 
     A line that is not a request is yielded as the error with which to answer it.
     """
@@ -83,11 +81,9 @@ def _lines() -> Iterator[FrameRequest | InputError]:
 
 
 def _arriving(folder: Path) -> Iterator[FrameRequest]:
-    """Yield the images of a folder in the natural order of their names, and later ones as they arrive."""
+    """Yield the images of a folder in natural name order, and later ones as they arrive."""
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: no such folder, expected one that images come into, or {STDIN} for stdin"
-        )
+        raise InputError(f"{folder}: no such folder, expected one that receives images, or {STDIN} for stdin")
     given, sizes = set[Path](), dict[Path, tuple[int, int]]()
     while True:
         photos, others = photos_in(folder)
@@ -95,14 +91,14 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
         for photo in waiting:
             depth = next((file for file in others if _is_depth_of(photo, file)), None)
             if not all(_is_steady(file, sizes) for file in (photo, depth) if file is not None):
-                break  # later names have to wait, to keep the order of names
+                break  # later names have to wait, to keep the name order
             given.add(photo)
             yield FrameRequest(photo, depth)
         clocks.sleep(POLL)
 
 
 def _is_depth_of(photo: Path, file: Path) -> bool:
-    """Return whether a file beside a photo is its depth, rather than something else about it, such as ``NAME.json``."""
+    """Return whether a file next to a photo is its depth, rather than something else about it, such as ``NAME.json``."""
     return file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)
 
 

@@ -41,9 +41,9 @@ log = logging.getLogger("bidnerf")
 CHANGED = {
     "views": "images, depth, masks or cameras than {trial.data} has now",
     "points": "depth points than {trial.depth_points} has now",
-    "surface": "surface than map {trial.map} has now, which was baked anew",
+    "surface": "surface than map {trial.map} has now, which was rebaked",
 }
-"""The meaning of a change in each digest of a trial's input, by the digest's name."""
+"""Meaning of a change in each digest of a trial's input, by the digest's name."""
 LIMITS: dict[str, Range] = {
     "trials": WholeNumbers(1, MOST_TRIALS),
     "seed": WholeNumbers(0, 2**31 - 1),
@@ -56,7 +56,8 @@ LIMITS: dict[str, Range] = {
 class Plan:
     """A set of trials to run. None selects the protocol's own sizes, number of trials and seed.
 
-    Raises ``InputError`` for an unknown protocol or fault, and for numbers that no map or dataset could make right.
+    Raises ``InputError`` for an unknown protocol or fault, and for numbers that are invalid for any map and
+    dataset.
     """
 
     map: str  # folder, demo:NAME, or a name for a map in memory
@@ -68,15 +69,17 @@ class Plan:
     trials: int | None = None  # of each size
     seed: int | None = None
     split: str = "test"
-    frames: tuple[str, ...] | None = None  # try these only
-    images: int = 1  # length of the sequence around the object that is localized at once
+    frames: tuple[str, ...] | None = None  # use only these
+    images: int = 1  # length of the sequence around the object that is localized jointly
     angle: float = 15.0  # degrees between neighbours of a sequence
     device: str = "cpu"
-    depth: bool = True  # whether the method gets the measured depth
+    depth: bool = True  # whether the method receives the measured depth
     depth_points: str | None = None  # see Trial
     masks: str | None = None  # see Trial
     mask_hides: HiddenColour = "black"
-    faults: tuple[str, ...] = (NO_FAULT,)  # see Trial; each is tried on the same frames from the same starts
+    faults: tuple[str, ...] = (
+        NO_FAULT,
+    )  # see Trial; each is applied to the same frames from the same starts
 
     def __post_init__(self) -> None:
         protocol = find_protocol(self.protocol)
@@ -93,9 +96,10 @@ class Plan:
 
 
 def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
-    """Return all trials in the order of the results. Raises ``InputError`` for a plan that cannot be carried out.
+    """Return all trials in the order of the results. Raises ``InputError`` for a plan that cannot be carried
+    out.
 
-    ``dataset`` is the one that the plan names; by default it is opened, and the map with it.
+    ``dataset`` is the one named by the plan; by default it is opened, and the map with it.
     """
     dataset = dataset or opened_for(plan)[1]
     protocol = find_protocol(plan.protocol)
@@ -105,13 +109,15 @@ def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
     check_depth(plan.faults, plan.depth)
     sizes = protocol.sizes if plan.sizes is None else plan.sizes
     if protocol.fixed and (plan.frames is not None or len(rigs) < len(names)):
-        raise InputError(f"protocol {plan.protocol!r} has its own frames, expected one image and all frames")
+        raise InputError(
+            f"protocol {plan.protocol!r} defines its own frames, expected one image and all frames"
+        )
     count = protocol.trials if plan.trials is None else plan.trials
     cases = protocol.cases(len(rigs), count, protocol.seed if plan.seed is None else plan.seed)
     if plan.trials is not None and len(cases) < plan.trials:
         log.info(
-            f"{amount(len(cases), 'trial')}, one a frame, in place of {plan.trials}: without a start, trying a frame again"
-            " tells nothing new"
+            f"{amount(len(cases), 'trial')}, one per frame, instead of {plan.trials}: without a start,"
+            " repeating a frame gives no new information"
         )
     return [
         Trial(
@@ -144,9 +150,11 @@ def changed_settings(method: str, settings: Any) -> str:
 
 
 def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None = None) -> list[Trial]:
-    """Return the trials whose results are not in the file. ``scene`` is their map and data, by default those they name.
+    """Return the trials without results in the file. ``scene`` is their map and data, by default those they
+    name.
 
-    Raises ``InputError`` where it holds a result from another training or surface of the map, other images or other settings.
+    Raises ``InputError`` if it holds a result from another training run or surface of the map, other images
+    or other settings.
     """
     _check_same([trial for trial in trials if key_of(trial) in file.results], file, scene)
     return [trial for trial in trials if key_of(trial) not in file.results]
@@ -174,11 +182,12 @@ def run_trials(
     cancel: Cancel | None = None,
     scene: Opened | None = None,
 ) -> None:
-    """Run the trials whose results ``file`` does not hold, and store each result when it is done.
+    """Run the trials without results in ``file``, and store each result as soon as it is available.
 
-    At most ``at_once`` trials are under way at once, so that a kill loses little. No trial begins once ``cancel``
-    returns True. A trial that fails ends the run with its error, after the results of the trials under way have been stored.
-    ``scene`` is the map and data of all trials, which an executor in this process can use; by default those they name.
+    At most ``at_once`` trials run concurrently, so that a kill loses little. No trial begins once ``cancel``
+    returns True. A trial that fails ends the run with its error, after the results of the running trials have
+    been stored. ``scene`` is the map and data of all trials, for an executor in this process; by default
+    those they name.
     """
     todo = left_to_do(trials, file, scene)
     waiting, under_way = iter(todo), set[Future[TrialResult]]()
@@ -208,26 +217,26 @@ def run_trials(
 
 
 def shard_of(trials: Sequence[Trial], number: int, shards: int) -> list[Trial]:
-    """Return part ``number`` of ``shards``, for one machine among several: every ``shards``-th trial."""
+    """Return part ``number`` of ``shards``, for one of several machines: every ``shards``-th trial."""
     if not 0 <= number < shards:
         raise InputError(f"shard is {number}, expected 0 to {shards - 1}")
     return list(trials[number::shards])
 
 
 def _check_same(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None) -> None:
-    """Raise ``InputError`` where a result in ``file`` came from other weights, settings or input than its trial has now."""
+    """Raise ``InputError`` if a result in ``file`` came from other weights, settings or input than its trial has now."""
     digests: dict[Any, dict[str, Any]] = {}
     for trial in trials:
         known = file.results[key_of(trial)]
         stored, dataset = scene or opened_for(trial)
-        advice = "name another --out, or remove the file to begin anew"
+        advice = "name another --out, or remove the file to start again"
         if known.weights != stored.training:
             raise InputError(
-                f"{file.path}: holds results of another training of map {trial.map} "
-                f"({known.weights}, expected {stored.training}); {advice}"
+                f"{file.path}: holds results of another training run of map {trial.map} ({known.weights},"
+                f" expected {stored.training}); {advice}"
             )
         _check_settings(trial, known, f"{file.path}: was made with {{}} {{}}, expected {{}}; {advice}")
-        if known.inputs is None:  # an earlier version did not record it
+        if known.inputs is None:  # not recorded by an earlier version
             continue
         seed = (
             None if trial.fault == NO_FAULT else trial.seed
@@ -244,7 +253,9 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None
 
 
 def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
-    """Raise ``InputError`` if a result was made with other settings; those that earlier versions lacked had their defaults."""
+    """Raise ``InputError`` if a result was made with other settings; settings unknown to earlier versions had
+    their defaults.
+    """
     usual = to_flat(find_method(trial.method).config_type())
     found = {RENAMED.get(name, name): value for name, value in known.settings.items()}
     for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
@@ -254,7 +265,7 @@ def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
 
 
 def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...]]:
-    """Return, for each frame that may be tried, the names of its views."""
+    """Return the names of the views for each frame that may be tried."""
     for name in plan.frames or ():
         if name not in names:
             raise InputError(f"{plan.data}: split {plan.split!r} has no frame {name!r}")

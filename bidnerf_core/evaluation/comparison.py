@@ -37,10 +37,10 @@ class MapRow:
 
     map: str  # the shortest name that is unique among the maps
     backend: str
-    weights: str  # identifies the training, see ``Map.training``
-    success: dict[str, Success | None]  # by criterion; None where it does not apply
+    weights: str  # identifies the training run, see ``Map.training``
+    success: dict[str, Success | None]  # by criterion; None if it does not apply
     unit: LengthUnit  # of the map
-    translation: float | None  # median of the final errors; None where most are not finite
+    translation: float | None  # median of the final errors; None if most are not finite
     rotation_deg: float | None
     steps: float  # median
     seconds: float  # median time of a trial
@@ -102,10 +102,11 @@ def compare_maps(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Comparison:
-    """Run the trials of each start, one map after another: a map without an entry in ``scenes`` in a process of its own.
+    """Run the trials of each start, one map after another; a map without an entry in ``scenes`` runs in its
+    own process.
 
-    Only one process works at a time, so that a change in the machine's load affects all maps alike. Raises ``Cancelled`` once
-    ``cancel`` returns True.
+    Only one process works at a time, so that a change in the machine's load affects all maps alike. Raises
+    ``Cancelled`` once ``cancel`` returns True.
     """
     done: list[list[Measured]] = [[] for _ in labels]
     with ExitStack() as stack:
@@ -130,7 +131,7 @@ def compare_maps(
 
 
 def _found(label: str, result: TrialResult) -> str:
-    """Return in words what a trial found."""
+    """Describe the outcome of a trial in words."""
     error = result.error
     off = (
         f"{error.translation:.3f} {symbol(result.unit)}, {error.rotation_deg:.2f} deg"
@@ -141,7 +142,7 @@ def _found(label: str, result: TrialResult) -> str:
 
 
 def map_row(label: str, size: int, measured: Sequence[Measured]) -> MapRow:
-    """Return the statistics of the trials on one map, which takes ``size`` bytes."""
+    """Return the statistics of the trials on one map whose size is ``size`` bytes."""
     results = [m.result for m in measured]
     found = summarize(results)
     return MapRow(
@@ -191,7 +192,7 @@ def _rate(row: MapRow, criterion: str) -> str:
 
 
 def _usual(row: MapRow) -> Success:
-    """Return the success by the relative criterion, or by the absolute one where there was no start."""
+    """Return the success by the relative criterion, or by the absolute one if there was no start."""
     success = row.success[RELATIVE] or row.success[ABSOLUTE]
     assert success is not None  # the absolute criterion always applies
     return success

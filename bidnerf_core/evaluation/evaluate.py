@@ -1,4 +1,4 @@
-"""Evaluation from Python: many localizations of one map as a table, and of several maps side by side."""
+"""Evaluation from Python: many localizations in one map as a table, and several maps side by side."""
 
 from __future__ import annotations
 
@@ -72,18 +72,18 @@ def evaluate(
     """Localize many frames of ``data`` in a map, from the starts of a protocol or from none, and return all results.
 
     ``protocol`` chooses frames, seeds and starts; ``sizes`` are the errors of the start in its units, ``trials`` is the number
-    of trials of each size, and None stands for the protocol's own. ``config`` holds the method's settings: an instance of its
+    of trials per size, and None stands for the protocol's own values. ``config`` holds the method's settings: an instance of their
     type, or a dictionary of those that differ from the defaults. ``faults`` are applied to the images, such as
-    ``"depth-scale:1.02"``. ``masks`` is a folder of masks of the images, in which ``mask_hides`` is the colour of what is not
-    used. ``device`` is that of a map that is read from a folder.
+    ``"depth-scale:1.02"``. ``masks`` is a folder of image masks, in which ``mask_hides`` is the colour that is ignored.
+    ``device`` is used for a map read from a folder.
 
-    ``out`` is a file of results: a trial that it holds is not run again, and each result is on disk before the next trial
-    begins, so that an evaluation that was interrupted or cancelled goes on with the same call. ``workers`` is the number of
-    processes (None: one a core); several need a map and data in folders, and a main module that can be imported, and know what
-    was registered only if its import registers it. With one, everything happens in the calling thread.
+    ``out`` is a results file: trials already in it are not run again, and each result is on disk before the next trial
+    begins, so that the same call resumes an evaluation that was interrupted or cancelled. ``workers`` is the number of
+    processes (None: one per core); more than one requires a map and data in folders and an importable main module, and finds
+    registered names only if importing that module registers them. With one, everything runs in the calling thread.
 
     Raises ``InputError`` for an evaluation that cannot be carried out, and ``Cancelled`` once ``cancel`` returns True and the
-    trials under way have ended.
+    running trials have ended.
     """
     for what, given in (("faults", faults), ("frames", frames), ("sizes", sizes)):
         refuse_text(what, given)
@@ -117,10 +117,11 @@ def run_plan(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> ResultTable:
-    """Run the trials of a plan, or one part of ``shards``, as ``evaluate`` does.
+    """Run the trials of a plan, or one of ``shards`` parts, as ``evaluate`` does.
 
-    ``scene`` is the map and the dataset in memory, by default those that the plan names. ``dask`` is the address of a scheduler
-    whose workers run the trials, and ``command`` is recorded beside the results as what made them.
+    ``scene`` is the map and the dataset in memory, by default those named by the plan. ``dask`` is the
+    address of a scheduler whose workers run the trials, and ``command`` is recorded next to the results as
+    their origin.
     """
     if dask is not None and workers not in (1, None):
         raise InputError("workers and dask contradict each other: a cluster has its own workers")
@@ -143,8 +144,8 @@ def run_plan(
                     run_trials(todo, file, executor, at_once, progress, cancel, here)
                 except BrokenProcessPool as error:
                     raise InputError(
-                        f"a worker process ended by itself (is there enough memory for {at_once} of them?); "
-                        f"finished trials are kept{_where(file)}, the same command goes on"
+                        f"a worker process died (is there enough memory for {at_once} of them?); finished"
+                        f" trials are kept{_where(file)}, the same command resumes"
                     ) from error
             _check_complete(trials, file)
         file.put_in_order(trials)
@@ -170,11 +171,12 @@ def compare(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Comparison:
-    """Localize the same frames from the same starts in several maps, and return success and cost of each.
+    """Localize the same frames from the same starts in several maps, and return the success and cost of each.
 
-    Arguments are as for ``evaluate``, with one size. ``scenes`` may be a dictionary, whose keys then name the maps. Maps in
-    folders are tried in a process each, of which the peak memory is measured; maps in memory, and all maps where the data is in
-    memory, are tried in this process. One trial runs at a time. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
+    Arguments are as for ``evaluate``, with one size. ``scenes`` may be a dictionary, whose keys then name the
+    maps. Maps in folders run in a process each, whose peak memory is measured; maps in memory, and all maps
+    if the data is in memory, run in this process. One trial runs at a time. Raises ``InputError`` and
+    ``Cancelled`` as ``evaluate`` does.
     """
     refuse_text("frames", frames)
     plan = Plan(
@@ -195,9 +197,9 @@ def run_comparison(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Comparison:
-    """Run a plan of one size on each of several maps, as ``compare`` does; its own map is not used.
+    """Run a plan of one size on each of several maps, as ``compare`` does; the plan's own map is ignored.
 
-    ``data`` are by default those that the plan names.
+    ``data`` defaults to the data named by the plan.
     """
     if isinstance(scenes, str | Path | Map):
         raise InputError(
@@ -229,7 +231,7 @@ def run_comparison(
 
 @dataclass(frozen=True, eq=False)
 class _GivenViews:
-    """Posed images in memory as a ``Dataset`` whose every split holds all of them."""
+    """Posed images in memory as a ``Dataset``; every split contains all of them."""
 
     given: tuple[View, ...]
     path: Path = Path("views")
@@ -248,7 +250,7 @@ class _GivenViews:
 
 
 def _note_kept(trials: Sequence[Trial], todo: Sequence[Trial], file: ResultsFile) -> None:
-    """Log how many trials are not run again, and how many results cannot be checked, because an earlier version wrote them."""
+    """Log how many trials are not run again, and how many results of an earlier version cannot be checked."""
     if len(todo) < len(trials):
         log.info("%s: %d of %d trials are already there", file.path, len(trials) - len(todo), len(trials))
     known = [file.results.get(key_of(trial)) for trial in trials]
@@ -260,13 +262,11 @@ def _note_kept(trials: Sequence[Trial], todo: Sequence[Trial], file: ResultsFile
 
 
 def _check_complete(trials: Sequence[Trial], file: ResultsFile) -> None:
-    """Raise ``Cancelled`` where trials have no result, which happens only if they were not begun."""
+    """Raise ``Cancelled`` if trials have no result, which happens only if they were not started."""
     left = sum(key_of(trial) not in file.results for trial in trials)
     if left:
         are = "is" if left == 1 else "are"
-        kept = (
-            "nothing is kept without a file of results" if file.path is None else "the same command goes on"
-        )
+        kept = "nothing is kept without a results file" if file.path is None else "the same command resumes"
         raise Cancelled(f"stopped; {amount(left, 'trial')} {are} left{_where(file)}, {kept}")
 
 
@@ -293,18 +293,18 @@ def _in_memory(data: Dataset | Sequence[View]) -> Dataset:
     if not views or len(views) < len(data):
         raise InputError(f"data is a {type(data).__name__}, expected a folder, a dataset or a list of views")
     name, count = Counter(view.frame.name for view in views).most_common(1)[0]
-    if count > 1:  # trials know their frames by name
-        raise InputError(f"data holds {count} frames called {name!r}, expected names that differ")
+    if count > 1:  # trials identify their frames by name
+        raise InputError(f"data holds {count} frames named {name!r}, expected different names")
     return _GivenViews(views)
 
 
 def _device(scene: Scene, asked: str) -> str:
-    """Return the device on which a map computes: that of a map in memory, else the one that is asked for."""
+    """Return the device on which a map computes: that of a map in memory, else the requested one."""
     return str(device_of(scene.field)) if isinstance(scene, Map) else asked
 
 
 def _name(value: Scene | Data) -> str:
-    """Return the name under which results know a map or a dataset: its folder, or the backend of a map in memory."""
+    """Return the name of a map or dataset in results: its folder, or the backend of a map in memory."""
     if isinstance(value, Map):
         return value.info.backend
     if isinstance(value, str | Path):
@@ -313,7 +313,7 @@ def _name(value: Scene | Data) -> str:
 
 
 def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:
-    """Return the maps by the shortest names that distinguish them; maps in memory of one backend are numbered."""
+    """Return the maps by the shortest names that distinguish them; maps in memory with the same backend are numbered."""
     folders = [str(scene) for scene in scenes if not isinstance(scene, Map)]
     if len({Path(folder).resolve() for folder in folders}) != len(folders):
         raise InputError(f"maps: {', '.join(folders)}: one is named twice, expected different ones")

@@ -14,10 +14,10 @@ from bidnerf_core.io.json import parse_json
 
 @dataclass(frozen=True)
 class Situation:
-    """The map, the images and the starts of some trials. ``size`` is None where trials of all sizes are pooled."""
+    """The map, the images and the starts of some trials. ``size`` is None if trials of all sizes are pooled."""
 
     map: str
-    weights: str  # identifies the training, see ``Map.training``
+    weights: str  # identifies the training run, see ``Map.training``
     data: str
     split: str
     protocol: str
@@ -26,7 +26,7 @@ class Situation:
 
     @property
     def start(self) -> str:
-        """The start in words, with the faults of the images if there are any."""
+        """The start in words, with the image faults if any."""
         words = "no start" if self.protocol == "none" else self.protocol
         if self.size is None:
             words += ", all sizes"
@@ -86,7 +86,7 @@ def situations(groups: Sequence[Group]) -> list[Situation]:
 
 
 def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
-    """Return a title for each situation: its start, preceded by the map and the data unless all share these."""
+    """Return a title for each situation: its start, preceded by the map and data unless all situations share these."""
     maps = {situation.map for situation in every}
     trainings = {(situation.map, situation.weights) for situation in every}
     datasets = {(situation.data, situation.split) for situation in every}
@@ -101,7 +101,7 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
 
 
 def situation_of(result: TrialResult) -> Situation:
-    """Return the situation to which a trial belongs."""
+    """Return the situation of a trial."""
     trial = result.trial
     return Situation(
         trial.map, result.weights, trial.data, trial.split, trial.protocol, trial.size, trial.fault
@@ -109,7 +109,7 @@ def situation_of(result: TrialResult) -> Situation:
 
 
 def condition_of(result: TrialResult) -> Condition:
-    """Return the condition to which a trial belongs."""
+    """Return the condition of a trial."""
     trial, settings = result.trial, json.dumps(result.settings, sort_keys=True)
     images = len(trial.frames)
     return Condition(

@@ -1,7 +1,7 @@
 """Append-only files of one JSON object per line, which stay valid if the process is killed at any moment.
 
-A line is on disk before its work counts as done. An incomplete last line, left by a kill, is cut off when the file is next
-opened. Anything else that is not JSON raises an error that names the line, and is never deleted.
+A line is on disk before its work counts as done. An incomplete last line, left by a kill, is removed when the
+file is next opened. Anything else that is not JSON raises an error that names the line, and is never deleted.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ LARGEST_LINES = 512 * 2**20
 class LineFormat:
     """The format of a JSON Lines file: the beginning of each line, and a description of the content for error messages.
 
-    An incomplete last line is dropped only if it begins as expected; otherwise it is an error, so no foreign file is truncated.
+    An incomplete last line is dropped only if it begins as expected; otherwise it is an error, so no
+    unrelated file is truncated.
     """
 
     opening: bytes
     expected: str  # the end of the error message about any other line
 
     def parse(self, path: Path, content: bytes) -> tuple[list[tuple[str, Any]], int]:
-        """Return the place (for messages) and the object of each line, and the number of bytes in complete lines."""
+        """Return the location (for messages) and the object of each line, and the number of bytes in complete lines."""
         lines, found, length = content.split(b"\n"), [], 0
         for number, line in enumerate(lines, start=1):
             where = f"{path}: line {number}"
@@ -49,7 +50,9 @@ class LineFormat:
         return found, length
 
     def read(self, path: Path) -> list[tuple[str, Any]]:
-        """Return the place and the object of each complete line of ``path``. Raises ``InputError`` if it cannot be read."""
+        """Return the location and object of each complete line of ``path``. Raises ``InputError`` if it
+        cannot be read.
+        """
         return self.parse(path, read_file(path, self.expected, LARGEST_LINES))[0]
 
 
@@ -61,7 +64,7 @@ class JsonLinesFile:
         self._file: BinaryIO | None = None
 
     def open(self) -> list[tuple[str, Any]]:
-        """Create and lock the file; return the place and the object of each line. ``repair`` makes it fit to be written."""
+        """Create and lock the file; return the location and object of each line. Call ``repair`` before writing."""
         self._file = self._locked()
         try:
             content = read_open_file(self._file, self.path, self._kind.expected, LARGEST_LINES)
@@ -73,7 +76,7 @@ class JsonLinesFile:
         return found
 
     def repair(self) -> None:
-        """Remove an incomplete last line, and end the last complete one with a newline."""
+        """Remove an incomplete last line, and terminate the last complete one with a newline."""
         file, whole, content = self._opened(), self._whole, self._content
         if whole < len(content):
             file.truncate(whole)
@@ -87,7 +90,7 @@ class JsonLinesFile:
             self._file = None
 
     def append(self, plain: Any) -> None:
-        """Write one line, which is on disk when this returns. Raises ``InputError`` where the file was removed."""
+        """Write one line, which is on disk when this returns. Raises ``InputError`` if the file was removed."""
         file = self._opened()
         self.check_there()
         file.write(as_line(plain))
@@ -102,15 +105,15 @@ class JsonLinesFile:
         self._file = self._locked()
 
     def check_there(self) -> None:
-        """Raise ``InputError`` where the path no longer names the open file, so that lines would be lost unnoticed."""
+        """Raise ``InputError`` if the path no longer names the open file, since lines would be lost unnoticed."""
         try:
             same = os.path.samestat(os.fstat(self._opened().fileno()), self.path.stat())
         except FileNotFoundError:
             same = False
         if not same:
             raise InputError(
-                f"{self.path}: was removed or replaced while it was written, and what it held is gone with it; "
-                "begin again, or move the file back where it was"
+                f"{self.path}: was removed or replaced while it was being written, so its content is lost;"
+                " start again, or move the file back"
             )
 
     def _opened(self) -> BinaryIO:
@@ -130,18 +133,18 @@ class JsonLinesFile:
             raise InputError(f"{self.path}: cannot be written ({error.strerror}), expected a file") from error
         if not take_lock(file.fileno()):
             file.close()
-            raise FileInUse(f"{self.path}: another process is writing it; name another --out")
+            raise FileInUse(f"{self.path}: another process is writing to it; name another --out")
         file.seek(0)
         return file
 
 
 class RowStore:
-    """A file of results by key, from which an interrupted script resumes. Use it as a context manager.
+    """A file of results by key, which lets an interrupted script resume. Use it as a context manager.
 
     Each row is computed once and stored as a line ``{"key": KEY, "row": ROW}``.
     """
 
-    FORMAT = LineFormat(b'{"key": ', "lines as a benchmark keeps its rows")
+    FORMAT = LineFormat(b'{"key": ', "lines in the format of benchmark rows")
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,6 +1,6 @@
-"""The pictures of an evaluation: of results by situation, of faults by size, of maps side by side, and of single trials.
+"""The figures of an evaluation: results by situation, faults by size, maps side by side, and single trials.
 
-In a report there is one panel per situation, and a condition has the same colour in all figures.
+A report has one panel per situation, and a condition has the same colour in all figures.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ from bidnerf_core.results.plot_style import (
 )
 
 COLUMNS, PANEL = 3, (3.6, 2.7)  # inches
-LABEL = 5.0  # inches: width of the labels of lines
+LABEL = 5.0  # inches: width of the line labels
 PER_INCH = 13
-"""Number of characters of an inch of text, on average."""
+"""Average number of characters per inch of text."""
 MOST_LINES, MOST_PANELS = 150, 48
-"""Maximum numbers of groups and of panels in a figure; larger pictures can neither be drawn nor read."""
+"""Maximum numbers of groups and of panels in a figure; larger figures can be neither drawn nor read."""
 DrawPanel = Callable[[Any, list[Group]], None]
 
 
@@ -74,13 +74,13 @@ class Figures:
 
     @property
     def omitted(self) -> str:
-        """A sentence about what is not drawn; empty where everything is."""
+        """A sentence about what is not drawn; empty if everything is."""
         places = situations(self.groups)
         if len(self.groups) <= MOST_LINES and len(places) <= MOST_PANELS:
             return ""
         return (
-            f" Drawn are at most {MOST_LINES} of {len(self.groups)} groups and {MOST_PANELS} of {len(places)} situations; "
-            "the tables have all."
+            f"At most {MOST_LINES} of {len(self.groups)} groups and {MOST_PANELS} of {len(places)}"
+            " situations are drawn; the tables have all."
         )
 
     def rates(self) -> Path:
@@ -120,7 +120,7 @@ class Figures:
         return self._panels("steps", draw, title_pad=15)
 
     def share(self) -> Path:
-        """Draw, for each step, the share of trials that meet the criterion from then on."""
+        """Draw, for each step, the fraction of trials that meet the criterion from then on."""
 
         def draw(panel: Any, groups: list[Group]) -> None:
             last = max(1, *(result.steps for group in groups for result in group.results))
@@ -136,7 +136,7 @@ class Figures:
         return self._panels("share", draw)
 
     def traces(self, kind: str) -> Path:
-        """Draw median and quartiles of the error after each step. ``kind`` is "translation" or "rotation_deg"."""
+        """Draw the median and quartiles of the error after each step. ``kind`` is "translation" or "rotation_deg"."""
         length = unit_of([result for group in self.groups for result in group.results])
         unit, bar = {"translation": (length, 0.05), "rotation_deg": ("degrees", 5.0)}[kind]
 
@@ -166,7 +166,9 @@ class Figures:
         sharey: bool = False,
         groups: Sequence[Group] | None = None,
     ) -> Path:
-        """Draw one panel per situation of ``groups`` (by default those to which the criterion applies), and a legend below."""
+        """Draw one panel per situation of ``groups`` (by default those to which the criterion applies), and a
+        legend below.
+        """
         fitting = [group for group in self.without_faults if applies(self.criterion, group.results)]
         shown = fitting if groups is None else groups
         places = situations(shown)[:MOST_PANELS]
@@ -223,7 +225,7 @@ class Figures:
             [steps], positions=[place], widths=0.5, showfliers=False, medianprops={**line, "linewidth": 2},
             boxprops=line, whiskerprops=line, capprops=line,
         )  # fmt: skip
-        beside = place + 0.16 * np.sin(2.4 * np.arange(len(steps)))  # apart, and the same each time
+        beside = place + 0.16 * np.sin(2.4 * np.arange(len(steps)))  # spread out, and the same each time
         panel.plot(beside, steps, "o", color=colour, markersize=3.5, alpha=0.5, markeredgewidth=0, zorder=3)
 
     def _look(self, group: Group) -> dict[str, Any]:
@@ -235,7 +237,7 @@ class Figures:
 
 
 def _wrapped(text: str, width: float, lines: int = 4) -> str:
-    """Return text in lines of a width (inches), cut where there are more than ``lines`` of them."""
+    """Wrap text to a width (inches), truncated to ``lines`` lines."""
     return "\n".join(textwrap.wrap(text, int(width * PER_INCH), max_lines=lines, placeholder=" ...")) or text
 
 
@@ -249,14 +251,14 @@ def _lines(groups: Sequence[Group]) -> list[float]:
 
 
 def _quartiles(errors: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "3 s"]:
-    """Return the quartiles over the trials whose pose was finite, NaN where none was."""
+    """Return the quartiles over the trials whose pose was finite, NaN if none was."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.nanpercentile(errors, (25, 50, 75), axis=0)
 
 
 def _table(group: Group, kind: str) -> Float[np.ndarray, "n s"]:
-    """Return errors (trials, steps); where a trial ended early, its last error is repeated."""
+    """Return errors (trials, steps); if a trial ended early, its last error is repeated."""
     rows = [
         np.array([np.nan if x is None else x for x in getattr(result.errors, kind)])
         for result in group.results
@@ -272,7 +274,7 @@ DRAWN_SHARES: dict[str, tuple[Callable[[TrialResult], bool], str]] = {
     "converged": (lambda result: result.converged, COLOURS[0]),
     "converged, but wrong": (lambda result: result.converged and not succeeded(result), COLOURS[1]),
 }
-"""The lines of a panel: which trials each counts, and a colour."""
+"""The lines of a panel: which trials each counts, and its colour."""
 
 
 @dataclass(frozen=True)
@@ -309,7 +311,7 @@ def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
 def draw_faults(groups: Sequence[Group], folder: Path) -> Path | None:
     """Draw a panel for each curve with Wilson intervals, as PNG and SVG in ``folder``; return the SVG's path.
 
-    Returns None where no fault was tried on its own. Raises ``InputError`` without matplotlib.
+    Returns None if no fault was tried on its own. Raises ``InputError`` without matplotlib.
     """
     curves = fault_curves(groups)[:MOST_PANELS]
     if not curves:
@@ -373,9 +375,10 @@ COSTS: dict[str, Callable[[MapRow], float]] = {
 
 
 def comparison_figure(paths: Sequence[Path], comparison: Comparison) -> None:
-    """Draw success with Wilson intervals, time to success and four costs, one colour per map; suffixes give the formats.
+    """Draw success with Wilson intervals, time to success and four costs, one colour per map; suffixes give
+    the formats.
 
-    Raises ``InputError`` where matplotlib, which is optional, is missing.
+    Raises ``InputError`` if matplotlib, which is optional, is missing.
     """
     with styled():
         figure = new_figure(11, 6.4)
@@ -419,7 +422,7 @@ def _draw_success(axes: Any, comparison: Comparison) -> None:
 
 
 def _draw_times(axes: Any, comparison: Comparison) -> None:
-    """Draw the share of trials that have met the usual criterion as a function of time."""
+    """Draw the fraction of trials that have met the default criterion as a function of time."""
     criterion = usual_criterion([result for results in comparison.results for result in results])
     for place, (row, results) in enumerate(zip(comparison.rows, comparison.results, strict=True)):
         times = seconds_to_success(results, criterion)
@@ -436,7 +439,7 @@ def _draw_times(axes: Any, comparison: Comparison) -> None:
 def _draw_cost(
     axes: Any, rows: Sequence[MapRow], name: str, cost: Callable[[MapRow], float], named: bool
 ) -> None:
-    """Draw a horizontal bar for each map, the first at the top, with its value beside it."""
+    """Draw a horizontal bar for each map, the first at the top, with its value next to it."""
     places, values = range(len(rows)), [cost(row) for row in rows]
     bars = axes.barh(places, values, 0.7, color=[_colour(place) for place in places])
     axes.bar_label(bars, [f"{value:.3g}" for value in values], padding=3, fontsize="small")
@@ -455,7 +458,7 @@ def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
     Entry 0 of a trace is the start. Values without a logarithm leave a gap. Raises ``InputError`` without matplotlib.
     """
     if not traces:
-        raise InputError(f"{path}: a plot of no traces")
+        raise InputError(f"{path}: no traces to plot")
     with styled():
         figure = new_figure(9, 3.6)
         left, right = figure.subplots(1, 2)

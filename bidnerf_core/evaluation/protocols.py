@@ -1,4 +1,4 @@
-"""Protocols, which choose frames, seeds and starts; their choices are reproducible from a seed alone.
+"""Protocols, which choose frames, seeds and starts, reproducibly from a seed.
 
 ``PROTOCOLS`` holds them by name.
 """
@@ -24,8 +24,8 @@ SMALLEST_E_T, LARGEST_E_T = 0.5, 3.4
 def bid_start(T_true: SE3, size: float, seed: int) -> SE3:
     """Return the start of BID-NeRF, ``T_true exp((e_t u1, e_r u2))`` with random unit u1, u2 and e_t = ``size``.
 
-    The paper does not say which e_r goes with which e_t, only that errors stay under 45 degrees: here e_r grows linearly
-    from 0.2 rad at e_t = 0.5 to pi/4 at 3.4.
+    The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees: here e_r
+    grows linearly from 0.2 rad at e_t = 0.5 to pi/4 at 3.4.
     """
     return _bid(T_true, size, math.pi / 4, seed)
 
@@ -105,10 +105,11 @@ def draw_starts(frames: int) -> Drawn:
 
 
 def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-    """Return the index of the frame and the seed of each trial; 1234 is the first of the 25."""
+    """Return the frame index and the seed of each trial; 1234 is the first of the 25."""
     if seed != PARALLEL_SEED or trials > PARALLEL_TRIALS:
         raise InputError(
-            f"parallel: {trials} trials from seed {seed}, expected {PARALLEL_TRIALS} at most from seed {PARALLEL_SEED}: it is a fixed list"
+            f"parallel: {trials} trials from seed {seed}, expected at most {PARALLEL_TRIALS} from seed"
+            f" {PARALLEL_SEED}, since the list is fixed"
         )
     chosen = draw_starts(frames)[0]
     return [(int(chosen[i // STARTS]), PARALLEL_SEED + i) for i in range(trials)]
@@ -141,7 +142,7 @@ FARTHEST_START = 1e6
 """The largest translation error of a start, metres."""
 
 MOST_TRIALS = 100_000
-"""The maximum number of trials of one size, since all trials of a plan are in memory."""
+"""The maximum number of trials per size, since all trials of a plan are in memory."""
 
 Case = tuple[int, int]
 """The index of a frame in its split, and the seed of a trial on it."""
@@ -149,13 +150,15 @@ Case = tuple[int, int]
 
 @dataclass(frozen=True)
 class Protocol:
-    """A way to choose frames, seeds and starts. ``start`` takes the true pose, a size, the seed and the number of frames."""
+    """A way of choosing frames, seeds and starts. ``start`` takes the true pose, a size, the seed and the
+    number of frames.
+    """
 
     summary: str
     start: Callable[[SE3, Size, int, int], SE3 | None]
-    sizes: tuple[Size, ...] = ((),)  # tried by default
-    units: tuple[str, ...] = ()  # units of the numbers that make a size
-    trials: int = 24  # of each size, by default
+    sizes: tuple[Size, ...] = ((),)  # used by default
+    units: tuple[str, ...] = ()  # units of the numbers in a size
+    trials: int = 24  # per size, by default
     seed: int = 0
     plan: Callable[[int, int, int], list[Case]] | None = (
         None  # takes the numbers of frames and trials, and the seed
@@ -163,18 +166,18 @@ class Protocol:
     fixed: bool = False  # whether it always chooses from all frames of a split
 
     def cases(self, frames: int, trials: int, seed: int) -> list[Case]:
-        """Return the cases of one size. A larger number of trials begins with the same cases."""
+        """Return the cases for one size. A larger number of trials begins with the same cases."""
         if frames < 1:
             raise InputError("nothing to try: expected at least one frame")
         if trials > MOST_TRIALS:
-            raise InputError(f"{trials} trials, expected at most {MOST_TRIALS} of each size")
+            raise InputError(f"{trials} trials, expected at most {MOST_TRIALS} per size")
         return (self.plan or each_in_turn)(frames, trials, seed)
 
     def check_size(self, size: Size) -> None:
         """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
         most = [180.0 if "deg" in unit else FARTHEST_START for unit in self.units]
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
-            expected = " : ".join(self.units) or "none, for it has no sizes"
+            expected = " : ".join(self.units) or "none, since it has no sizes"
             limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
             raise InputError(
                 f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}, expected {expected}{limits}"
@@ -188,7 +191,7 @@ def each_in_turn(frames: int, trials: int, seed: int) -> list[Case]:
 
 
 def once_each(frames: int, trials: int, seed: int) -> list[Case]:
-    """Return as many frames as there are to be trials, each once, in random order; every trial has its own seed."""
+    """Return as many distinct frames as trials were requested, in random order; every trial has its own seed."""
     return each_in_turn(frames, min(trials, frames), seed)
 
 
@@ -213,13 +216,13 @@ PROTOCOLS = {
         ("e_t (m)",),
     ),
     "bid-hard": Protocol(
-        "as bid, with rotations up to 1.4 rad",
+        "like bid, with rotations up to 1.4 rad",
         lambda T_true, size, seed, frames: bid_hard_start(T_true, size[0], seed),
         ((0.5,), (0.8,), (1.2,)),
         ("e_t (m)",),
     ),
     "inerf": Protocol(
-        "iNeRF: up to 40 degrees about a random axis and up to 0.2 along each axis; five starts a frame",
+        "iNeRF: up to 40 degrees about a random axis and up to 0.2 along each axis; five starts per frame",
         lambda T_true, size, seed, frames: inerf_start(T_true, seed),
         trials=25,
         plan=five_of_each,
@@ -239,7 +242,7 @@ PROTOCOLS = {
         ("metres", "degrees"),
     ),
     "none": Protocol(
-        "no start at all; one trial a frame",
+        "no start at all; one trial per frame",
         lambda T_true, size, seed, frames: None,
         plan=once_each,
     ),

@@ -1,4 +1,4 @@
-"""The provenance that is needed to reproduce results (command, code and machine), and records that include it."""
+"""The provenance needed to reproduce results (command, code and machine), and records that include it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
 SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
 """Folders in which uncommitted changes make a run irreproducible from its commit."""
 LINE = 120
-"""Columns of a record's lines: nested values that fit are written on one."""
+"""Columns per line of a record: nested values that fit are written on one line."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Provenance:
     date: str  # UTC, when it began
     command: str
     commit: str | None  # of the checkout that the code was run from
-    dirty: bool  # whether files of that checkout had changes
+    dirty: bool  # whether files of that checkout were modified
     cpu: str
     cores: int | None
     gpu: str | None
@@ -71,30 +71,30 @@ def command_line(name: str, arguments: list[str]) -> str:
 
 
 def beside(results: Path) -> Path:
-    """Return the path of the file that lists the runs behind a file of results."""
+    """Return the path of the file that lists the runs behind a results file."""
     return results.with_suffix(".meta.json")
 
 
 def note_run(results: Path, run: Provenance) -> None:
-    """Add a run to the list that accompanies a file of results, which may take several runs to complete."""
+    """Add a run to the list next to a results file, which may take several runs to complete."""
     runs = [*read_runs(results), run]
     write_file(beside(results), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
 
 
 def read_runs(results: Path) -> list[Provenance]:
-    """Return the runs behind a file of results, first to last; empty if no list accompanies it."""
+    """Return the runs behind a results file, in order; empty if there is no list next to it."""
     path = beside(results)
     if not path.is_file():
         return []
-    expected = "what 'bidnerf evaluate' writes beside its results"
+    expected = "the list that 'bidnerf evaluate' writes next to its results"
     runs = read_record(path, expected).items("runs")
     if runs is None:
-        raise InputError(f"{path}: no list of runs, expected {expected}")
+        raise InputError(f"{path}: not a list of runs, expected {expected}")
     return [from_plain(Provenance, run, str(path)) for run in runs]
 
 
 def git(*arguments: str) -> str:
-    """Return the output of a git command in this package's checkout; empty where there is no checkout or no git."""
+    """Return the output of a git command in this package's checkout; empty if there is no checkout or no git."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
     if not (root / ".git").exists():  # installed, perhaps inside another project
         return ""
@@ -132,15 +132,16 @@ def _version(name: str) -> str | None:
 
 
 def script_command() -> str:
-    """Return the command of the running script; paths are relative to the checkout, or only names outside of it."""
+    """Return the command of the running script; paths are relative to the checkout, or only names outside it."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
     return shlex.join(["python", *(_without_local_path(word, root) for word in sys.argv)])
 
 
 def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
-    """Write the results of a benchmark script with its provenance to ``path``, a JSON file, and return the path.
+    """Write the results of a benchmark script with its provenance to ``path``, a JSON file, and return the
+    path.
 
-    Raises ``ValueError`` where ``results`` hold values that strict JSON cannot represent.
+    Raises ``ValueError`` if ``results`` contain values that strict JSON cannot represent.
     """
     threads = torch.get_num_threads()
     run = provenance(script_command(), f"one process of {threads} thread{'s' if threads > 1 else ''}")
@@ -152,7 +153,7 @@ def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
 
 
 def _in_lines(value: Any, indent: str = "") -> str:
-    """Return a value as JSON, with each object or list on one line where it fits into ``LINE`` columns."""
+    """Return a value as JSON, with each object or list on one line if it fits into ``LINE`` columns."""
     line = json.dumps(value, allow_nan=False)
     if len(indent) + len(line) <= LINE or not value or not isinstance(value, (dict, list, tuple)):
         return line

@@ -34,17 +34,17 @@ from bidnerf_core.results.plot_style import CRITERION_NAMES, require_matplotlib
 
 TEMPLATE = "report.html.jinja"
 MARK = '<meta name="generator" content="bidnerf report">'
-"""The mark of a page as a report, which a later report may replace."""
+"""Marks a page as a report, which a later report may replace."""
 UNFINISHED = (
-    f"<!doctype html>{MARK}<title>Unfinished report</title>"
-    "<p>This report was interrupted; the same command writes it again.</p>\n"
+    f"<!doctype html>{MARK}<title>Unfinished report</title><p>This report was interrupted; the same command"
+    " rewrites it.</p>\n"
 )
 LISTED_FRAMES = 100
-"""Frames that a report lists with links to the page of a map."""
+"""Number of frames that a report lists with links to the page of a map."""
 LENGTH_OF_HEAD = 4096  # bytes at the beginning of a page that contain the mark of a report
 FAULT_CAPTION = (
-    "Trials by fault of the images and its size, with Wilson's 95 % intervals: right (within 5 degrees and 0.05 units), "
-    "converged by the method's own judgement, and converged but wrong."
+    "Trials by fault of the images and its size, with Wilson's 95 % intervals: right (within 5 degrees and"
+    " 0.05 units), converged according to the method itself, and converged but wrong."
 )
 
 
@@ -57,7 +57,7 @@ class Figure:
 
     @property
     def base64(self) -> str:
-        """The content of the file, as a page can hold it."""
+        """The content of the file, encoded for embedding in a page."""
         return base64.b64encode(self.file.read_bytes()).decode()
 
 
@@ -71,10 +71,10 @@ def write_report(
 ) -> Path:
     """Write ``index.html``, and its figures as PNG and SVG, to ``folder``, and return the path of the page.
 
-    ``criterion`` is the one of ``CRITERIA`` that is shown where there is room for only one. ``runs`` has the name of each file
-    of results and the runs that made it. ``view`` is the address of a page of ``bidnerf view --results``, to whose frames
-    the report links. An earlier report in the folder is replaced. Raises ``InputError`` without results or
-    matplotlib, and for a folder that holds anything but a report.
+    ``criterion`` is the one of ``CRITERIA`` used where only one is shown. ``runs`` has the name of each
+    results file and the runs that made it. ``view`` is the address of a page of ``bidnerf view --results``,
+    to whose frames the report links. An earlier report in the folder is replaced. Raises ``InputError``
+    without results or matplotlib, and for a folder that holds anything but a report.
     """
     if not table.rows:
         raise InputError("no finished trial, nothing to report")
@@ -84,7 +84,7 @@ def write_report(
     _check_ours(folder)
     path = folder / "index.html"
     with output_folder(folder, overwrite=True):
-        if not path.exists():  # so that an interrupted report is recognised as one
+        if not path.exists():  # so that an interrupted report is recognized as one
             write_file(path, UNFINISHED.encode())
         figures = draw_figures(table.groups, folder, chosen)
         write_file(path, page(title, table, figures, runs, chosen, view).encode())
@@ -92,14 +92,15 @@ def write_report(
 
 
 def chosen_criterion(asked: str | None, groups: Sequence[Group]) -> str:
-    """Return the criterion to show where only one is shown. Raises ``InputError`` for one that applies to no trial."""
+    """Return the criterion to use where only one is shown. Raises ``InputError`` for one that applies to no trial."""
     if asked is None:
         return usual_criterion([result for group in groups for result in group.results])
     if asked not in CRITERIA:
         raise InputError(f"criterion is {asked!r}, expected one of {', '.join(CRITERIA)}")
     if not any(applies(asked, group.results) for group in groups):
         raise InputError(
-            f"criterion is {asked}, a share of the start's error, and no trial had a start; expected 5deg 0.05 or 1deg 0.02"
+            f"criterion is {asked}, relative to the start's error, but no trial had a start; expected 5deg"
+            " 0.05 or 1deg 0.02"
         )
     return asked
 
@@ -122,7 +123,7 @@ def draw_figures(groups: Sequence[Group], folder: Path, criterion: str) -> list[
         ),
         Figure(
             figures.share(),
-            f"Share of all trials that meet the criterion ({success}) from each step on.{omitted}{cut}",
+            f"Fraction of all trials that meet the criterion ({success}) from each step on.{omitted}{cut}",
         ),
         Figure(
             figures.traces("translation"),
@@ -143,7 +144,7 @@ def page(
     criterion: str,
     view: str | None = None,
 ) -> str:
-    """Return the HTML of a report."""
+    """Return a report as HTML."""
     environment = Environment(
         autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True
     )
@@ -179,7 +180,7 @@ def page(
 
 
 def doubtful(rows: Sequence[TrialResult]) -> list[TrialResult]:
-    """Return the trials that were accepted although they are wrong (beyond 5 degrees or 0.05 units), then the refused ones."""
+    """Return the trials that were accepted although wrong (beyond 5 degrees or 0.05 units), then the rejected ones."""
 
     def is_wrong(row: TrialResult) -> bool:
         return row.error is None or row.error.translation > 0.05 or row.error.rotation_deg > 5
@@ -189,7 +190,7 @@ def doubtful(rows: Sequence[TrialResult]) -> list[TrialResult]:
 
 
 def _printed(value: Any) -> Any:
-    """Return text without characters that a browser or a terminal would obey; markup of the template is left alone."""
+    """Return text without characters that a browser or a terminal would interpret; markup of the template is kept."""
     return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
@@ -214,7 +215,7 @@ def _commands(runs: Sequence[Provenance]) -> list[str]:
 
 
 def _facts(name: str, runs: Sequence[Provenance]) -> dict[str, str]:
-    """Return how a file of results was made, by the name of each fact; empty where that is not recorded."""
+    """Return how a results file was made, by the name of each fact; empty if that is not recorded."""
     if not runs:
         return {}
     last = runs[-1]
@@ -241,7 +242,7 @@ def _machine(run: Provenance) -> str:
 
 
 def _check_ours(folder: Path) -> None:
-    """Raise ``InputError`` where a folder holds anything but a report, which a newer report may replace."""
+    """Raise ``InputError`` if a folder holds anything but a report, which a newer report may replace."""
     try:
         with open_binary(folder / "index.html", "the page of a report") as file:
             written = MARK.encode() in file.read(LENGTH_OF_HEAD)
@@ -249,5 +250,5 @@ def _check_ours(folder: Path) -> None:
         written = False
     if folder.is_dir() and not written and not all(is_temporary(file.name) for file in folder.iterdir()):
         raise InputError(
-            f"{folder}: holds something that is no report of bidnerf's; name another --out or remove it"
+            f"{folder}: holds something other than a bidnerf report; name another --out or remove it"
         )

@@ -1,4 +1,6 @@
-"""Results of trials: a table in memory, and a file of one JSON line per trial, each on disk before its trial counts as done."""
+"""Trial results: a table in memory, and a file of one JSON line per trial, each on disk before its trial
+counts as done.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +23,16 @@ from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.results.errors import CRITERIA
 
 Key: TypeAlias = str
-"""The identity of a trial, independent of where its folders are."""
+"""The identity of a trial, independent of the location of its folders."""
 
 WIDEST_FIRST = 60
-"""Maximum number of characters of the first cell of a line of text that shares its line with the others."""
-RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as 'bidnerf evaluate' writes")
+"""Maximum number of characters of a line's first cell for it to share the line with the others."""
+RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as written by 'bidnerf evaluate'")
 
 
 @dataclass(frozen=True)
 class SummaryRow:
-    """The statistics of the trials of one condition in one situation, with the words that reports use for these."""
+    """The statistics of the trials of one condition in one situation, with the words used for these in reports."""
 
     start: str  # title of the situation
     label: str  # of the condition
@@ -41,7 +43,7 @@ class SummaryRow:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """The results of trials. ``str()`` of it is a table for people."""
+    """The results of trials. ``str()`` gives a human-readable table."""
 
     rows: tuple[TrialResult, ...]
 
@@ -75,17 +77,17 @@ class ResultTable:
         return aligned(lines)
 
     def save(self, path: str | Path) -> None:
-        """Write the results as JSON lines, which ``bidnerf report`` reads; a file of that name is replaced as a whole."""
+        """Write the results as JSON lines, which ``bidnerf report`` reads; an existing file is replaced as a whole."""
         write_file(Path(path), b"".join(as_line(to_plain(row)) for row in self.rows))
 
     @classmethod
     def load(cls, *paths: str | Path) -> ResultTable:
-        """Return the results of files, as ``read_results`` does."""
+        """Load the results in files, as ``read_results`` does."""
         return cls(tuple(read_results(map(Path, paths))))
 
 
 def rate_text(success: Success | None) -> str:
-    """Return the share of trials that met a criterion with its interval; a dash where the criterion does not apply."""
+    """Format the fraction of trials that met a criterion with its interval; a dash if the criterion does not apply."""
     if success is None:
         return "-"
     rate = success.rate
@@ -93,10 +95,10 @@ def rate_text(success: Success | None) -> str:
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> str:
-    """Return lines of cells as text: the first column is flush left and the others are flush right.
+    """Format lines of cells as text: the first column is flush left and the others are flush right.
 
-    A line of a single cell is a heading, which may be wider than its column; a very wide first cell takes a line of its own.
-    Characters that could control a terminal are escaped.
+    A line with a single cell is a heading, which may be wider than its column; a very wide first cell takes a
+    line of its own. Characters that could control a terminal are escaped.
     """
     cells: list[list[str]] = []
     for line in lines:
@@ -118,9 +120,10 @@ def key_of(trial: Trial) -> Key:
 
 
 def read_results(paths: Iterable[Path]) -> list[TrialResult]:
-    """Return the results of all files in order; a result that several files hold is returned once.
+    """Return the results of all files in order; a result in several files is returned once.
 
-    An incomplete last line is ignored. Raises ``InputError`` for a file that cannot be read or holds something else.
+    An incomplete last line is ignored. Raises ``InputError`` for a file that cannot be read or contains
+    something else.
     """
     found: dict[Any, TrialResult] = {}
     for path in paths:
@@ -161,7 +164,7 @@ class ResultsFile:
             self._file.close()
 
     def add(self, result: TrialResult) -> None:
-        """Append a result, which is on disk when this returns. Raises ``InputError`` where the file was removed."""
+        """Append a result, which is on disk when this returns. Raises ``InputError`` if the file was removed."""
         if self._file is not None:
             self._file.append(to_plain(result))
         self.results[key_of(result.trial)] = result

@@ -1,4 +1,6 @@
-"""Statistics of trials: success rates with intervals, steps and time to success, errors and cost, and tests of differences."""
+"""Statistics of trials: success rates with intervals, steps and time to success, errors and cost, and
+significance tests.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ NEVER = math.inf
 """Steps to success of a trial that did not succeed."""
 
 RELATIVE, ABSOLUTE = "10%", "5deg 0.05"
-"""The criterion shown where there is room for only one: with a start, and without."""
+"""The criterion used where only one is shown: with a start, and without."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +39,12 @@ class Success:
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of one group of trials. A median is None where the middle value is unknown."""
+    """Statistics of a group of trials. A median is None if the middle value is unknown."""
 
     trials: int
-    frames: int  # distinct ones; their number, and not that of the trials, limits what the rates tell
+    frames: int  # number of distinct ones; this, not the number of trials, limits the precision of the rates
     unit: LengthUnit  # of the errors
-    criteria: dict[str, Success | None]  # by name; None where a criterion does not apply
+    criteria: dict[str, Success | None]  # by name; None if a criterion does not apply
     translation: float | None  # median of the final errors
     rotation_deg: float | None  # median of the final errors
     steps: float  # median
@@ -55,23 +57,23 @@ class Summary:
 
 
 def frame_of(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
-    """Return what identifies the images of a trial: trials of the same images are not independent."""
+    """Return the identity of a trial's images: trials of the same images are not independent."""
     return result.trial.data, result.trial.split, result.trial.frames
 
 
 def unit_of(results: Sequence[TrialResult]) -> LengthUnit:
-    """Return the unit of the errors of some trials: metres if that is known of all of them."""
+    """Return the unit of the errors of some trials: metres if that holds for all of them."""
     return "metres" if results and all(result.unit == "metres" for result in results) else "units"
 
 
 def applies(criterion: str, results: Sequence[TrialResult]) -> bool:
-    """Return whether a criterion applies to every trial: a share of the start's error needs a start."""
+    """Return whether a criterion applies to every trial: a relative criterion needs a start."""
     needs_start = isinstance(CRITERIA[criterion], Reduced)
     return not needs_start or all(result.start_error is not None for result in results)
 
 
 def usual_criterion(results: Sequence[TrialResult]) -> str:
-    """Return the name of the criterion to show where there is room for only one."""
+    """Return the name of the criterion to use where only one is shown."""
     return RELATIVE if applies(RELATIVE, results) else ABSOLUTE
 
 
@@ -114,7 +116,7 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
 
 
 def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None:
-    """Return how often and how soon trials met a criterion; None where it does not apply to them."""
+    """Return how often and how soon trials met a criterion; None if it does not apply to them."""
     if not applies(criterion, results):
         return None
     reached = [s for s in steps_of(results, criterion) if s < NEVER]
@@ -125,9 +127,10 @@ def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Return the median (of an even number, the mean of the two middle values); an unknown value counts as infinite.
+    """Return the median (of an even number, the mean of the two middle values); an unknown value counts as
+    infinite.
 
-    Returns None where there is no value, or where a middle value is unknown.
+    Returns None if there is no value, or if a middle value is unknown.
     """
     known = [math.inf if value is None else float(value) for value in values]
     middle = statistics.median(known) if known else math.inf
@@ -135,13 +138,15 @@ def median(values: Iterable[float | None]) -> float | None:
 
 
 def milliseconds_per_step(result: TrialResult) -> float:
-    """Return the mean time of a step of one trial."""
+    """Return the mean time per step of a trial."""
     return 1000 * result.seconds / max(1, result.steps)
 
 
 @dataclass(frozen=True)
 class PairTest:
-    """Tests of whether two groups of trials in the same situation differ, by one criterion. All p values are two-sided."""
+    """Tests of whether two groups of trials in the same situation differ, by one criterion. All p values are
+    two-sided.
+    """
 
     first: str
     second: str
@@ -151,7 +156,7 @@ class PairTest:
     median_steps: tuple[float | None, float | None]
     steps_u: float | None  # Mann-Whitney U of the first group, over the trials that succeeded
     steps_p: float | None  # of equal steps to success
-    all_p: float  # of equal speed over all trials, where a failure is slower than every success
+    all_p: float  # of equal speed over all trials, where a failure is slower than any success
 
 
 def pairwise_tests(groups: Sequence[Group], criterion: str) -> list[PairTest]:
@@ -163,7 +168,7 @@ def pairwise_tests(groups: Sequence[Group], criterion: str) -> list[PairTest]:
 
 def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
     """Test whether two groups differ in success rate or in steps to success, by one criterion."""
-    from scipy.stats import fisher_exact, mannwhitneyu  # here: the import takes a second
+    from scipy.stats import fisher_exact, mannwhitneyu  # imported here: it takes a second
 
     steps = [steps_of(group.results, criterion) for group in (first, second)]
     reached = [[s for s in row if s < NEVER] for row in steps]
@@ -183,7 +188,7 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
 
 
 def _all_p(first: list[float], second: list[float]) -> float:
-    """Return the p value over all trials. All failures tie; it is 1 where all trials tie."""
+    """Return the p value over all trials. All failures tie; it is 1 if all trials tie."""
     from scipy.stats import mannwhitneyu
 
     if len({*first, *second}) == 1:

@@ -25,14 +25,16 @@ from bidnerf_core.results.errors import PoseError
 from bidnerf_core.scenes.closed_form_data import is_closed_form
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
-DIGEST_BYTES = 16  # enough that no two inputs share one by chance
+DIGEST_BYTES = 16  # enough that no two inputs coincide by chance
 LARGEST_COUNT = 2**63 - 1
 """The largest count. JSON can hold integers that no tensor or float can."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Everything that the result of a trial depends on. Raises ``InputError`` for what cannot be the name of a folder."""
+    """Everything that the result of a trial depends on. Raises ``InputError`` for anything that cannot be a
+    folder name.
+    """
 
     map: str  # folder, or demo:NAME
     data: str  # folder, or demo:NAME
@@ -44,8 +46,8 @@ class Trial:
     seed: int = 0  # of the start and of every random choice of the method
     split: str = "test"
     device: str = "cpu"  # the map's device
-    depth: bool = True  # whether the method gets the measured depth
-    depth_points: str | None = None  # folder of a COLMAP model whose points the method gets as depth rays
+    depth: bool = True  # whether the method receives the measured depth
+    depth_points: str | None = None  # folder of a COLMAP model whose points the method receives as depth rays
     masks: str | None = None  # folder of masks of the images, see ``MaskFolder``
     mask_hides: HiddenColour = "black"
     fault: str = "none"  # faults of the images and their sizes, such as depth-scale:1.02+exposure:0.7
@@ -62,7 +64,7 @@ class Trial:
 
     @property
     def portable(self) -> Trial:
-        """This trial with the names of folders instead of their paths, which differ from machine to machine."""
+        """This trial with the names of folders instead of their paths, which differ between machines."""
         points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
         masks = None if self.masks is None else _name(self.masks)
         return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points, masks=masks)
@@ -80,7 +82,7 @@ class ScalarPoseError:
 class Trace:
     """Errors at the start and after each step; without a start, entry 0 is the method's first pose.
 
-    Raises ``ValueError`` where the two sequences differ in length or are empty.
+    Raises ``ValueError`` if the two sequences differ in length or are empty.
     """
 
     translation: tuple[float | None, ...]  # metres; None where a pose was not finite
@@ -102,21 +104,21 @@ class Trace:
 
 @dataclass(frozen=True)
 class InputDigests:
-    """Digests of the content of a trial's input. Folders may move, and machines may differ; content may not."""
+    """Digests of the content of a trial's input: folders may move and machines may differ, but the content must not."""
 
     views: str  # images, depth, intrinsics and true poses of the frames, in hexadecimal
     points: str | None = None  # files of the COLMAP model that depth points were taken from
-    surface: str | None = None  # file name of the map's baked surface, which is new with every baking
+    surface: str | None = None  # file name of the map's baked surface, which changes with every baking
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """One line of results: what ``bidnerf localize --json`` prints, and everything that a report needs.
+    """One line of results: the output of ``bidnerf localize --json``, and everything that a report needs.
 
     Raises ``ValueError`` for a count that does not fit into 64 bits.
     """
 
-    T_world_camera: Rows | None  # 4x4; None where it was not finite
+    T_world_camera: Rows | None  # 4x4; None if it was not finite
     converged: bool  # according to the method itself
     steps: int
     seconds: float
@@ -132,19 +134,19 @@ class TrialResult:
     reason: str  # why the method stopped
     peak_memory_bytes: int  # of the process during the trial: resident memory, or memory of the GPU
     settings: dict[str, Any]  # all settings of the method
-    weights: str  # identifies the map's training, see ``Map.training``
+    weights: str  # identifies the map's training run, see ``Map.training``
     trial: Trial  # with folders' names instead of paths
-    outcome: str = ""  # the method's verdict; empty in results of earlier versions
-    focal_factor: float = 1.0  # ratio of the true to the given focal length, where it was estimated as well
-    intrinsics: Intrinsics | None = None  # those used for the pose, where they differ from those given
-    confidence: float | None = None  # probability that the pose is right, where a model of it was learned
+    outcome: str = ""  # the method's outcome; empty in results of earlier versions
+    focal_factor: float = 1.0  # ratio of the true to the given focal length, if it was estimated as well
+    intrinsics: Intrinsics | None = None  # those used for the pose, if they differ from the given ones
+    confidence: float | None = None  # probability that the pose is right, if a model for it was learned
     unit: LengthUnit = "units"  # of all lengths: that of the map
     inputs: InputDigests | None = None  # None in results of earlier versions
 
     def __post_init__(self) -> None:
         for name in ("steps", "seed", "peak_memory_bytes"):
             if abs(getattr(self, name)) > LARGEST_COUNT:
-                raise ValueError(f"{name} is larger than any number that was measured")
+                raise ValueError(f"{name} is larger than any measurement")
 
 
 def _name(folder: str) -> str:
@@ -171,9 +173,9 @@ def views_digest(views: Sequence[View]) -> str:
 
 @lru_cache(maxsize=4)
 def folder_digest(folder: str) -> str:
-    """Return the digest of the names and contents of the files that lie directly in ``folder``.
+    """Return the digest of the names and contents of the files directly in ``folder``.
 
-    Raises ``InputError`` where one of them cannot be read.
+    Raises ``InputError`` if one of them cannot be read.
     """
     hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
     try:

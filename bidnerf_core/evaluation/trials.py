@@ -1,7 +1,8 @@
 """Running one trial: localize a frame from a start with a method, and measure the result.
 
-``run_trial`` depends only on its arguments and on the files that these name, so trials may run in any order, in any process
-and on any machine; two runs of the same trial differ only in ``seconds`` and ``peak_memory_bytes``.
+``run_trial`` depends only on its arguments and the files that these name, so trials may run in any order, in
+any process and on any machine; two runs of the same trial differ only in ``seconds`` and
+``peak_memory_bytes``.
 """
 
 from __future__ import annotations
@@ -58,10 +59,11 @@ STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 def run_trial(
     trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
 ) -> TrialResult:
-    """Run a trial on the map and the dataset ``scene``, by default those that the trial names.
+    """Run a trial on the map and dataset ``scene``, by default those named by the trial.
 
-    ``registered`` has group and name of what the process that planned the trial has registered for it. Raises ``InputError``
-    for an unknown name, for a method that lacks an input it needs, and where this process has not registered the same names.
+    ``registered`` has the group and name of everything that the planning process registered for it. Raises
+    ``InputError`` for an unknown name, for a method that lacks an input it needs, and if this process has not
+    registered the same names.
     """
     require_registered(registered)
     with one_thread():
@@ -76,7 +78,7 @@ def run_trial(
 
 
 def registered_for(trial: Trial) -> list[tuple[str, str]]:
-    """Return group and name of what is registered in this process and may be needed for a trial.
+    """Return the group and name of everything registered in this process that a trial may need.
 
     The map may need any detector and backend, and the dataset any reader.
     """
@@ -96,9 +98,9 @@ def _localized(
 
 
 def trial_views(trial: Trial, dataset: Dataset) -> list[View]:
-    """Return the views that the method gets, with T_world_camera.
+    """Return the views that the method receives, with T_world_camera.
 
-    They have the trial's faults, and no depth if the trial withholds it.
+    They include the trial's faults, and have no depth if the trial withholds it.
     """
     views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
     if trial.depth:
@@ -113,7 +115,7 @@ def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:
 
 
 def start_of(trial: Trial, views: list[View], dataset: Dataset) -> SE3 | None:
-    """Return T_world_camera at which the trial begins; None where its protocol gives no start."""
+    """Return T_world_camera at which the trial starts; None if its protocol gives no start."""
     protocol = find_protocol(trial.protocol)
     protocol.check_size(trial.size)
     frames = len(dataset.frame_names(trial.split))
@@ -128,7 +130,7 @@ def parse_settings(method: str, config: str) -> Any:
 
 
 def open_map(name: str, device: str = "cpu") -> Map:
-    """Return the map of a folder, or of a closed-form scene."""
+    """Return the map in a folder, or of a closed-form scene."""
     where = working_device(device)
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
@@ -136,7 +138,7 @@ def open_map(name: str, device: str = "cpu") -> Map:
 def open_data(
     name: str, stored: Map | None = None, masks: str | None = None, hides: HiddenColour = "black"
 ) -> Dataset:
-    """Return the dataset of a folder, or of a closed-form scene; a map gives the colour behind its images.
+    """Return the dataset in a folder, or of a closed-form scene; a map gives the colour behind its images.
 
     Masks of the folder ``masks`` hide parts of the images.
     """
@@ -158,10 +160,10 @@ def opened(
     masks: str | None = None,
     hides: HiddenColour = "black",
 ) -> Opened:
-    """Return the map and the dataset of these names, which are read once per process unless the map has changed since."""
+    """Return the map and dataset with these names, which are read once per process unless the map has changed since."""
     try:
         file = os.stat(Path(map_name) / DESCRIPTION)
-    except OSError:  # a closed-form scene, or no map, which is found out below
+    except OSError:  # a closed-form scene, or not a map, which is detected below
         return _opened(map_name, data_name, device, masks, hides, None)
     return _opened(map_name, data_name, device, masks, hides, (file.st_ino, file.st_mtime_ns))
 
@@ -182,9 +184,9 @@ def _opened(
 
 @lru_cache(maxsize=4)
 def opened_points(folder: str, stored: Map) -> SparsePoints:
-    """Return the points of the COLMAP model in ``folder``, scaled to the map by the poses of its training cameras."""
+    """Return the points of the COLMAP model in ``folder``, scaled to the map with the poses of its training cameras."""
     if not stored.info.cameras:
-        raise InputError(f"{folder}: the map was trained without cameras, which would give its scale")
+        raise InputError(f"{folder}: the map has no training cameras to determine the scale from")
     return SparsePoints(Path(folder), places_of(stored.info), SparseChoice())
 
 
@@ -223,7 +225,7 @@ def _finite(values: Tensor) -> list[float | None]:
 
 
 def forget_peak_memory() -> None:
-    """Reset the peak where the system supports it; elsewhere it remains the peak since the process began."""
+    """Reset the peak if the system supports it; elsewhere it remains the peak since the process began."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
     with contextlib.suppress(OSError):
@@ -231,7 +233,7 @@ def forget_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Return the peak memory of the GPU where one is in use, else the peak resident memory of this process."""
+    """Return the peak GPU memory if a GPU is in use, else the peak resident memory of this process."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return int(torch.cuda.max_memory_allocated())
     with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""What runs trials: this process, other processes of this machine, or the workers of a cluster."""
+"""Executors of trials: this process, other processes on this machine, or the workers of a cluster."""
 
 from __future__ import annotations
 
@@ -46,14 +46,16 @@ class InThisProcess(Executor):
 
 
 def local_processes(count: int) -> Executor:
-    """Return an executor of ``count`` processes of one thread each, which end when this process ends, for whatever reason."""
+    """Return an executor of ``count`` single-threaded processes, which end when this process ends, for
+    whatever reason.
+    """
     if count == 1:
         return InThisProcess()
     return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=prepare_worker)
 
 
 def prepare_worker() -> None:
-    """Set up a worker: it leaves Ctrl-C to its parent and exits when its parent is gone."""
+    """Set up a worker: it leaves Ctrl-C to its parent and exits when the parent is gone."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -79,12 +81,12 @@ def workers_for(
 ) -> Iterator[tuple[Executor, int, str]]:
     """Yield an executor for a number of trials, how many of them to run on it at once, and its description.
 
-    ``workers`` is the number of processes; None stands for one a core, and one on a GPU. ``dask`` is the address of a
-    scheduler whose workers run the trials instead. Where the work fails, the processes are ended with their trials. Raises
-    ``InputError`` for a number below 1, and as ``dask_executor`` does.
+    ``workers`` is the number of processes; None stands for one per core, and one on a GPU. ``dask`` is the
+    address of a scheduler whose workers run the trials instead. If the work fails, the processes are ended
+    with their trials. Raises ``InputError`` for a number below 1, and as ``dask_executor`` does.
     """
     if workers is not None and workers < 1:
-        raise InputError(f"workers is {workers}, expected 1 or more, or None for one a core")
+        raise InputError(f"workers is {workers}, expected 1 or more, or None for one per core")
     if dask is not None:
         with dask_executor(dask) as (cluster, threads):
             yield cluster, 2 * threads, f"dask, {threads} threads"
@@ -103,12 +105,14 @@ def workers_for(
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
-    """Yield an executor of the dask scheduler at ``address``, and the number of trials that its workers run at once.
+    """Yield an executor for the dask scheduler at ``address``, and the number of trials that its workers run
+    concurrently.
 
-    Workers need this package, the same backends, and the maps and data under the same paths. Peak memory is measured per
-    process: it is that of one trial only if the worker has one thread (``dask worker --nthreads 1``).
+    Workers need this package, the same backends, and the maps and data under the same paths. Peak memory is
+    measured per process: it is that of a single trial only if the worker has one thread (``dask worker
+    --nthreads 1``).
 
-    Raises ``InputError`` where dask is missing, and where no scheduler or worker answers.
+    Raises ``InputError`` if dask is missing, and if no scheduler or worker responds.
     """
     try:
         from distributed import Client
@@ -118,7 +122,7 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
         raise InputError(
-            f"no dask scheduler at {address} ({error}), expected one as tcp://host:8786"
+            f"no dask scheduler at {address} ({error}), expected one such as tcp://host:8786"
         ) from error
     with client:
         threads = sum(client.nthreads().values())
@@ -129,10 +133,10 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
 
 @dataclass(frozen=True)
 class Measured:
-    """The result of a trial, and the mean number of samples on a ray of its last frame at the true pose."""
+    """The result of a trial, and the mean number of samples per ray in its last frame at the true pose."""
 
     result: TrialResult
-    samples_per_ray: float  # of the field's level in the method's settings, else of the finest
+    samples_per_ray: float  # for the field level in the method's settings, else the finest
 
 
 def measured(
@@ -163,21 +167,22 @@ class _Question:
 
 
 class TrialProcess:
-    """A process that runs trials one after another and keeps its map in memory, so that its memory and time are those of one map.
+    """A process that runs trials one after another and keeps its map in memory, so that its memory and time
+    are those of one map.
 
-    It is a new interpreter that exchanges JSON, not a fork: it shares no memory, and scripts need no ``__main__`` guard. Use it
-    as a context manager.
+    It is a new interpreter that exchanges JSON, not a fork: it shares no memory, and scripts need no
+    ``__main__`` guard. Use it as a context manager.
     """
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            # With -P, files of the current folder are not taken for modules.
+            # With -P, files in the current folder are not mistaken for modules.
             [sys.executable, "-P", "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             start_new_session=True,  # so that Ctrl-C reaches only this process, which ends the other
         )  # fmt: skip
 
     def run(self, trial: Trial) -> Measured:
-        """Run a trial. Raises ``InputError`` if it is impossible, or if the process ends before its result."""
+        """Run a trial. Raises ``InputError`` if it cannot run, or if the process ends before its result."""
         try:
             _send(self._process.stdin, to_plain(_Question(trial, registered_for(trial))))
             line = self._process.stdout.readline() if self._process.stdout else ""

@@ -1,9 +1,10 @@
-"""A tree of boxes about the pieces of a scene (Gaussians, triangles, discs), by which a ray or a point finds the few that it meets.
+"""A tree of boxes around the pieces of a scene (Gaussians, triangles, discs) that finds the few pieces a ray
+or point meets.
 
-Pieces are put in the order of a Morton curve, eight neighbours share a box, eight of these boxes the next, and so on
-(an implicit bounding volume hierarchy, Lauterbach et al. 2009, with eight children). The tree has no pointers: child ``c`` of
-node ``n`` is ``8 n + c`` on the level below. The boxes of a node's children lie side by side, as (6 nodes 8): lower corner,
-upper corner.
+Pieces are sorted along a Morton curve, eight neighbours share a box, eight of these boxes share the next, and
+so on (an implicit bounding volume hierarchy, Lauterbach et al. 2009, with eight children). The tree has no
+pointers: child ``c`` of node ``n`` is ``8 n + c`` on the level below. The boxes of a node's children are
+stored side by side, as (6 nodes 8): lower corner, upper corner.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from torch.nn.functional import pad
 
 CHILDREN = 8
 TOP = 8
-"""Largest number of nodes on the highest level, all of which are tested."""
+"""Largest number of nodes on the highest level; all of them are tested."""
 MORTON_BITS = 16
 """Bits of each coordinate on the Morton curve."""
 LEAST_COMPONENT = 1e-9
-"""Least size of a direction's component along an axis; smaller ones are replaced by it, so that slopes stay finite."""
+"""Smallest magnitude of a direction's component along an axis; smaller ones are replaced by it, so that
+slopes stay finite."""
 MOST_PAIRS = 2**22
-"""Largest number of pairs of a ray and a box that are tested at once: some 300 MB."""
+"""Largest number of ray-box pairs tested at once: some 300 MB."""
 KEPT_NODES = 128
-"""Nodes on each level that a ray may meet where their number must be known beforehand; the nearest ones are kept."""
+"""Number of nodes kept per ray on each level if the number must be known beforehand; the nearest ones are kept."""
 
 Boxes = Sequence[Float[Tensor, "6 _ 8"]]
 """The boxes of the children of each node, the lowest level (whose children are pieces) first."""
@@ -43,7 +45,7 @@ def level_sizes(count: int) -> list[int]:
 def tree_of(
     centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
 ) -> tuple[Int[Tensor, "n"], list[Float[Tensor, "6 _ 8"]]]:
-    """Return the order of the pieces, and the boxes of all levels. What is not ``seen`` is in an empty box."""
+    """Return the order of the pieces, and the boxes of all levels. Pieces that are not ``seen`` are in an empty box."""
     order = torch.argsort(_morton(centres, seen), stable=True)
     centres, halves, seen = centres[order], halves[order], seen[order]
     lower = torch.where(seen[:, None], centres - halves, torch.inf)
@@ -61,8 +63,8 @@ def tree_of(
 
 
 def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Return the places along a Morton curve, the last for what is not seen."""
-    # Quantiles, so that a few pieces far away do not put all others in one cell.
+    """Return the positions along a Morton curve; unseen pieces come last."""
+    # Quantiles, so that a few distant pieces do not put all others into one cell.
     some = centres[:: max(1, len(centres) // 10_000)].double()
     low, high = (some.quantile(q, dim=0) for q in (0.02, 0.98))
     side = (high - low).amax().clamp(min=1e-12)
@@ -77,7 +79,7 @@ def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tenso
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Parts of rays, as a box is tested against them. A point is a ray of no length."""
+    """Segments of rays, prepared for box tests. A point is a ray of zero length."""
 
     offsets: Float[Tensor, "3 r"]  # -origin / direction
     slopes: Float[Tensor, "3 r"]  # 1 / direction, finite
@@ -95,7 +97,9 @@ class Lines:
     def entered(
         self, rays: Int[Tensor, "p"], boxes: Float[Tensor, "6 p 8"]
     ) -> tuple[Float[Tensor, "p 8"], Bool[Tensor, "p 8"]]:
-        """Return where the rays number ``rays`` enter each of the boxes, and whether they meet it within their part."""
+        """Return where the rays with indices ``rays`` enter each of the boxes, and whether they meet it
+        within their segment.
+        """
         offsets, slopes = (
             self.offsets.index_select(1, rays)[..., None],
             self.slopes.index_select(1, rays)[..., None],
@@ -107,18 +111,19 @@ class Lines:
             )
             enter = torch.maximum(enter, torch.minimum(low, high))
             leave = torch.minimum(leave, torch.maximum(low, high))
-        # The corners of an empty box are exchanged, at infinity, and its slabs would hold all rays.
+        # The corners of an empty box are swapped, at infinity, and its slabs would hold all rays.
         return enter, (enter <= leave) & (boxes[0] <= boxes[3])
 
 
 class TooMany(Exception):
-    """The rays meet more boxes than are to be tested at once; fewer rays may do."""
+    """The rays meet more boxes than may be tested at once; fewer rays may work."""
 
 
 def met(lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return the pairs of a ray and a piece whose box it meets, sorted by ray. Their number is read from the device.
+    """Return all pairs of a ray and a piece whose box it meets, sorted by ray. Their number is read from the
+    device.
 
-    Raises ``TooMany`` where several rays meet so many boxes that memory might not suffice.
+    Raises ``TooMany`` if several rays meet so many boxes that memory might not suffice.
     """
     rays = len(lines.near)
     top = boxes[-1].shape[1]
@@ -136,7 +141,9 @@ def met(lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]) -> tuple[Int[Tensor
 def nearest_met(
     lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]
 ) -> tuple[Int[Tensor, "r c"], Bool[Tensor, "r c"]]:
-    """Return the pieces whose boxes each ray meets first, and which of these places are in use; the shape is known beforehand."""
+    """Return the pieces whose boxes each ray meets first, and which of these slots are in use; the shape is
+    known beforehand.
+    """
     rays = len(lines.near)
     node = torch.arange(boxes[-1].shape[1], device=order.device).expand(rays, -1)
     valid = torch.ones_like(node, dtype=torch.bool)

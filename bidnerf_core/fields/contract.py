@@ -1,7 +1,7 @@
 """The contract between the core and any radiance field.
 
-Shapes: *r rays, *p points, s samples on a ray. Units: metres (or scene units) in the world frame; density per metre.
-Directions are always unit, so distance along the ray is the only length.
+Shapes: *r rays, *p points, s samples on a ray. Units: metres (or scene units) in the world frame; density per
+metre. Directions are always unit vectors, so distance along the ray is the only length.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """Disjoint intervals of each ray, nearest first, each queried at its middle. Those that are not valid have no effect."""
+    """Disjoint intervals of each ray, nearest first, each queried at its middle. Invalid intervals have no effect."""
 
     starts: Float[Tensor, "*r s"]
     ends: Float[Tensor, "*r s"]
@@ -49,13 +49,13 @@ class RaySamples:
         return self.starts, self.ends, self.valid
 
     def unflattened(self, shape: torch.Size) -> RaySamples:
-        """Return the samples of rays that were flattened, in their former ``shape``."""
+        """Restore the original ``shape`` of rays that were flattened."""
         return RaySamples(*(part.reshape(*shape, part.shape[-1]) for part in self.parts))
 
 
 @dataclass(frozen=True, eq=False)
 class FieldValues:
-    """Density and colour at points, as seen along directions."""
+    """Density and colour at points, seen along given directions."""
 
     density: Float[Tensor, "*p"]  # >= 0, per metre
     rgb: Float[Tensor, "*p 3"]  # in [0, 1]
@@ -82,49 +82,50 @@ class RadianceField(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """The places at which rays meet something, and what is seen there, in the order in which they are composited.
+    """Where rays hit something, and what is seen there, in compositing order.
 
-    This is the order of distance, except where a field composites otherwise, as splats do that were trained in the order of
-    their means. Places that are not valid have no effect.
+    This is the order of distance, except for fields that composite otherwise, such as splats trained in the
+    order of their means. Invalid hits have no effect.
     """
 
     distance: Float[Tensor, "*r s"]  # metres along the ray
-    alpha: Float[Tensor, "*r s"]  # share of the light that is stopped there, in [0, 1]; 0 where not valid
+    alpha: Float[Tensor, "*r s"]  # fraction of the light stopped there, in [0, 1]; 0 where not valid
     rgb: Float[Tensor, "*r s 3"]  # in [0, 1]
     valid: Bool[Tensor, "*r s"]
 
     @property
     def samples(self) -> RaySamples:
-        """The places as intervals of no length."""
+        """The hits as intervals of zero length."""
         return RaySamples(self.distance, self.distance, self.valid)
 
 
 @runtime_checkable
 class HitField(RadianceField, Protocol):
-    """An optional part of a field, which finds for whole rays what they meet, as splats and meshes do.
+    """Optional part of a field that computes the hits of whole rays, as splats and meshes do.
 
-    ``render`` then takes ``hits`` in place of ``sampler`` and ``query``. These remain, for points and for whoever samples rays
-    otherwise, and agree with it: the integral of ``query``'s density along a ray gives the opacity of the ray's hits.
+    ``render`` then uses ``hits`` instead of ``sampler`` and ``query``. These remain available for points and
+    for other ways of sampling rays, and are consistent with it: the integral of ``query``'s density along a
+    ray gives the opacity of the ray's hits.
     """
 
     def hits(self, rays: Rays) -> RayHits:
-        """Return what rays meet in [near, far]; differentiable in the rays and in the parameters."""
+        """Return the hits of rays in [near, far]; differentiable in the rays and in the parameters."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """The pieces of a field that is made of some, as points: for whoever draws it without casting rays."""
+    """The pieces of a field that consists of some, as points for drawing without ray casting."""
 
     positions: Float[Tensor, "n 3"]  # metres, world
-    rgb: Float[Tensor, "n 3"]  # in [0, 1], whatever the direction
+    rgb: Float[Tensor, "n 3"]  # in [0, 1], independent of direction
     opacity: Float[Tensor, "n"]  # in [0, 1]
     radius: Float[Tensor, "n"]  # metres: the geometric mean of the standard deviations along its axes
 
 
 @runtime_checkable
 class SplatField(Protocol):
-    """An optional part of a field that is made of pieces, which viewers show."""
+    """Optional part of a field that consists of pieces, which viewers show."""
 
     def splats(self) -> Splats:
         """Return all pieces, in any order."""
@@ -132,12 +133,14 @@ class SplatField(Protocol):
 
 
 def levels(field: RadianceField) -> tuple[RadianceField, ...]:
-    """Return the field's levels of detail, coarsest first; a field that offers none is its own only level."""
+    """Return the field's levels of detail, coarsest first; a field without any is its own only level."""
     return tuple(getattr(field, "levels", None) or (field,))
 
 
 def device_of(field: RadianceField) -> torch.device:
-    """Return the device of a field's parameters or buffers, or of the first field in a dataclass that wraps one; else the CPU."""
+    """Return the device of a field's parameters or buffers, or of the first field that a dataclass wraps;
+    else the CPU.
+    """
     for kind in ("parameters", "buffers"):
         first = next(iter(getattr(field, kind, tuple)()), None)
         if isinstance(first, torch.Tensor):
@@ -150,21 +153,22 @@ def device_of(field: RadianceField) -> torch.device:
 
 
 LARGEST_LENGTH = 1e15
-"""Metres. Squares of larger lengths come close to the largest number of single precision."""
+"""Metres. Squares of larger lengths approach the largest single-precision number."""
 
 
 @dataclass(frozen=True)
 class SceneBounds:
-    """What may be assumed of a scene before anything is trained. Plain numbers: it is stored as JSON."""
+    """Information about a scene available before training: plain numbers, stored as JSON."""
 
     lower: tuple[float, float, float]  # metres, world: corners of the box that holds all matter
     upper: tuple[float, float, float]
     near: float  # metres along a ray: nothing of interest is nearer ...
     far: float  # ... or farther
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour seen where a ray meets nothing
-    # Whether there is matter beyond the box, as far as ``far``: fields contract what lies outside of the box's cube.
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour seen where a ray hits nothing
+    # Whether there is matter beyond the box, up to ``far``: fields contract what lies outside the box's cube.
     contracted: bool = False
-    # Metres: width of what a pixel of the images shows at the usual distance, which tells how fine a field needs to be; 0: unknown.
+    # Metres: width covered by a pixel at the usual distance, which determines how fine a field must be; 0:
+    # unknown.
     footprint: float = 0.0
 
     def __post_init__(self) -> None:
@@ -200,8 +204,8 @@ class SceneBounds:
     def normalized(self, positions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         """Return positions (metres, world) scaled so that the modelled space is the cube [-1, 1].
 
-        This is the cube around the box or, where the scene is contracted, all space: the cube around the box then fills the
-        inner half of each axis.
+        This is the cube around the box or, if the scene is contracted, all of space: the cube around the box
+        then fills the inner half of each axis.
         """
         scaled = (positions - constant(self.centre, positions)) * (2 / self.side)
         return contract(scaled) / 2 if self.contracted else scaled
@@ -224,7 +228,7 @@ class SceneBounds:
 
     @torch.no_grad()
     def spacing(self, rays: Rays) -> RaySpacing:
-        """Return the coordinate along the rays in which a field with these bounds is to be sampled evenly."""
+        """Return the coordinate along the rays in which a field with these bounds should be sampled evenly."""
         origins, directions = rays.origins.detach(), rays.directions.detach()
         if not self.contracted:
             return RaySpacing(torch.zeros_like(rays.near), float("inf"))
@@ -240,7 +244,7 @@ def crossed_box(
     lower: Float[Tensor, "3"],
     upper: Float[Tensor, "3"],
 ) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
-    """Return the distances (metres) at which lines enter and leave a box (slab method); they miss it where these are not in order."""
+    """Return the distances (metres) at which lines enter and leave a box (slab method); entry > exit means a miss."""
     tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
     slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
     first, second = (lower - origins) * slope, (upper - origins) * slope
@@ -248,6 +252,8 @@ def crossed_box(
 
 
 def widened(rays: Rays, factor: float) -> Rays:
-    """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind the camera."""
+    """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind
+    the camera.
+    """
     middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
     return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

@@ -1,8 +1,8 @@
 """Contraction of unbounded space (Barron et al. 2022, mip-NeRF 360, section 2).
 
-Points within a unit of the origin stay where they are, and all others are drawn into the shell between 1 and 2, so that a
-field of bounded size models near things finely and distant ones coarsely. The norm is the largest coordinate, as in
-nerfstudio: the contracted space is then a cube, which a grid fills.
+Points within a unit of the origin stay in place, and all others are mapped into the shell between 1 and 2, so
+that a field of bounded size models near things finely and distant ones coarsely. The norm is the largest
+coordinate, as in nerfstudio: the contracted space is then a cube, which a grid fills.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ def expand(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
 class RaySpacing:
     """A coordinate along rays in which equal steps match the resolution of a contracted field (eq. 11).
 
-    It is the distance (metres) up to ``exit``, where the ray leaves the uncontracted box, and ``exit + radius * x / (1 + x)``
-    beyond, where ``x`` is the distance from there in units of ``radius``.
+    It is the distance (metres) up to ``exit``, where the ray leaves the uncontracted box, and ``exit + radius
+    * x / (1 + x)`` beyond, with ``x`` the distance from there in units of ``radius``.
     """
 
     exit: Float[Tensor, "*r"]  # metres along the ray
-    radius: float  # metres: half the side of the uncontracted cube; infinite where nothing is contracted
+    radius: float  # metres: half the side of the uncontracted cube; infinite without contraction
 
     def rows(self, numbers: Int[Tensor, "m"]) -> RaySpacing:
-        """Return the spacing of the rays with these numbers, of rays (r) along one axis."""
+        """Return the spacing of the rays with these indices, for rays (r) along one axis."""
         return RaySpacing(self.exit.index_select(0, numbers), self.radius)
 
     def place(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:

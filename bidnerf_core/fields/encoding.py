@@ -1,4 +1,4 @@
-"""The input and the output of networks that are radiance fields: encoding by frequencies, and density from a raw number."""
+"""Inputs and outputs of networks that are radiance fields: frequency encoding, and density from a raw number."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from torch.nn import functional
 from bidnerf_core.fields.contract import FieldValues, SceneBounds
 
 SHARPNESS = 30.0
-"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can represent surfaces."""
+"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can
+represent surfaces."""
 THINNESS = 1.0
 """Shift of raw density that makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF)."""
 
@@ -29,7 +30,7 @@ def encoded_width(frequencies: int, include_input: bool = True) -> int:
 
 
 def octaves(count: int, points: Tensor, lowest: float = torch.pi) -> Float[Tensor, "l"]:
-    """Return ``count`` angular frequencies of which each is twice the one before, in the dtype and on the device of ``points``."""
+    """Return ``count`` angular frequencies, each twice the previous one, in the dtype and on the device of ``points``."""
     return lowest * 2 ** torch.arange(count, dtype=points.dtype, device=points.device)
 
 
@@ -56,7 +57,7 @@ def query_network(
     positions: Float[Tensor, "*p 3"],
     directions: Float[Tensor, "*p 3"],
 ) -> FieldValues:
-    """Return the values of a network; positions are scaled to the cube [-1, 1], so that the unit of length has no effect."""
+    """Return a network's values; positions are scaled to the cube [-1, 1], so that the length unit has no effect."""
     shape = positions.shape[:-1]
     raw, rgb = network(bounds.normalized(positions.reshape(-1, 3)), directions.reshape(-1, 3))
     density = functional.softplus(raw - THINNESS) * (SHARPNESS / bounds.side)

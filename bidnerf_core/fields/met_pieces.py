@@ -1,4 +1,4 @@
-"""What rays meet among the pieces of a scene (Gaussians, triangles, discs), found by a tree of boxes."""
+"""Intersections of rays with the pieces of a scene (Gaussians, triangles, discs), found with a tree of boxes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bidnerf_core.fields.box_tree import Boxes, Lines, TooMany, met, nearest_met
 from bidnerf_core.fields.contract import FieldValues, Rays
 
 STOPPED = 1e-4
-"""Share of a ray's light that still shines through where nothing behind is looked at, as in the code of 3D Gaussian splatting."""
+"""Transmittance below which nothing behind is considered, as in the code of 3D Gaussian splatting."""
 RAYS_AT_ONCE = 384
-"""Rays that are looked up together: so few that what they meet stays in the processor's cache."""
+"""Number of rays looked up together: small enough for what they meet to stay in the processor's cache."""
 POINTS_AT_ONCE = 2**15
-"""Points that are looked up together."""
+"""Number of points looked up together."""
 KEPT_HITS = 64
-"""Pieces along a ray where their number must be known beforehand; the nearest ones are kept."""
+"""Number of pieces kept along a ray if the number must be known beforehand; the nearest ones are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,19 +31,19 @@ class Meeting:
     """Where lines meet pieces, one pair each."""
 
     distance: Float[Tensor, "*p"]  # metres along the line from its origin; may be negative
-    alpha: Float[Tensor, "*p"]  # share of the light that is stopped there; 0 where the line passes by
-    key: Float[Tensor, "*p"]  # by which the pieces along a ray are ordered, such as the distance
+    alpha: Float[Tensor, "*p"]  # fraction of the light stopped there; 0 where the line misses
+    key: Float[Tensor, "*p"]  # sort key of the pieces along a ray, such as the distance
 
 
 Meet: TypeAlias = Callable[[Int[Tensor, "p"], Float[Tensor, "p 3"], Float[Tensor, "p 3"]], Meeting]
-"""A function from numbers of pieces, origins and directions of lines to where they meet."""
+"""A function from piece indices and the origins and directions of lines to their intersections."""
 
 
 def met_pieces(
     rays: Rays, boxes: Boxes, order: Int[Tensor, "n"], meet: Meet
 ) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-    """Return the numbers of the pieces that rays (r) meet, in order of the key, up to where hardly any light is left, and
-    which of these places are in use.
+    """Return the indices of the pieces that rays (r) hit, in key order until hardly any light is left, and
+    which slots are in use.
     """
     if not len(rays.near):
         empty = torch.zeros((0, 0), dtype=torch.long, device=order.device)
@@ -102,7 +102,7 @@ def _met_in_known_shape(rays: Rays, boxes: Boxes, order: Tensor, meet: Meet) -> 
 
 
 def _lines(rays: Rays) -> Lines:
-    far = torch.where(rays.far > rays.near, rays.far, rays.near - 1)  # nothing is met by rays that miss
+    far = torch.where(rays.far > rays.near, rays.far, rays.near - 1)  # rays that miss the scene meet nothing
     return Lines.of(rays.origins, rays.directions, rays.near, far)
 
 
@@ -113,7 +113,7 @@ def _is_hit(found: Meeting, near: Float[Tensor, "p"], far: Float[Tensor, "p"]) -
 def _in_order(
     key: Float[Tensor, "r s"], alpha: Float[Tensor, "r s"], index: Int[Tensor, "r s"]
 ) -> tuple[Int[Tensor, "r k"], Bool[Tensor, "r k"]]:
-    """Return the indices in order of ``key``, and which of them count: those that are reached by any light."""
+    """Return the indices in order of ``key``, and which of them are reached by any light."""
     key, order = key.sort(dim=1, stable=True)
     alpha, index = alpha.gather(1, order), index.gather(1, order)
     thickness = -torch.log1p(-alpha)
@@ -129,11 +129,11 @@ def pieces_about(
     positions: Float[Tensor, "p 3"], boxes: Boxes, order: Int[Tensor, "n"],
     directions: Float[Tensor, "p 3"] | None = None, reach: float = 0.0,
 ) -> tuple[Int[Tensor, "q"], Int[Tensor, "q"], Bool[Tensor, "q"]]:  # fmt: skip
-    """Return pairs of a point and a piece whose box holds it, and whether each counts.
+    """Return pairs of a point and a piece whose box contains it, and whether each pair counts.
 
-    With unit ``directions``, the piece's box meets the line through the point up to ``reach`` (metres) before and behind it.
-    Where the host must not wait, each point has equally many pairs, of which some do not count. Raises ``TooMany`` where several
-    points lie in so many boxes that memory might not suffice.
+    With unit ``directions``, the line through the point must meet the piece's box within ``reach`` (metres)
+    in either direction. If the host must not wait, each point has equally many pairs, some of which do not
+    count. Raises ``TooMany`` if several points lie in so many boxes that memory might not suffice.
     """
     away = torch.full_like(positions[:, 0], reach)
     lines = Lines.of(positions, torch.ones_like(positions) if directions is None else directions, -away, away)
@@ -149,7 +149,8 @@ AboutPoints: TypeAlias = Callable[
     [Float[Tensor, "p 3"], Float[Tensor, "p 3"]],
     tuple[Int[Tensor, "q"], Float[Tensor, "q"], Float[Tensor, "q 3"]],
 ]
-"""A function from positions and directions to pairs of a point and a piece: the point's number, the density (1/metre), the colour.
+"""A function from positions and directions to pairs of a point and a piece: the point's index, the density
+(1/metre), the colour.
 
 It may raise ``TooMany``, as ``pieces_about`` does.
 """
@@ -158,7 +159,7 @@ It may raise ``TooMany``, as ``pieces_about`` does.
 def values_of_pieces(
     positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], about: AboutPoints
 ) -> FieldValues:
-    """Return the sum of the pieces' densities at points, and their mean colour by density."""
+    """Return the sum of the pieces' densities at points, and their density-weighted mean colour."""
     shape = positions.shape[:-1]
     places, ways = (part.reshape(-1, 3).split(POINTS_AT_ONCE) for part in (positions, directions))
     found = _joined([_values(place, way, about) for place, way in zip(places, ways, strict=True)])
@@ -186,7 +187,7 @@ def _joined(parts: list[FieldValues]) -> FieldValues:
 def listed(
     index: Int[Tensor, "r s"], valid: Bool[Tensor, "r s"]
 ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return place in the table, row and index of the valid entries or, where the host must not wait, of all."""
+    """Return slot, row and index of the valid entries or, if the host must not wait, of all entries."""
     if may_wait(valid.device):
         place = valid.reshape(-1).nonzero()[:, 0]
     else:
@@ -195,7 +196,7 @@ def listed(
 
 
 def flattened(rays: Rays) -> Rays:
-    """Return rays of any shape in one row."""
+    """Return rays of any shape flattened to one axis."""
     return Rays(
         rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3), rays.near.reshape(-1), rays.far.reshape(-1)
     )  # fmt: skip

@@ -1,7 +1,7 @@
 """Measured rays: colours and distances that sensors measured along half-lines in a reference frame.
 
-One class serves the pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. Each ray holds
-what was measured along it: ``coloured`` marks rays with a colour, and ``distance`` is 0 where none was measured.
+One class represents the pixels of an RGB-D image, the returns of a lidar and the points of structure from
+motion. ``coloured`` marks rays with a colour, and ``distance`` is 0 for rays without a measured distance.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bidnerf_core.geometry.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Half-lines of a reference frame with the colour and the distance that were measured along them."""
+    """Half-lines in a reference frame with the colour and distance measured along them."""
 
     origins: Float[Tensor, "*p 3"]  # metres, reference frame
     directions: Float[Tensor, "*p 3"]  # unit, reference frame
@@ -32,8 +32,8 @@ class Observations:
     def from_points(points: Float[Tensor, "n 3"], T_ref_sensor: SE3) -> Observations:
         """Return rays to ``points`` (metres), as measured by a sensor at the origin of their frame; float64.
 
-        Points that are not finite or lie at the origin are a lidar's missing returns and are left out. Raises ``InputError``
-        where none is left.
+        Points that are not finite or lie at the origin are a lidar's missing returns and are left out. Raises
+        ``InputError`` if none is left.
         """
         points = points.to(torch.float64)
         distance = torch.linalg.vector_norm(points, dim=-1)
@@ -70,7 +70,7 @@ class Observations:
         return len(self.distance)
 
     def __getitem__(self, index: Tensor | slice | None) -> Observations:
-        """Return some of the rays, by their index along the first axis or by a mask; None adds an axis of length 1."""
+        """Return some of the rays, by index along the first axis or by a mask; None adds an axis of length 1."""
         return Observations(*(part[index] for part in self._tensors()))
 
     @property
@@ -104,7 +104,7 @@ class Observations:
         return Observations(origins, directions, rgb, self.distance.reshape(-1), self.coloured.reshape(-1))
 
     def repeated(self, times: int) -> Observations:
-        """Return rays of shape (n) repeated ``times`` times in sequence, for as many poses."""
+        """Repeat rays of shape (n) ``times`` times in sequence, for as many poses."""
         return Observations(*(part.expand(times, *part.shape).flatten(0, 1) for part in self._tensors()))
 
     def drawn(
@@ -114,7 +114,7 @@ class Observations:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Observations:
-        """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more."""
+        """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more than that."""
         if count >= len(self):
             return self.to(device, dtype)
         index = torch.randint(len(self), (count,), generator=generator, device=generator.device)

@@ -31,7 +31,7 @@ class Rendering:
 
     rgb: Float[Tensor, "*r 3"]
     distance: Float[Tensor, "*r"]  # sum of weight times distance, metres: not divided by the opacity
-    opacity: Float[Tensor, "*r"]  # 0 nothing was met, 1 nothing shines through
+    opacity: Float[Tensor, "*r"]  # 0: nothing was hit, 1: fully opaque
     weights: Float[Tensor, "*r s"]
     samples: RaySamples
     density: Float[Tensor, "*r s"] | None = None  # per metre, at the samples
@@ -42,14 +42,15 @@ class RenderedImage:
     """Colour, depth and opacity of each pixel."""
 
     rgb: Float[Tensor, "h w 3"]
-    depth: Float[Tensor, "h w"]  # planar z, metres; 0 where less than half of the ray was stopped
+    depth: Float[Tensor, "h w"]  # planar z, metres; 0 where the opacity is below one half
     opacity: Float[Tensor, "h w"]
 
 
 def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
-    """Return the field's values at the samples (*r s). At samples that are not valid, density is 0.
+    """Return the field's values at the samples (*r s), with density 0 at invalid samples.
 
-    There the field is not queried or, where the host must not wait for the device (see ``waiting``), queried at the origin.
+    The field is not queried at these or, if the host must not wait for the device (see ``may_wait``), queried
+    at the origin.
     """
     valid = samples.valid
     if not may_wait(valid.device) or bool(valid.all()):
@@ -61,10 +62,10 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
 
 @dataclass(frozen=True, eq=False)
 class _ValidSamples:
-    """The valid samples of all rays, one ray after the other, and the field's values there."""
+    """The valid samples of all rays, ray by ray, and the field's values there."""
 
-    index: Int[Tensor, "n"]  # number of each among all samples
-    ray: Int[Tensor, "n"]  # number of each sample's ray
+    index: Int[Tensor, "n"]  # index of each among all samples
+    ray: Int[Tensor, "n"]  # index of each sample's ray
     values: FieldValues
 
 
@@ -82,7 +83,7 @@ def _query_valid(field: RadianceField, rays: Rays, samples: RaySamples) -> _Vali
     count = samples.valid.shape[-1]
     ray, slot = samples.valid.reshape(-1, count).nonzero(as_tuple=True)
     index = ray * count + slot
-    # Positions are computed of these samples only: often most of a row is padding.
+    # Positions are computed only for these samples: often most of a row is padding.
     origins, directions = (
         part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions)
     )
@@ -93,7 +94,7 @@ def _query_valid(field: RadianceField, rays: Rays, samples: RaySamples) -> _Vali
 def _padded(
     values: Float[Tensor, "n"], index: Int[Tensor, "n"], valid: Bool[Tensor, "*r s"]
 ) -> Float[Tensor, "*r s"]:
-    """Return the values of the valid samples at their places, and 0 at the others."""
+    """Return the values of the valid samples in place, and 0 elsewhere."""
     return values.new_zeros(valid.numel()).index_copy(0, index, values).reshape(valid.shape)
 
 
@@ -132,7 +133,9 @@ def render_samples(
 def render_hits(
     hits: RayHits, background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0)
 ) -> Rendering:
-    """Composite what rays meet: ``w_i = alpha_i prod_{j<i} (1 - alpha_j)``, which is eq. 3 with ``alpha = 1 - exp(-sigma dt)``."""
+    """Composite the hits of rays: ``w_i = alpha_i prod_{j<i} (1 - alpha_j)``, which is eq. 3 with ``alpha = 1
+    - exp(-sigma dt)``.
+    """
     passed = torch.cumprod(1 - hits.alpha, dim=-1)
     before = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], dim=-1)[..., : passed.shape[-1]]
     weights = hits.alpha * before
@@ -176,7 +179,8 @@ def render_image(
 ) -> RenderedImage:  # fmt: skip
     """Render a whole image from a pose, ``chunk`` rays at a time.
 
-    ``motion`` is that of the camera from the first row to the last, see ``rolling_shutter``; without it, the camera is at rest.
+    ``motion`` is the camera's motion from the first row to the last, see ``rolling_shutter``; without it, the
+    camera is static.
     """
     pixels = intrinsics.pixel_centres().reshape(-1, 2)
     ray, length = intrinsics.rays(pixels)

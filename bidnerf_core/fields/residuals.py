@@ -1,8 +1,9 @@
-"""The residuals between renderings and measurements, which every rendering method minimises.
+"""Residuals between renderings and measurements, which every rendering method minimizes.
 
-A ``Residual`` compares what is rendered along rays with what was measured there; a ``Term`` adds a robust loss, a weight and
-the rays that it applies to; an ``Objective`` is a sum of terms (eq. 5). Adam uses the objective's ``loss``,
-Levenberg-Marquardt its ``residuals``, ``weights`` and robust factors, so that a change to a residual changes every method.
+A ``Residual`` compares what is rendered along rays with what was measured there; a ``Term`` adds a robust
+loss, a weight and the rays that it applies to; an ``Objective`` is a sum of terms (eq. 5). Adam uses the
+objective's ``loss``, Levenberg-Marquardt its ``residuals``, ``weights`` and robust weights, so a change to a
+residual changes every method.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ class Residual(Protocol):
 class DepthResidual(Protocol):
     """Compares rendered with measured distances.
 
-    ``miss`` is the residual of a ray that meets nothing; None selects the paper's residual, in which such a ray has a
-    rendered distance of 0.
+    ``miss`` is the residual of a ray that hits nothing; None selects the paper's residual, in which such a
+    ray has a rendered distance of 0.
     """
 
     def __call__(
@@ -50,9 +51,10 @@ def depth_residual(
 ) -> Float[Tensor, "*p"]:
     """Return rendered minus measured distance, metres (eq. 5).
 
-    With ``miss`` (metres) it is ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``: the part of a ray that passes through the
-    scene counts as if it met something ``miss`` too far away. The paper's ``sum_i w_i t_i - d`` jumps by the whole distance
-    at every silhouette, where its derivative is of no use to second-order steps.
+    With ``miss`` (metres) it is ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``: the fraction of a ray that
+    passes through the scene counts as if it hit something ``miss`` too far away. The paper's ``sum_i w_i t_i
+    - d`` jumps by the whole distance at every silhouette, where its derivative is of no use to second-order
+    steps.
     """
     if miss is None:
         return rendering.distance - observed.distance
@@ -60,7 +62,7 @@ def depth_residual(
 
 
 TRUNCATION = 0.3
-"""Largest depth difference of a sample (metres) in ``truncated_depth_residual``, where none is given."""
+"""Largest depth difference of a sample (metres) in ``truncated_depth_residual`` if none is given."""
 SURFACE_DEPTH = 0.1
 """Distance (metres) from the first surface within which ``first_surface_residual`` averages."""
 
@@ -70,8 +72,8 @@ def truncated_depth_residual(
 ) -> Float[Tensor, "*p"]:
     """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) miss``, metres, where clip limits to +-``miss``.
 
-    At a silhouette, part of the weight lies on a surface far behind. Here it counts with at most ``miss``, however far away
-    it is; in the paper's residual it counts with its whole distance.
+    At a silhouette, part of the weight lies on a surface far behind. Here its contribution is limited to
+    ``miss``, however far away the surface is; in the paper's residual it counts with its full distance.
     """
     limit = TRUNCATION if miss is None else miss
     off = (rendering.samples.middles - observed.distance[..., None]).clamp(-limit, limit)
@@ -106,10 +108,11 @@ DEPTH_RESIDUALS: dict[str, DepthResidual] = {
 
 
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
-    """Return how far (metres) the matter on a ray lies in front of ``distance - margin``, summed with the rendering weights.
+    """Return how far (metres) matter on a ray lies in front of ``distance - margin``, summed with the
+    rendering weights.
 
-    A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 with matter on both
-    sides of the measured point; this residual cannot.
+    A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 with
+    matter on both sides of the measured point; this residual cannot.
     """
     before = (distance[..., None] - margin - rendering.samples.middles).clamp(min=0)
     return (rendering.weights * before).sum(-1)
@@ -151,7 +154,7 @@ class Objective:
         return torch.stack([term.loss(rendering, observed) for term in self.terms]).sum(0).mean()
 
     def residuals(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        """Return the residuals of all terms side by side; meaningless where ``weights`` is 0."""
+        """Return the residuals of all terms side by side; undefined where ``weights`` is 0."""
         return torch.cat([term.residual(rendering, observed) for term in self.terms], -1)
 
     def weights(self, observed: Observations) -> Float[Tensor, "k p c"]:
@@ -199,7 +202,7 @@ def measured(observed: Observations) -> Bool[Tensor, "*p"]:
 
 
 def colour_term(robust: Robust) -> Term:
-    """Return the photometric term, of weight 1 and three channels."""
+    """Return the photometric term, with weight 1 and three channels."""
     return Term(colour_residual, robust, 1.0, coloured, channels=3)
 
 
@@ -215,7 +218,9 @@ def depth_term(
 
 
 def free_space_term(robust: Robust, weight: float) -> Term:
-    """Return the term for matter in front of the measured distance by more than the scale of ``robust`` (metres)."""
+    """Return the term for matter that lies in front of the measured distance by more than the scale of
+    ``robust`` (metres).
+    """
 
     def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
         return free_space(rendering, observed.distance, robust.scale)[..., None]

@@ -25,19 +25,20 @@ from bidnerf_core.fields.rendering import query_samples, rendering_weights
 from bidnerf_core.fields.voxel_grid import OccupancyMask
 
 EVEN_SHARE = 0.25
-"""Fraction of the borders that ``Concentrated`` spreads evenly, so that matter which the guide lacks is found."""
+"""Fraction of the borders that ``Concentrated`` spreads evenly, so that matter missing from the guide is found."""
 TAIL = 0.005
 """Fraction of a ray's weight, at either end, that ``Concentrated`` leaves to evenly spread intervals."""
 LARGEST_THICKNESS = 0.5
-"""Optical thickness to which ``Concentrated`` limits the guide's intervals. A coarse guide has one density for a cell of
-which only a part is dense; what lies behind the other part must be found as well."""
+"""Optical thickness to which ``Concentrated`` limits the guide's intervals. A coarse guide has a single
+density for a cell that is only partly dense; what lies behind the empty part must be found as well."""
 
 
 @dataclass(frozen=True)
 class Stratified:
-    """``count`` intervals of [near, far]; with jitter, their borders are shifted randomly by up to half an interval.
+    """``count`` intervals of [near, far]; with jitter, their borders are shifted randomly by up to half an
+    interval.
 
-    They are equally long in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
+    They have equal length in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
     """
 
     count: int
@@ -66,8 +67,8 @@ class Stratified:
 class AroundDepth:
     """``count`` equal intervals within ``reach`` metres of the distance measured along each ray.
 
-    With a nearly correct pose they contain all the matter that the ray meets; with a wrong one they are empty. Rays without
-    a measurement (distance 0) are sampled by ``otherwise``.
+    With a nearly correct pose they contain all matter on the ray; with a wrong one they are empty. Rays
+    without a measurement (distance 0) are sampled by ``otherwise``.
     """
 
     distance: Float[Tensor, "*r"]  # metres along the rays to be sampled
@@ -88,7 +89,7 @@ class AroundDepth:
 
 @dataclass(frozen=True, eq=False)
 class HitsAroundDepth:
-    """A field whose hits are only those within ``reach`` metres of the distance measured along each ray, see ``AroundDepth``."""
+    """A field restricted to hits within ``reach`` metres of the distance measured along each ray, see ``AroundDepth``."""
 
     field: HitField
     distance: Float[Tensor, "*r"]  # metres along the rays to be rendered; 0 where nothing was measured
@@ -123,7 +124,7 @@ class OccupiedOnly:
 
 @dataclass(frozen=True)
 class Resampled:
-    """A field with another sampler in place of its own."""
+    """A field with its sampler replaced by another."""
 
     field: RadianceField
     sampler: RaySampler
@@ -156,15 +157,16 @@ def either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySam
 
 @dataclass(frozen=True)
 class Importance:
-    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its weight.
+    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its
+    weight.
 
-    The field's own valid intervals are cut at ``count`` more places; what its sampler skips, as an occupancy grid does,
-    remains skipped. No gradient flows through the choice of places.
+    The field's own valid intervals are split at ``count`` more places; what its sampler skips, as an
+    occupancy grid does, remains skipped. No gradient flows through the choice of places.
     """
 
     field: RadianceField
     count: int
-    padding: float = 1e-5  # added to the weight of each interval, so that some places are found anywhere
+    padding: float = 1e-5  # added to the weight of each interval, so that every interval gets some places
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         with torch.no_grad():
@@ -179,9 +181,11 @@ class Importance:
 def inverse_transform(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> tuple[Float[Tensor, "*r n"], Int[Tensor, "*r n"]]:
-    """Return ``count`` distances distributed as ``weights`` (piecewise constant over the intervals), by inverting their CDF.
+    """Return ``count`` distances distributed as ``weights`` (piecewise constant over the intervals), by
+    inverting their CDF.
 
-    They are in ascending order, each with the index of its interval. On a ray without weight, all are in its first interval.
+    They are in ascending order, each with the index of its interval. On a ray without weight, all are in its
+    first interval.
     """
     cdf = torch.cumsum(weights, dim=-1)
     cdf = cdf / cdf[..., -1:].clamp(min=torch.finfo(cdf.dtype).tiny)
@@ -203,7 +207,7 @@ def inverse_transform(
 def gathered(samples: RaySamples) -> RaySamples:
     """Return the samples with valid intervals first, and without overlaps from rounding."""
     starts, ends, valid = samples.parts
-    # Sorting costs more than all the rest; most samplers return the valid intervals first.
+    # Sorting costs more than everything else; most samplers return the valid intervals first.
     if not (may_wait(valid.device) and bool((valid[..., 1:] <= valid[..., :-1]).all())):
         order = (~valid).sort(dim=-1, stable=True).indices
         starts, ends, valid = (part.gather(-1, order) for part in (starts, ends, valid))
@@ -213,14 +217,15 @@ def gathered(samples: RaySamples) -> RaySamples:
 
 
 def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*r n"]) -> RaySamples:
-    """Return the gathered intervals ``rough``, cut at ``places``, which lie in the intervals ``owner``.
+    """Return the gathered intervals ``rough``, split at ``places``, which lie in the intervals ``owner``.
 
-    A piece begins at the start of an interval or at a place in it, and ends at the next place or at the interval's end.
+    A piece begins at the start of an interval or at a place in it, and ends at the next place or at the
+    interval's end.
     """
     first = torch.arange(rough.starts.shape[-1], device=owner.device).expand(rough.starts.shape)
     owner = torch.cat([owner, first], dim=-1)
     valid = rough.valid.gather(-1, owner)
-    # Places go first: where a place and a start coincide, the piece from the start is the longer one.
+    # Places go first: if a place and a start coincide, the piece from the start is the longer one.
     starts, order = (
         torch.cat([places, rough.starts], dim=-1).where(valid, torch.inf).sort(dim=-1, stable=True)
     )
@@ -232,7 +237,7 @@ def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*
 
 
 class HierarchicalField(nn.Module):
-    """A field of two levels, of which the coarse one places the samples of the fine one; subclasses make both."""
+    """A field with two levels; the coarse one places the samples of the fine one. Subclasses create both."""
 
     coarse: RadianceField
     fine: RadianceField
@@ -252,15 +257,19 @@ class HierarchicalField(nn.Module):
 
 @runtime_checkable
 class SplittingSampler(RaySampler, Protocol):
-    """A sampler that returns rays with many intervals apart, so that short rows are not padded to the length of long ones."""
+    """A sampler that returns rays with many intervals separately, so that short rows are not padded to the
+    length of long ones.
+    """
 
     def split_by_count(
         self, rays: Rays, count: int, jitter: Generator | None = None
     ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
-        """Return the samples of all rays, the (flattened) indices of rays with more than ``count``, and the samples of these.
+        """Return the samples of all rays, the (flattened) indices of rays with more than ``count``, and the
+        samples of these.
 
-        The intervals are those of ``__call__`` with the same ``jitter``. In the first part, rows are at most ``count`` long,
-        and what they hold for the rays with more has no meaning. Called only where the host may wait for the device.
+        The intervals are those of ``__call__`` with the same ``jitter``. In the first part, rows have at most
+        ``count`` entries, which are meaningless for the rays with more. Called only if the host may wait for
+        the device.
         """
         ...
 
@@ -268,7 +277,7 @@ class SplittingSampler(RaySampler, Protocol):
 def _split(
     sampler: RaySampler, rays: Rays, count: int, jitter: Generator | None
 ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
-    """Return any sampler's intervals, gathered, as a ``SplittingSampler`` does."""
+    """Split any sampler's intervals, gathered, as a ``SplittingSampler`` does."""
     if isinstance(sampler, SplittingSampler):
         few, many, rest = sampler.split_by_count(rays, count, jitter)
         return gathered(few), many, gathered(rest)
@@ -279,11 +288,11 @@ def _split(
 
 @dataclass(frozen=True)
 class Concentrated:
-    """At most ``count`` intervals of each ray, short where the field ``guide`` has its weight and long elsewhere.
+    """At most ``count`` intervals per ray, short where the field ``guide`` has its weight and long elsewhere.
 
-    Three quarters of the borders divide the guide's weight over its own valid intervals into equal parts; the others divide
-    their length. Each interval is as long as what it replaces. A ray with ``count`` intervals or fewer keeps them. No gradient
-    flows through the choice.
+    Three quarters of the borders divide the guide's weight over its own valid intervals into equal parts; the
+    others divide their length. Each interval is as long as what it replaces. A ray with ``count`` intervals
+    or fewer keeps them. No gradient flows through the choice.
     """
 
     guide: RadianceField
@@ -304,7 +313,9 @@ class Concentrated:
         return RaySamples(*merged).unflattened(rays.near.shape)
 
     def _of_known_shape(self, rays: Rays, jitter: Generator | None) -> RaySamples:
-        """Return the intervals without waiting for the device: all rays are concentrated, also those that keep theirs."""
+        """Return the intervals without waiting for the device: all rays are concentrated, including those
+        that keep theirs.
+        """
         rough = gathered(self.guide.sampler(rays, jitter))
         if rough.starts.shape[-1] <= self.count:
             return rough
@@ -325,7 +336,7 @@ def _first(samples: RaySamples, count: int) -> RaySamples:
 def concentrated(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> RaySamples:
-    """Return ``count`` intervals in place of ``samples``, short where ``weights`` are large, see ``Concentrated``."""
+    """Replace ``samples`` by ``count`` intervals that are short where ``weights`` are large, see ``Concentrated``."""
     length = torch.where(samples.valid, samples.ends - samples.starts, 0)
     laid = pad(length.cumsum(-1), (1, 0))  # borders of the intervals, laid end to end
     border = _borders(weights, length, laid, count, jitter)
@@ -358,7 +369,9 @@ def _borders(
 
 
 def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:
-    """Return ``count`` numbers from 0 to 1 in equal steps; with jitter, the inner ones are shifted by up to half a step."""
+    """Return ``count`` evenly spaced numbers from 0 to 1; with jitter, the inner ones are shifted by up to
+    half a step.
+    """
     levels = torch.linspace(0, 1, count, dtype=like.dtype, device=like.device).repeat(*like.shape[:-1], 1)
     if jitter is not None and count > 2:
         shift = torch.rand((*like.shape[:-1], count - 2), generator=jitter, device=jitter.device) - 0.5
@@ -369,7 +382,7 @@ def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -
 def _interpolated(
     at: Float[Tensor, "*r n"], x: Float[Tensor, "*r s"], y: Float[Tensor, "*r s"]
 ) -> Float[Tensor, "*r n"]:
-    """Return the piecewise linear function through the points (x, y), x ascending, at ``at``."""
+    """Evaluate at ``at`` the piecewise linear function through the points (x, y), x ascending."""
     right = torch.searchsorted(x.contiguous(), at.contiguous(), right=True).clamp(1, x.shape[-1] - 1)
     x0, x1, y0, y1 = (part.gather(-1, index) for part in (x, y) for index in (right - 1, right))
     slope = (y1 - y0) / (x1 - x0).clamp(min=torch.finfo(x.dtype).tiny)

@@ -1,4 +1,4 @@
-"""A field in a world whose lengths are multiples of those that it was trained in."""
+"""A field in a world scaled relative to the one it was trained in."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ from bidnerf_core.fields.contract import (
 
 
 class ScaledField(nn.Module):
-    """A field whose world is ``scale`` times as large as that of the field in it; colours stay, densities are per new length."""
+    """A field whose world is ``scale`` times as large as that of the wrapped field; colours stay, and
+    densities are per new length.
+    """
 
     def __init__(self, field: RadianceField, scale: float) -> None:
         super().__init__()
@@ -47,17 +49,17 @@ class ScaledField(nn.Module):
 
 
 class ScaledHitField(ScaledField):
-    """A scaled field that finds what whole rays meet."""
+    """A scaled field that computes the hits of whole rays."""
 
     def hits(self, rays: Rays) -> RayHits:
-        """Return what rays of the scaled world meet."""
+        """Return the hits of rays in the scaled world."""
         trained: HitField = self.trained
         found = trained.hits(shrunk(rays, self.scale))
         return replace(found, distance=found.distance * self.scale)
 
 
 class ScaledSplatField(ScaledHitField):
-    """A scaled field that is made of pieces."""
+    """A scaled field that consists of pieces."""
 
     def splats(self) -> Splats:
         """Return the pieces in the scaled world."""
@@ -67,14 +69,14 @@ class ScaledSplatField(ScaledHitField):
 
 
 def scaled_field(field: RadianceField, scale: float) -> ScaledField:
-    """Return a field in a world that is ``scale`` times as large; it offers what ``field`` does."""
+    """Return a field in a world that is ``scale`` times as large; it has the same optional parts as ``field``."""
     if isinstance(field, HitField) and isinstance(field, SplatField):
         return ScaledSplatField(field, scale)
     return (ScaledHitField if isinstance(field, HitField) else ScaledField)(field, scale)
 
 
 def shrunk(rays: Rays, scale: float) -> Rays:
-    """Return rays of a scaled world in the world of the field."""
+    """Convert rays of a scaled world to the world of the field."""
     return Rays(rays.origins / scale, rays.directions, rays.near / scale, rays.far / scale)
 
 
@@ -92,5 +94,5 @@ class ScaledSampler:
 
 
 def trained_field(field: RadianceField) -> RadianceField:
-    """Return the field as its backend built it, in the unit of its training, whose weights are what is stored."""
+    """Return the field as its backend built it, in the unit of its training; its weights are the ones stored."""
     return field.trained if isinstance(field, ScaledField) else field

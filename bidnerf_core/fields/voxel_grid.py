@@ -1,7 +1,7 @@
-"""Voxel grids: cubic cells that cover a box, and the look-up of a value for the cell that holds a point.
+"""Voxel grids: cubic cells that cover a box, and look-up of the value of the cell that contains a point.
 
-A grid is only geometry; the values of its cells are tensors of its shape, which the classes that use it store. All look-ups
-go through ``VoxelGrid.at``.
+A grid is only geometry; the values of its cells are tensors of its shape, stored by the classes that use it.
+All look-ups go through ``VoxelGrid.at``.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from bidnerf_core.fields.contract import Rays, SceneBounds
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Cubic cells, axis-aligned in the world. A cell's number counts z fastest, then y, then x."""
+    """Cubic cells, axis-aligned in the world. Cell indices count z fastest, then y, then x."""
 
     lower: tuple[float, float, float]  # metres, world: lower corner of the first cell
     cell: float  # metres: side of a cell
     shape: tuple[int, int, int]  # cells along x, y and z
-    # The scene whose contracted space the grid divides, in the coordinates of ``SceneBounds.normalized``; None: the world.
+    # The scene whose contracted space the grid divides, in the coordinates of ``SceneBounds.normalized``;
+    # None: the world.
     contracted: SceneBounds | None = None
 
     @staticmethod
     def cube(bounds: SceneBounds, resolution: int) -> VoxelGrid:
         """Return the grid of the modelled cube, ``resolution`` cells wide.
 
-        This is the cube around the box's centre with the box's longest side or, where the scene is contracted, the cube into
-        which all space is contracted.
+        This is the cube around the box's centre with the box's longest side or, if the scene is contracted,
+        the cube into which all space is contracted.
         """
         if bounds.contracted:
             return VoxelGrid((-1.0, -1.0, -1.0), 2 / resolution, (resolution,) * 3, bounds)
@@ -104,7 +105,9 @@ class VoxelGrid:
 
 
 class OccupancyMask(nn.Module):
-    """A grid whose cells are marked as occupied or empty: where there may be matter. At first all cells are occupied."""
+    """A grid whose cells are marked as occupied or empty, according to where there may be matter. Initially
+    all cells are occupied.
+    """
 
     cells: Bool[Tensor, "x y z"]
 
@@ -114,5 +117,7 @@ class OccupancyMask(nn.Module):
         self.register_buffer("cells", torch.ones(grid.shape, dtype=torch.bool))
 
     def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        """Return whether there may be matter at ``positions`` (metres, world); outside the grid, border cells decide."""
+        """Return whether there may be matter at ``positions`` (metres, world); outside the grid, the nearest
+        border cell decides.
+        """
         return self.grid.at(self.cells, positions)

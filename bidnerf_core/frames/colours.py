@@ -1,4 +1,4 @@
-"""The colours of a frame: floats in [0, 1] to whoever asks, bytes in memory where they were given as bytes."""
+"""The colours of a frame: read as floats in [0, 1], but held as bytes in memory if they were given as bytes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ FULL_BYTE = 255
 class Colours:
     """The attribute ``rgb`` of a frame.
 
-    Colours that are given as bytes stay bytes, a quarter of the memory of floats, and are converted whenever they are asked
-    for. The last conversion is returned again for as long as somebody holds it, so its identity does not change meanwhile.
+    Colours given as bytes stay bytes, a quarter of the memory of floats, and are converted on access. The
+    last conversion is returned again while a reference to it exists, so its identity does not change
+    meanwhile.
     """
 
     def __get__(self, frame: Any, owner: type | None = None) -> Any:
@@ -38,21 +39,21 @@ class Colours:
 
 
 HELD, LAST = "_rgb", "_rgb_as_floats"
-"""Names under which a frame holds its colours, and a weak reference to the last conversion of them."""
+"""Names of the attributes that hold a frame's colours, and a weak reference to their last conversion."""
 
 
 def as_floats(colours: Shaped[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Return bytes as floats in [0, 1]; floats are returned as they are."""
+    """Convert bytes to floats in [0, 1]; floats are returned unchanged."""
     return colours.float().div_(FULL_BYTE) if colours.dtype == torch.uint8 else colours
 
 
 def as_bytes(colours: Float[Tensor, "*n"]) -> Shaped[Tensor, "*n"]:
-    """Return floats in [0, 1] rounded to bytes."""
+    """Round floats in [0, 1] to bytes."""
     return (colours * FULL_BYTE).round_().clamp_(0, FULL_BYTE).to(torch.uint8)
 
 
 def are_bytes(colours: Float[Tensor, "*n"]) -> bool:
-    """Return whether floats are exactly those of bytes."""
+    """Return whether floats are exactly representable as bytes."""
     return torch.equal(as_floats(as_bytes(colours)), colours)
 
 

@@ -1,4 +1,4 @@
-"""Images with their cameras, and images with their cameras' poses."""
+"""Images with their cameras, and posed images."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from bidnerf_core.io.images import (
 )
 
 SPARSE = 0.05
-"""Share of an image's pixels below which measured depth is sparse: the pixels in between then remain unknown."""
+"""Fraction of pixels with depth below which depth counts as sparse: the pixels in between then remain unknown."""
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -47,32 +47,33 @@ class Frame:
     """One RGB or RGB-D image. Depth is planar z in metres, 0 where nothing was measured; NaN becomes 0."""
 
     name: str
-    # rgb is in [0, 1], already over the background where there was an alpha channel; alpha is 1 where the scene covers
-    # the pixel and 0 where the background shows. All are dense tensors of the size of the camera's image, of finite
-    # floats, which is checked here. Colours may be given as bytes (uint8): they are held so, and read as floats.
+    # rgb is in [0, 1], already composited over the background if there was an alpha channel; alpha is 1 where
+    # the scene covers the pixel and 0 where the background shows. All are dense tensors of the camera's image
+    # size with finite floats, which is checked here. Colours may be given as bytes (uint8): they are stored
+    # as bytes and read as floats.
     rgb: Float[Tensor, "h w channels"]
     intrinsics: Intrinsics
     depth: Float[Tensor, "dh dw"] | None = None
     alpha: Float[Tensor, "ah aw"] | None = None
     camera_source: str | None = None
-    """One line about the source of the intrinsics, in frames that ``open`` returned."""
+    """One line about the source of the intrinsics, for frames returned by ``open``."""
 
     focal_is_approximate: bool = False
-    """Whether the focal length is a nominal one, such as that in EXIF, which may be off by several percent."""
+    """Whether the focal length is only nominal, as in EXIF, and may be off by several percent."""
 
     has_colour: bool = True
-    """Whether colours were recorded. Where only depth was, as between the photos of a LiDAR scan, ``rgb`` is black."""
+    """Whether colours were recorded. If only depth was, as between the photos of a LiDAR scan, ``rgb`` is black."""
 
     hidden: Bool[Tensor, "hh hw"] | None = None
-    """The pixels where something that the map does not have hides the scene.
+    """The pixels where the scene is hidden by something that is not part of the map.
 
-    Masks are read into it (see ``masks``). Depth counts as not measured there. No rays are drawn there, no keypoints are
-    detected, no points are followed and no landmarks are expected; the thumbnails of a search by colour alone continue the
-    colours around it.
+    Masks are read into it (see ``masks``). Depth there counts as not measured. No rays are drawn there, no
+    keypoints are detected, no points are tracked and no landmarks are expected; the thumbnails used to search
+    by colour alone are filled in from the surrounding colours.
     """
 
     lens: Lens | None = None
-    """The lens from whose image those of the frame were resampled on reading, where that was no pinhole camera."""
+    """The non-pinhole lens whose image was resampled to the frame's on reading, if there was one."""
 
     orientation: Orientation = UPRIGHT
     """How the image in its file was turned upright on reading."""
@@ -98,7 +99,7 @@ class Frame:
     def _hide(self, hidden: Bool[Tensor, "h w"]) -> None:
         expected = "expected booleans that leave something visible"
         if hidden.dtype != torch.bool:
-            raise InputError(f"frame {self.name}: hidden is of {hidden.dtype}, {expected}")
+            raise InputError(f"frame {self.name}: hidden has dtype {hidden.dtype}, {expected}")
         if bool(hidden.all()):
             raise WhollyHidden(f"frame {self.name}: hidden is all true, {expected}")
         if self.depth is not None and bool((self.depth[hidden.to(self.depth.device)] != 0).any()):
@@ -122,22 +123,24 @@ class Frame:
     ) -> Frame:
         """Read a photo, turn it upright according to its EXIF orientation, and find its camera.
 
-        The camera is ``camera`` (intrinsics, or a file, see ``bidnerf_core.camera.files``; photos of fisheye lenses are undistorted),
-        or has the focal length ``focal`` (pixels of the image file), or the horizontal field of view ``hfov`` (degrees, of
-        the upright image); at most one of them. Without them it comes from the focal length in EXIF or, where there is none,
-        from the ``assumed`` cameras, for instance those of a map's landmarks (``map.landmarks.cameras``). A camera of another
-        resolution is scaled, and one of the image as stored is turned with it. ``camera_source`` of the result describes in
-        one line where the camera comes from.
+        The camera is given by at most one of ``camera`` (intrinsics, or a file, see
+        ``bidnerf_core.camera.files``; photos from fisheye lenses are undistorted), ``focal`` (focal length in
+        pixels of the image file) and ``hfov`` (horizontal field of view of the upright image, degrees).
+        Otherwise it comes from the focal length in EXIF or, failing that, from the ``assumed`` cameras, for
+        instance those of a map's landmarks (``map.landmarks.cameras``). A camera for another resolution is
+        scaled, and one that describes the image as stored is turned with it. ``camera_source`` of the result
+        states in one line where the camera comes from.
 
-        ``depth`` is an image or a ``.npy`` file of planar z, in steps of ``depth_unit`` metres. Without a unit, 0.001 m is
-        assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists values that mean "nothing
-        measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become 0. Depth of another resolution is resampled
-        to the nearest measurement. ``background`` (rgb in [0, 1], "white" or "black") lies behind transparent pixels. Where
-        the longer side has more than ``largest`` pixels, the image is reduced to that size. ``mask`` is an image whose black
-        pixels (white ones with ``mask_hides="white"``) show what is not to be used: they become ``hidden``.
+        ``depth`` is an image or a ``.npy`` file of planar z, in steps of ``depth_unit`` metres. Without a
+        unit, 0.001 m is assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists
+        values that mean "nothing measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become
+        0. Depth at another resolution is resampled to the nearest measurement. ``background`` (rgb in [0, 1],
+        "white" or "black") lies behind transparent pixels. If the longer side exceeds ``largest`` pixels, the
+        image is downscaled to that size. ``mask`` is an image whose black pixels (white ones with
+        ``mask_hides="white"``) are ignored: they become ``hidden``.
 
-        Raises ``InputError`` where a file is not readable or has more than 100 megapixels, where the camera is not known or
-        given twice, and where camera or depth belong to an image of another aspect ratio.
+        Raises ``InputError`` if a file cannot be read or exceeds 100 megapixels, if the camera is unknown or
+        given twice, and if camera or depth belong to an image of another aspect ratio.
         """
         given = CameraSource(camera, focal, hfov, tuple(assumed))
         return Frame.read(
@@ -158,7 +161,7 @@ class Frame:
         mask: str | Path | None = None,
         mask_hides: HiddenColour = "black",
     ) -> Frame:
-        """Read a photo as ``open`` does; depth is registered to it from ``sensor``, if there is one."""
+        """Read a photo as ``open`` does; depth is registered to it from ``sensor``, if given."""
         path = Path(path)
         photo = read_photo(
             path,
@@ -187,9 +190,10 @@ class Frame:
 
     @staticmethod
     def taken(name: str, camera: Camera, images: Images, **about: Any) -> Frame:
-        """Return the frame of upright images that ``camera`` took; those of a ``Lens`` are resampled to its pinhole camera.
+        """Return the frame of upright images taken by ``camera``; those of a ``Lens`` are resampled to its
+        pinhole camera.
 
-        ``about`` holds other attributes of the frame, as for its constructor.
+        ``about`` holds further attributes of the frame, as for its constructor.
         """
         intrinsics = camera
         if isinstance(camera, Lens):
@@ -199,9 +203,10 @@ class Frame:
         return Frame(name, images.rgb, intrinsics, images.depth, images.alpha, hidden=hidden, **about)  # type: ignore[arg-type]
 
     def with_hidden(self, hidden: Bool[Tensor, "h w"] | None) -> Frame:
-        """Return the frame with more pixels hidden; the frame itself where ``hidden`` is None or false everywhere.
+        """Return the frame with more pixels hidden; the frame itself if ``hidden`` is None or false
+        everywhere.
 
-        Raises ``WhollyHidden`` where nothing would be left.
+        Raises ``WhollyHidden`` if nothing would be left.
         """
         if hidden is None or not bool(hidden.any()):
             return self
@@ -219,29 +224,31 @@ class Frame:
         name: str = "image",
         background: Background = BLACK,
     ) -> Frame:
-        """Make a frame from NumPy arrays or torch tensors.
+        """Build a frame from NumPy arrays or torch tensors.
 
-        ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a second or
-        fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are straight (not premultiplied) and
-        laid over ``background``. ``depth`` (planar z) and ``depth_unit`` are as in ``open``, as is scaling of ``camera``.
-        ``hidden`` (h, w) holds booleans, true where a pixel is not to be used.
+        ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a
+        second or fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are
+        straight (not premultiplied) and composited over ``background``. ``depth`` (planar z), ``depth_unit``
+        and the scaling of ``camera`` are as in ``open``. ``hidden`` (h, w) holds booleans, true where a pixel
+        is to be ignored.
 
-        Raises ``InputError`` for other types and shapes, NaN, floats outside [0, 1], and where camera or depth belong to
-        an image of another aspect ratio.
+        Raises ``InputError`` for other types and shapes, NaN, floats outside [0, 1], and if camera or depth
+        belong to an image of another aspect ratio.
         """
         where = f"frame {name}"
         given: Any = camera
         if not isinstance(given, Intrinsics):
             found = type(given).__name__
             raise InputError(
-                f"{where}: camera is a {found}, expected Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...)"
-                " or, of a matrix, Intrinsics.from_opencv(K, distortion, (width, height))"
+                f"{where}: camera is a {found}, expected Intrinsics(fx=..., fy=..., cx=..., cy=...,"
+                " width=..., height=...) or, from a matrix, Intrinsics.from_opencv(K, distortion, (width,"
+                " height))"
             )
         colour, cover = split_alpha(pixel_array(rgb, f"{where}: rgb"))
         if alpha is not None:
             if cover is not None:
                 raise InputError(
-                    f"{where}: rgb has an alpha channel, and alpha is given; expected one of them"
+                    f"{where}: rgb has an alpha channel, and alpha is given; expected only one of them"
                 )
             cover = _mask(alpha, (colour.shape[1], colour.shape[0]), where)
         raster = Raster(colour.shape[1], colour.shape[0])
@@ -249,7 +256,8 @@ class Frame:
         if intrinsics is None:
             found, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"
             raise InputError(
-                f"{where}: rgb is {found}, its camera expects {expected} or a size of the same aspect ratio"
+                f"{where}: rgb is {found}, but its camera expects {expected} or a size of the same aspect"
+                " ratio"
             )
         metres = None
         if depth is not None:
@@ -264,7 +272,7 @@ class Frame:
         return Frame(name, laid, intrinsics, metres, cover, hidden=unused)
 
     def to(self, device: torch.device | str) -> Frame:
-        """Return the frame with its images on ``device``; the frame itself where they lie there."""
+        """Return the frame with its images on ``device``; the frame itself if they are already there."""
         others = (self.depth, self.alpha, self.hidden)
         depth, alpha, hidden = (None if image is None else image.to(device) for image in others)
         rgb = self.held_rgb.to(device)
@@ -274,19 +282,20 @@ class Frame:
 
     @property
     def held_rgb(self) -> Shaped[Tensor, "h w channels"]:
-        """The colours as they are held: bytes from 0 to 255, or floats in [0, 1]."""
+        """The colours as stored: bytes from 0 to 255, or floats in [0, 1]."""
         held: Tensor = self.__dict__[HELD]
         return held
 
     def with_images(self, **images: Tensor | None) -> Frame:
-        """Return the frame with other depth, alpha or hidden pixels; its colours stay bytes where they are."""
+        """Return the frame with other depth, alpha or hidden pixels; colours stored as bytes stay bytes."""
         return replace(self, rgb=self.held_rgb, **images)  # type: ignore[arg-type]
 
     def at_most(self, largest: int) -> Frame:
-        """Return the frame reduced to ``largest`` pixels along its longer side; the frame itself where it has no more.
+        """Return the frame downscaled to ``largest`` pixels along its longer side; the frame itself if it is
+        not larger.
 
-        Colours become means over areas, rounded to bytes. Depth is that of the nearest pixel, and a pixel is hidden where any
-        that it covers is.
+        Colours are averaged over areas and rounded to bytes. Depth is that of the nearest pixel, and a pixel
+        is hidden if any pixel it covers is.
         """
         camera = self.intrinsics
         if max(camera.width, camera.height) <= largest:
@@ -303,7 +312,7 @@ class Frame:
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy of the frame is made of: all but the weak reference to its colours as floats."""
+        """Return the state for copying: everything except the weak reference to the colours as floats."""
         return {name: value for name, value in self.__dict__.items() if name != LAST}
 
     @property
@@ -318,11 +327,13 @@ class Frame:
 
 
 Frame.rgb = Colours()  # type: ignore[assignment]
-"""Set after the class was made: in its body, it would be taken for a default value."""
+"""Set after the class was created: in its body, it would be taken for a default value."""
 
 
 def _check_image(where: str, what: str, image: object, camera: Intrinsics, channels: int | None) -> None:
-    """Raise ``InputError`` for anything but a tensor of the camera's size, of finite floats unless it is ``hidden``."""
+    """Raise ``InputError`` unless the image is a tensor of the camera's size with finite floats (booleans if
+    ``hidden``).
+    """
     if not isinstance(image, Tensor):
         raise InputError(
             f"{where}: {what} is a {type(image).__name__}, expected a tensor; Frame.from_numpy takes arrays"
@@ -333,14 +344,18 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, chann
         hint = "; Frame.from_numpy takes grey and RGBA" if what == "rgb" else ""
         raise InputError(f"{where}: {what} has shape {found}, expected {expected}{hint}")
     if found[:2] != size:
-        raise InputError(f"{where}: {what} is {found[1]}x{found[0]}, its camera expects {size[1]}x{size[0]}")
+        raise InputError(
+            f"{where}: {what} is {found[1]}x{found[0]}, but its camera expects {size[1]}x{size[0]}"
+        )
     if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
         raise InputError(f"{where}: {what} is a sparse tensor or has no values, expected a dense one")
     if what == "hidden" or (what == "rgb" and image.dtype == torch.uint8):
         return
     if not image.is_floating_point():
         scale = "bytes or floats in [0, 1]" if what == "rgb" else "floats"
-        raise InputError(f"{where}: {what} is of {str(image.dtype).removeprefix('torch.')}, expected {scale}")
+        raise InputError(
+            f"{where}: {what} has dtype {str(image.dtype).removeprefix('torch.')}, expected {scale}"
+        )
     if image.requires_grad:
         raise InputError(f"{where}: {what} requires a gradient, expected measured values; detach() them")
     if what != "depth" and not _is_finite(image):
@@ -348,15 +363,16 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, chann
 
 
 def _is_finite(image: Tensor) -> bool:
-    """Return whether all values are finite. On an accelerator this is not looked at: waiting for it would delay each frame."""
-    # The sum is cheaper than a mask, which is only made where the sum is not finite.
+    """Return whether all values are finite. On an accelerator this is skipped: waiting for it would delay each frame."""
+    # The sum is cheaper than a mask, which is only computed if the sum is not finite.
     return image.device.type != "cpu" or math.isfinite(image.sum()) or bool(image.isfinite().all())
 
 
 def _require_rays(where: str, camera: Intrinsics) -> None:
     if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
         raise InputError(
-            f"{where}: distortion is {camera.distortion}, which maps no ray to some of its pixels; expected a real lens's"
+            f"{where}: distortion is {camera.distortion}, which maps no ray to some of its pixels; expected"
+            " coefficients of a real lens"
         )
 
 
@@ -377,7 +393,7 @@ def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Floa
 
 @dataclass(frozen=True, eq=False)
 class SeenLandmarks:
-    """Landmarks that an image shows, and their distances from its camera."""
+    """Landmarks visible in an image, and their distances from its camera."""
 
     pixels: Float[Tensor, "n 2"]  # column and row; the centre of the first pixel is (0.5, 0.5)
     distance: Float[Tensor, "n"]  # metres from the camera, not z
@@ -386,14 +402,13 @@ class SeenLandmarks:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A frame and the pose of its camera in some reference frame: the world, or the last camera of a rig."""
+    """A frame and its camera's pose in some reference frame: the world, or the last camera of a rig."""
 
     frame: Frame
     T_ref_camera: SE3
     landmarks: SeenLandmarks | None = None  # those from which training takes distances
     motion: Float[Tensor, "6"] | None = None
-    """Motion of the camera while its rows were exposed one after another, see ``rolling_shutter``; the pose is then that of
-    the middle row."""
+    """Motion of the camera during readout, see ``rolling_shutter``; the pose is then that of the middle row."""
 
     def to(self, device: torch.device | str) -> View:
         """Return the view with its images and its pose on ``device``."""

@@ -1,4 +1,4 @@
-"""Values of pixels of many images at once, wherever in memory the images lie."""
+"""Pixel values of many images at once, wherever in memory the images are."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ MOST_BLOCKS = 64
 
 @dataclass(frozen=True, eq=False)
 class ImagePixels:
-    """The pixels of images with the same number of channels; those of an image are numbered row by row."""
+    """The pixels of images with the same number of channels; pixels of an image are numbered row by row."""
 
     blocks: Sequence[Shaped[Tensor, "_"]]  # each flat; of one type within a block
-    block: Int[Tensor, "v"]  # number of the block that holds each image; -1 where there is no image
+    block: Int[Tensor, "v"]  # index of the block that holds each image; -1 if there is no image
     start: Int[Tensor, "v"]  # index of its first value in that block
     channels: int
-    default: float = 0.0  # the value of images that are missing
+    default: float = 0.0  # the value of missing images
 
     @staticmethod
     def of(images: Sequence[Tensor | None], channels: int, default: float = 0.0) -> ImagePixels:
-        """Return the pixels of ``images``; None has the value ``default`` everywhere. Images that share few blocks of memory
-        are not copied.
+        """Build this from ``images``; None has the value ``default`` everywhere. Images that share few blocks
+        of memory are not copied.
         """
         present = [image.detach().cpu().contiguous() for image in images if image is not None]
         if len({_block(image) for image in present}) > MOST_BLOCKS:
@@ -45,7 +45,7 @@ class ImagePixels:
         return ImagePixels(blocks, block, start, channels, default)
 
     def at(self, image: Int[Tensor, "p"], pixel: Int[Tensor, "p"]) -> Float[Tensor, "p c"]:
-        """Return the values of pixels, each of the image of that number; bytes become floats in [0, 1]."""
+        """Return the values of pixels, each from the image with that index; bytes become floats in [0, 1]."""
         block = self.block[image]
         first = self.start[image] + pixel * self.channels
         index = first[:, None] + torch.arange(self.channels)
@@ -68,7 +68,7 @@ def _place(image: Tensor, numbers: dict[tuple[int, torch.dtype], int]) -> tuple[
 
 
 def _together(images: Sequence[Tensor]) -> list[Tensor]:
-    """Return copies of images in one block: of bytes if all are, else of floats."""
+    """Copy images into one block, of bytes if all are bytes, else of floats."""
     kind = torch.uint8 if all(image.dtype == torch.uint8 for image in images) else torch.float32
     whole = torch.empty(sum(image.numel() for image in images), dtype=kind)
     found, first = [], 0

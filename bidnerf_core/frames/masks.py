@@ -1,7 +1,7 @@
-"""Masks: images that tell which pixels of a photo to leave out, such as those of people who walk through the scene.
+"""Masks: images that mark which pixels of a photo to ignore, such as people who walk through the scene.
 
-A mask is read into the boolean image ``Frame.hidden``. By the convention of nerfstudio and COLMAP, black is left out and
-everything brighter is used; masks of segmentation often mark what is to be left out in white instead.
+A mask is read into the boolean image ``Frame.hidden``. By the convention of nerfstudio and COLMAP, black is
+ignored and everything brighter is used; segmentation masks often mark the region to ignore in white instead.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.io.images import IMAGE_SUFFIXES, decode, resampled
 
 HiddenColour = Literal["black", "white"]
-"""The colour in masks of the pixels that are left out."""
+"""The colour in masks of the pixels that are ignored."""
 INVERTED = "if it marks what should be used, the masks are inverted (--mask-hides, mask_hides in Python)"
 BRIGHT = 0.5
-"""Share of the largest value of the file's type from which a pixel counts as white."""
+"""Fraction of the largest value of the file's type above which a pixel counts as white."""
 MOSTLY = 0.5
-"""Share of the pixels, in most images, above which masks may be inverted."""
+"""Fraction of hidden pixels, in most images, above which masks may be inverted."""
 PREFIXES, SUFFIXES = ("dynamic_mask_", "mask_"), ("_mask", ".mask", "-mask")
-"""What may stand before and behind the name of a photo in the name of its mask."""
+"""Prefixes and suffixes that turn the name of a photo into the name of its mask."""
 
 
 class WhollyHidden(InputError):
-    """A mask hides all of its image, of which nothing is left to use."""
+    """A mask hides its entire image, which leaves nothing to use."""
 
 
 def read_mask(
@@ -44,12 +44,13 @@ def read_mask(
 ) -> Bool[Tensor, "h w"]:
     """Return which pixels of an image of ``size`` (width, height) the mask in file ``path`` hides.
 
-    ``raster`` is that of the image file. A mask with an EXIF orientation of its own is turned upright by that; one whose size
-    fits the stored image is turned upright with it. Where its size fits the upright image as well, as in square photos and
-    those that were taken upside down, an ``InputWarning`` says so. A mask of another resolution is resampled to the nearest of
-    its pixels. Masks whose values are all small, such as 0 and 1, hide what is 0; otherwise the
-    bright half of the values is white. The alpha channel is the mask of files whose colours are uniform. Raises ``InputError``
-    where the file is not an image, or one of another aspect ratio, and ``WhollyHidden`` where it hides everything.
+    ``raster`` is that of the image file. A mask with its own EXIF orientation is turned upright accordingly;
+    one whose size fits the stored image is turned upright with it. If its size fits the upright image as
+    well, as for square photos and those taken upside down, an ``InputWarning`` says so. A mask of another
+    resolution is resampled to the nearest of its pixels. Masks whose values are all small, such as 0 and 1,
+    hide what is 0; otherwise the bright half of the values is white. If the colours are uniform, the alpha
+    channel is the mask. Raises ``InputError`` if the file is not an image, or has another aspect ratio, and
+    ``WhollyHidden`` if it hides everything.
     """
     white = _upright(torch.from_numpy(_white(decode(path))), path, raster)
     if tuple(white.shape) != size[::-1]:
@@ -61,21 +62,21 @@ def read_mask(
 
 
 def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[Tensor, "h w"]:
-    """Return the mask of the upright image of ``raster``. Raises ``InputError`` for another aspect ratio."""
+    """Turn the mask upright like the image of ``raster``. Raises ``InputError`` for another aspect ratio."""
     given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
     if own != UPRIGHT and same_aspect(own.upright_size(*given), raster.upright_size):
         return own.upright(stored)
     is_upright = same_aspect(given, raster.upright_size)
     if same_aspect(given, raster.size):
         if is_upright and raster.orientation != UPRIGHT:
-            text = "mask fits the image as stored and as EXIF turns it; it is turned as the image is"
+            text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
             warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
         return raster.orientation.upright(stored)
     if is_upright:
         return stored
     expected = "x".join(map(str, raster.upright_size))
     raise InputError(
-        f"{path}: mask is {given[0]}x{given[1]}, its image {expected}; expected the same aspect ratio"
+        f"{path}: mask is {given[0]}x{given[1]}, but its image is {expected}; expected the same aspect ratio"
     )
 
 
@@ -96,9 +97,10 @@ def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
 class MaskFolder:
     """A folder of masks that belong to photos by name.
 
-    The mask of ``NAME.jpg`` is ``NAME.png``, ``NAME.jpg.png`` as COLMAP calls it, or has ``mask`` before or behind the name
-    (``dynamic_mask_NAME.png``, ``NAME_mask.png``). Where photos lie in folders, so may their masks. Any image format will do.
-    ``hides`` is the colour of what is left out. Raises ``InputError`` where there is no such folder, or no image in it.
+    The mask of ``NAME.jpg`` is ``NAME.png``, ``NAME.jpg.png`` (COLMAP's convention), or has ``mask`` before
+    or after the name (``dynamic_mask_NAME.png``, ``NAME_mask.png``). If photos are in subfolders, their masks
+    may be too. Any image format is accepted. ``hides`` is the colour that is ignored. Raises ``InputError``
+    if there is no such folder, or no image in it.
     """
 
     def __init__(self, path: str | Path, hides: HiddenColour = "black") -> None:
@@ -110,7 +112,7 @@ class MaskFolder:
             raise InputError(f"{self.path}: {what}, expected a folder of masks")
         files = sorted(f for f in self.path.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file())
         if not files:
-            raise InputError(f"{self.path}: no images in it, expected masks")
+            raise InputError(f"{self.path}: contains no images, expected masks")
         self._by_name = defaultdict[str, list[Path]](list)
         for file in files:
             parts = (*file.relative_to(self.path).parts[:-1], photo_of(file.name))
@@ -118,33 +120,35 @@ class MaskFolder:
                 self._by_name["_".join(parts[-depth:])].append(file)
 
     def file_of(self, name: str) -> Path | None:
-        """Return the mask of the frame called ``name``; None where there is none. Raises ``InputError`` where there are several."""
+        """Return the mask of the frame named ``name``; None if there is none. Raises ``InputError`` if there
+        are several.
+        """
         found = self._by_name.get(name, [])
         if len(found) > 1:
-            raise InputError(
-                f"{found[0]} and {found[1]} both belong to {name} by their names, expected one mask"
-            )
+            raise InputError(f"{found[0]} and {found[1]} both match {name} by name, expected one mask")
         return found[0] if found else None
 
     def require_any(self, names: Sequence[str]) -> None:
-        """Raise ``InputError`` where no frame of ``names`` has a mask."""
+        """Raise ``InputError`` if none of the frames ``names`` has a mask."""
         if names and all(self.file_of(name) is None for name in names):
             raise InputError(
-                f"{self.path}: no mask in it belongs to any of {amount(len(names), 'image')} by its name; expected"
+                f"{self.path}: no mask in it matches any of {amount(len(names), 'image')} by name; expected"
                 f" {names[0]}.png or the like, found {next(iter(self._by_name))}"
             )
 
     def hidden(self, name: str, raster: Raster, size: tuple[int, int]) -> Bool[Tensor, "h w"] | None:
-        """Return what the mask of the frame called ``name`` hides, as ``read_mask`` does; None where it has no mask.
+        """Return what the mask of the frame named ``name`` hides, as ``read_mask`` does; None if it has no
+        mask.
 
-        Raises ``InputError`` as ``read_mask`` does, and ``WhollyHidden`` for a mask that leaves nothing visible.
+        Raises ``InputError`` as ``read_mask`` does, and ``WhollyHidden`` for a mask that leaves nothing
+        visible.
         """
         file = self.file_of(name)
         return None if file is None else read_mask(file, raster, size, self.hides)
 
 
 def photo_of(mask: str) -> str:
-    """Return the stem of the photo to which the file called ``mask`` belongs."""
+    """Return the stem of the photo to which the file ``mask`` belongs."""
     stem = PurePath(mask).stem
     for prefix in PREFIXES:
         stem = stem.removeprefix(prefix)
@@ -154,7 +158,7 @@ def photo_of(mask: str) -> str:
 
 
 def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
-    """Return how much of some images is hidden, in one sentence; None where nothing is.
+    """Return one sentence on how much of some images is hidden; None if nothing is.
 
     Masks that hide most of most images may be inverted, and the sentence says so.
     """
@@ -163,7 +167,7 @@ def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
         return None
     mean, without = 100 * sum(shares) / len(shares), len(hidden) - len(shares)
     line = f"masks hide {mean:.3g} % of the pixels of {amount(len(shares), 'image')}"
-    line += f"; {amount(without, 'image')} without anything hidden" if without else ""
+    line += f"; {amount(without, 'image')} without hidden pixels" if without else ""
     if float(np.median(shares)) > MOSTLY:
         line += f"; {INVERTED}"
     return line

@@ -28,18 +28,18 @@ from bidnerf_core.io.images import (
 )
 
 DEPTH_STEM = ".depth"
-"""``NAME.depth.png`` is the depth of ``NAME.png``, as ``bidnerf render`` writes it."""
+"""``NAME.depth.png`` is the depth of ``NAME.png``, as written by ``bidnerf render``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """An upright image in [0, 1] over its background, its camera, and what was measured and assumed."""
+    """An upright image in [0, 1] over its background, its camera, its depth, and the assumptions made."""
 
     rgb: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"] | None  # 1 where the scene covers the pixel
     camera: FoundCamera
     depth: Float[Tensor, "h w"] | None  # planar z in metres, 0 where nothing was measured
-    remark: str | None  # one line on the assumptions that were made about depth
+    remark: str | None  # one line on the assumptions made about depth
     raster: Raster  # of the image as stored
 
 
@@ -53,9 +53,9 @@ def read_photo(
     background: Background = (0.0, 0.0, 0.0),
     largest: int | None = None,
 ) -> Photo:
-    """Read an image file and find its camera, as ``Frame.open`` describes it; raises ``InputError`` as that does.
+    """Read an image file and find its camera as ``Frame.open`` does, with the same errors.
 
-    Depth is registered to the image from ``sensor``, if there is one.
+    Depth is registered to the image from ``sensor``, if given.
     """
     colour_behind = background_colour(background)
     header, exif = read_header(path), read_exif(path)
@@ -87,10 +87,10 @@ def pinhole_of(camera: Camera, depth: Path) -> Intrinsics:
 
 
 def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what: str) -> Float[Tensor, "h w"]:
-    """Turn a depth image upright and give it ``size`` (width, height) by taking the nearest measurement.
+    """Turn a depth image upright and resize it to ``size`` (width, height) by taking the nearest measurement.
 
-    Depth whose shape fits the stored image is turned as that is. Raises ``InputError``, which begins with ``what``, where
-    the aspect ratio is that of another image.
+    Depth whose shape fits the stored image is turned with it. Raises ``InputError``, whose message begins
+    with ``what``, if the aspect ratio is that of another image.
     """
     metres = measured.metres
     given = (metres.shape[1], metres.shape[0])
@@ -99,16 +99,18 @@ def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what:
     elif not same_aspect(given, raster.upright_size):
         expected = "x".join(map(str, raster.upright_size))
         raise InputError(
-            f"{what} is {given[0]}x{given[1]}, its image {expected}; expected the same aspect ratio"
+            f"{what} is {given[0]}x{given[1]}, but its image is {expected}; expected the same aspect ratio"
         )
     return metres if tuple(metres.shape) == size[::-1] else resampled(metres, *size)
 
 
 def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
-    """Return the image files of a folder and its other files, both in natural order (``2.jpg`` before ``10.jpg``).
+    """Return the image files and the other files of a folder, both in natural order (``2.jpg`` before
+    ``10.jpg``).
 
-    Depth images (``NAME.depth.png``), hidden files and whatever is not an image by its ending or its first bytes are among the others;
-    folders inside are left out. Raises ``InputError`` where ``folder`` is not a folder that may be read.
+    Depth images (``NAME.depth.png``), hidden files and files that are not images by extension or first bytes
+    are among the others; subfolders are left out. Raises ``InputError`` unless ``folder`` is a readable
+    folder.
     """
     try:
         files = sorted(
@@ -125,7 +127,7 @@ def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
 
 
 def _is_photo(file: Path) -> bool:
-    hidden = file.name.startswith(".")  # such as the "._IMG_1.JPG" of macOS
+    hidden = file.name.startswith(".")  # such as macOS's "._IMG_1.JPG"
     if hidden or file.stem.endswith(DEPTH_STEM):
         return False
     return file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) or looks_like_image(file)

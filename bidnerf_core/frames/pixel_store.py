@@ -1,4 +1,6 @@
-"""Storage for the images of many frames: bytes in a few large blocks of memory or, where they are many, of a mapped file."""
+"""Storage for the images of many frames: bytes in a few large blocks of memory or, if there are many, in a
+mapped file.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +20,17 @@ from bidnerf_core.frames.colours import are_bytes, as_bytes
 from bidnerf_core.frames.frame import Frame
 
 BLOCK = 2**28
-"""Bytes of a block, unless an image is larger. Few blocks make it cheap to draw pixels from all images at once."""
+"""Bytes per block, unless an image is larger. With few blocks it is cheap to draw pixels from all images at once."""
 IN_MEMORY = 2**28
-"""Bytes of images that are held in memory; more are held in a file, whose pages the system may drop when it needs memory."""
+"""Bytes of images held in memory; more are held in a file, whose pages the system may drop when it needs memory."""
 ALIGNMENT = 16
 
 
 class PixelStore:
-    """Holds the images of frames one behind the other.
+    """Holds the images of frames one after another.
 
-    ``expected`` is the number of bytes that will be stored. Where it exceeds ``IN_MEMORY``, they go to files in ``folder`` (by
-    default, the system's folder for temporary files) that have no name and vanish with the process.
+    ``expected`` is the number of bytes that will be stored. If it exceeds ``IN_MEMORY``, they go to nameless
+    files in ``folder`` (by default, the system's folder for temporary files) that vanish with the process.
     """
 
     def __init__(self, expected: int, folder: Path | None = None) -> None:
@@ -36,7 +38,7 @@ class PixelStore:
         self._block, self._used = torch.empty(0, dtype=torch.uint8), 0
 
     def stored(self, frame: Frame) -> Frame:
-        """Return the frame with its images in the store. Colours that are exactly those of bytes become bytes."""
+        """Return the frame with its images in the store. Colours exactly representable as bytes become bytes."""
         rgb = frame.held_rgb.cpu()
         if rgb.dtype != torch.uint8 and are_bytes(rgb):
             rgb = as_bytes(rgb)
@@ -68,13 +70,13 @@ class PixelStore:
         except OSError as error:
             place = self._folder or tempfile.gettempdir()
             raise InputError(
-                f"{place}: no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}), expected that"
-                " much; or read them smaller (--largest, largest=)"
+                f"{place}: no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}),"
+                " free that much, or read them smaller (--largest, largest=)"
             ) from error
 
 
 def _reserve(file: int, size: int) -> None:
-    """Give a file a size whose bytes exist: writing to a mapped page for which the disk has no room would end the process."""
+    """Allocate disk space for a file: writing to a mapped page for which the disk has no room would end the process."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file, 0, size)
     else:
@@ -82,8 +84,8 @@ def _reserve(file: int, size: int) -> None:
 
 
 def bytes_of(frame: Frame) -> int:
-    """Return the number of bytes that a store takes for the images of a frame."""
-    composited = frame.alpha is not None and frame.held_rgb.dtype != torch.uint8  # of bytes no more
+    """Return the number of bytes that a store needs for the images of a frame."""
+    composited = frame.alpha is not None and frame.held_rgb.dtype != torch.uint8  # no longer bytes
     return sum(
         part.numel() * size
         for part, size in (

@@ -1,7 +1,8 @@
 """Selection of pixels, and their conversion to measured rays.
 
-A ``PixelDrawer`` picks pixels of a frame; ``observe`` turns them into rays of the view's reference frame with the colour
-and distance that were measured there. This is where planar depth becomes distance along the ray, once.
+A ``PixelDrawer`` picks pixels of a frame; ``observe`` turns them into rays in the view's reference frame with
+the colour and distance measured there. This is the only place where planar depth becomes distance along the
+ray.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def draw(
 
 
 MOST_FOR_MIDDLE = 200_000
-"""Number of a view's measured points above which only a part of them is used for the median."""
+"""Number of a view's measured points above which only some of them are used for the median."""
 
 
 def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
@@ -116,13 +117,13 @@ def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
 
 DrawerName = Literal["uniform", "interest-points", "interest-regions"]
 QUALITY = 0.01
-"""Minimum corner response of an interest point, as a share of the strongest response in the image."""
+"""Minimum corner response of an interest point, relative to the strongest response in the image."""
 FAINTEST = 1e-5
 """Minimum corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
 BORDER = 3
 """Width, in pixels, of the margin that the corner detector needs; smaller images have no corners."""
 REACH, ROUNDS = 5, 3
-"""Interest regions are interest points dilated with a square of REACH by REACH pixels, ROUNDS times."""
+"""Interest regions are interest points dilated ROUNDS times with a square of REACH by REACH pixels."""
 
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
@@ -148,8 +149,8 @@ def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
 class Among:
     """Draws uniformly among the pixels that ``choose`` finds in a frame, with replacement.
 
-    Each frame is searched once. Where nothing is found, as in the image of a blank wall, pixels are drawn uniformly: they
-    still carry depth, and evidence of where there are no edges.
+    Each frame is searched once. If nothing is found, as in the image of a blank wall, pixels are drawn
+    uniformly: they still carry depth, and evidence of where there are no edges.
     """
 
     def __init__(self, choose: Callable[[Frame], Tensor]) -> None:
@@ -179,7 +180,7 @@ def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
 
 
 def continued(frame: Frame) -> Float[Tensor, "h w 3"]:
-    """Return the colours of a frame with those of hidden pixels replaced by the colours of the nearest visible ones."""
+    """Return the colours of a frame with hidden pixels filled in from the nearest visible ones."""
     if frame.hidden is None:
         return frame.rgb
     _, (rows, columns) = distance_transform_edt(frame.hidden.cpu().numpy(), return_indices=True)

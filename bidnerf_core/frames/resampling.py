@@ -1,4 +1,4 @@
-"""Images of lenses that are no pinhole cameras, resampled to those of one."""
+"""Resampling of images from non-pinhole lenses to pinhole images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bidnerf_core.camera.lenses import Lens
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """The upright images of a frame, all of one size."""
+    """The upright images of a frame, all of the same size."""
 
     rgb: Shaped[Tensor, "h w 3"]
     depth: Float[Tensor, "h w"] | None = None  # planar z
@@ -23,7 +23,8 @@ class Images:
     def as_pinhole(self, lens: Lens) -> Images:
         """Return the images that the pinhole camera of ``lens`` would have taken.
 
-        Colours are interpolated between pixels, and depth is that of the nearest one. What the lens did not see is hidden.
+        Colours are interpolated between pixels, and depth is that of the nearest one. Pixels that the lens
+        did not see are hidden.
         """
         depth, alpha, hidden = (
             None if part is None else torch.from_numpy(lens.resampled(part.numpy(), nearest))

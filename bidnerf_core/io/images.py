@@ -288,9 +288,7 @@ def _used_range(pixels: np.ndarray) -> int:
 
 
 def _is_deep(image: Image.Image) -> bool:
-    """Return whether an open image has 16 bits per channel, of which Pillow keeps only 8 if there are several
-    channels.
-    """
+    """Return whether an open image has 16 bits per channel. With several channels, Pillow keeps only 8 of them."""
     return (
         image.mode.startswith("I;16")
         or (image.format == "PNG" and image.mode == "I")

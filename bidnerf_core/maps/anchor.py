@@ -1,9 +1,10 @@
-"""The geographic anchor of a map: the file ``anchor.json`` beside ``map.json``, which says where on the earth the map lies.
+"""The geographic anchor of a map: the file ``anchor.json`` next to ``map.json``, which states where on earth
+the map lies.
 
-It holds ``latitude`` and ``longitude`` (degrees) and ``height`` (metres above the ellipsoid WGS 84) of a point, and
-``T_enu_world``, rows of the 4x4 matrix that takes the map's coordinates, times ``metres_per_unit``, to the frame at that point
-whose axes point east, north and up. ``position_sigma`` (metres, along each axis) and ``orientation_sigma`` (degrees, about each
-axis) say how well the anchor itself is known.
+It holds ``latitude`` and ``longitude`` (degrees) and ``height`` (metres above the WGS 84 ellipsoid) of a
+point, and ``T_enu_world``, the rows of the 4x4 matrix that maps the map's coordinates, times
+``metres_per_unit``, to the east-north-up frame at that point. ``position_sigma`` (metres, along each axis)
+and ``orientation_sigma`` (degrees, about each axis) state how accurately the anchor itself is known.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0
 
 @dataclass(frozen=True)
 class GeographicPose:
-    """A camera on the earth: its place, and its rotation into the frame of east, north and up at that place."""
+    """A camera on the earth: its place, and its rotation in the east-north-up frame at that place."""
 
     place: Geodetic
     rotation: Float[Tensor, "3 3"]  # R_enu_camera, OpenCV camera axes
@@ -43,7 +44,7 @@ class GeographicPose:
 
 @dataclass(frozen=True)
 class Anchor:
-    """Where on the earth a map lies, see the head of this file."""
+    """Where on earth a map lies, see the module docstring."""
 
     latitude: float
     longitude: float
@@ -54,7 +55,9 @@ class Anchor:
     orientation_sigma: float = 0.0  # degrees
 
     def __post_init__(self) -> None:
-        """Raise ``InputError`` for a place off the earth, a matrix that is no pose, and numbers that are not positive."""
+        """Raise ``InputError`` for a place off the earth, a matrix that is not a pose, and numbers that are
+        not positive.
+        """
         self._T_ecef_world  # noqa: B018 (it checks the place and the matrix)
         if not 0 < self.metres_per_unit < math.inf:
             raise InputError(f"metres_per_unit is {self.metres_per_unit}, expected a positive number")
@@ -68,7 +71,7 @@ class Anchor:
 
     @cached_property
     def _T_ecef_world(self) -> SE3:
-        """The map's frame, in metres, in the earth's."""
+        """The map's frame, in metres, in the earth-centred frame."""
         rows = [list(row) for row in self.T_enu_world]
         if [len(row) for row in rows] != [4] * 4:
             raise InputError("T_enu_world: expected 4 rows of 4 numbers")
@@ -76,14 +79,14 @@ class Anchor:
         return Geodetic(self.latitude, self.longitude, self.height).T_ecef_enu @ T_enu_world
 
     def geographic(self, T_world_camera: SE3) -> GeographicPose:
-        """Return a camera's place, and its rotation with respect to east, north and up there, not at the anchor."""
+        """Return a camera's place, and its rotation relative to east, north and up there, not at the anchor."""
         pose = T_world_camera.to("cpu", torch.float64)
         T_ecef_camera = self._T_ecef_world @ SE3(pose.rotation, pose.translation * self.metres_per_unit)
         place = geodetic(T_ecef_camera.translation)
         return GeographicPose(place, place.T_ecef_enu.rotation.mT @ T_ecef_camera.rotation)
 
     def T_world_camera(self, pose: GeographicPose) -> SE3:
-        """Return the pose of a camera on the earth in the map; the inverse of ``geographic``."""
+        """Convert the pose of a camera on the earth to the map's frame; the inverse of ``geographic``."""
         local = pose.place.T_ecef_enu
         inside = self._T_ecef_world.inverse() @ SE3(
             local.rotation @ pose.rotation.double(), local.translation
@@ -92,7 +95,8 @@ class Anchor:
 
 
 def load_anchor(folder: Path, newer: str | None = None) -> Anchor | None:
-    """Return the anchor in the folder of a map, or None where there is none. Raises ``InputError`` for a damaged one.
+    """Return the anchor in the folder of a map, or None if there is none. Raises ``InputError`` for a damaged
+    one.
 
     ``newer`` is the name of the file that counts in place of ``anchor.json`` if it exists, see ``MapInfo.anchor``.
     """
@@ -107,7 +111,7 @@ def load_anchor(folder: Path, newer: str | None = None) -> Anchor | None:
 
 
 def save_anchor(folder: Path, anchor: Anchor) -> None:
-    """Write an anchor into the folder of a map, replacing an earlier one."""
+    """Write an anchor into the folder of a map, replacing an existing one."""
     write_file(folder / ANCHOR, anchor_bytes(anchor))
     for file in folder.iterdir():
         if NEWER.fullmatch(file.name):

@@ -1,4 +1,4 @@
-"""Baking: the surface and the landmarks of a map, and the record of its photos."""
+"""Baking: the surface and landmarks of a map, and the capture record of its photos."""
 
 from __future__ import annotations
 
@@ -36,31 +36,31 @@ log = logging.getLogger("bidnerf")
 
 @dataclass(frozen=True, eq=False)
 class BakedLandmarks:
-    """Landmarks, and what was learnt while they were built."""
+    """Landmarks, and what was learned while they were built."""
 
-    landmarks: LandmarkMap | None  # None where the images show too little texture
+    landmarks: LandmarkMap | None  # None if the images show too little texture
     source: LandmarkSource
     colour_noise: (
         float | None
     )  # root mean square error of rendered colours on photos; None if it was not measured
-    capture: CaptureReport | None  # record of the photos; None for rendered images
+    capture: CaptureReport | None  # capture record of the photos; None for rendered images
 
 
 def bake_surface(
     info: MapInfo, field: RadianceField, views: Sequence[View], config: BakeConfig, where: str,
     progress: ProgressCallback | None = None, cancel: Cancel | None = None,
 ) -> SurfaceMap:  # fmt: skip
-    """Return the surface of a map from the measured depth of ``views`` or, without such, from depth that ``field`` renders.
+    """Build the surface of a map from the measured depth of ``views`` or, if there is none, from depth
+    rendered by ``field``.
 
-    Depth is rendered from the map's cameras, or from those of the views where the map has none. Raises ``InputError`` where
-    there is neither, and where images do not agree on a surface. ``where`` begins what is logged.
+    Depth is rendered from the map's cameras, or from those of the views if the map has none. Raises
+    ``InputError`` if there are neither, and if images do not agree on a surface. ``where`` begins log
+    messages.
     """
     began = time.monotonic()
     cameras = cameras_of(info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     if not cameras:
-        raise InputError(
-            f"{where}: holds no cameras to render it from; give a dataset of its views by --data"
-        )
+        raise InputError(f"{where}: holds no cameras to render from; give a dataset of its views with --data")
     measured = [view for view in views if view.frame.has_depth]
     if any(view.frame.has_dense_depth for view in measured):
         cameras = []
@@ -82,15 +82,16 @@ def bake_landmarks(
     info: MapInfo, field: RadianceField, views: Sequence[View], where: str, tracked: TrackedViews | None = None,
     progress: ProgressCallback | None = None, cancel: Cancel | None = None, up: UpDirection | None = None,
 ) -> BakedLandmarks:  # fmt: skip
-    """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's cameras.
+    """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's
+    cameras.
 
-    ``tracked`` holds the views' keypoints if they were tracked already. A scene without texture has no landmarks;
-    localization then relies on the surface alone. ``where`` begins what is logged, and ``up`` is the upward direction of the
-    scene where it is known.
+    ``tracked`` holds the views' keypoints if they were tracked already. A scene without texture has no
+    landmarks; localization then relies on the surface alone. ``where`` begins log messages, and ``up`` is the
+    upward direction of the scene if known.
     """
     began = time.monotonic()
     source: LandmarkSource = "photos" if views else "rendered images"
-    # Only photos show how well the field renders; against its own images it has no error.
+    # Only photos show how well the field renders; it has no error against its own images.
     noise = colour_noise(field, info.bounds, views) if views else info.colour_noise
     rendering = counter("rendering", "views", progress, cancel)
     images = views or rendered_views(field, info.bounds, cameras_of(info), rendering)
@@ -119,7 +120,7 @@ def _tried(
     info: MapInfo, tracked: TrackedViews, views: Sequence[View], report: Callable[[str], None]
 ) -> LandmarkMap:
     landmarks = tried_landmarks(tracked, views, report=report)
-    # New poses are compared with others from the source of the given ones. If training kept those, except for some wrong
-    # ones, their errors are negligible.
+    # New poses are compared with others from the same source as the given ones. If training kept those,
+    # except for some wrong ones, their errors are negligible.
     by_source = update_scatter(pose_updates(info.cameras))
     return replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)

@@ -1,4 +1,4 @@
-"""The state of a training that makes a map: its progress, its checkpoints on disk, and requests to stop it."""
+"""The state of a training run: its progress, its checkpoints on disk, and requests to stop it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ CHECKPOINT_SECONDS = 60.0
 
 
 class Checkpoints:
-    """The ``Report`` of a training. Its states are saved to ``folder``, unless that is None; ``info`` describes the last one.
+    """The ``Report`` of a training run. States are saved to ``folder``, unless that is None; ``info``
+    describes the last one.
 
     ``state`` is the one to resume from, and ``seconds`` the time between checkpoints.
     """
@@ -49,7 +50,7 @@ class Checkpoints:
             return
         figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
         if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
-            figures += f"  {progress.samples_per_ray:.1f} samples a ray"
+            figures += f"  {progress.samples_per_ray:.1f} samples per ray"
         self._progress(Progress("training", progress.step, progress.total, "steps", figures))
 
     def due(self, step: int) -> bool:

@@ -34,14 +34,14 @@ from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, cou
 log = logging.getLogger("bidnerf")
 
 ASKED = 5
-"""Largest number of maps that are asked for the pose of an image, the most similar ones first."""
+"""Largest number of maps in which an image is localized, the most similar ones first."""
 KEPT = 6
-"""Number of maps from folders that are kept in memory once they were asked."""
+"""Number of maps from folders that stay in memory after use."""
 
 
 @dataclass(frozen=True)
 class MapSimilarity:
-    """How similar an image is to what the cameras of a map see: the cosine between pooled descriptors, -1 where it has none."""
+    """Similarity of an image to a map: the cosine between pooled descriptors, -1 if the map has none."""
 
     map: str
     cosine: float
@@ -51,11 +51,11 @@ class MapSimilarity:
 class Placement:
     """The map that an image shows, its pose there, and the runner-up."""
 
-    map: str  # the best answer's, though it may be rejected like all others
+    map: str  # the map of the best answer, even if that was rejected
     found: Localization
-    runner_up: tuple[str, Localization] | None  # the next best answer; None where one map was asked
-    ranking: tuple[MapSimilarity, ...]  # all maps, the most similar first
-    asked: tuple[str, ...]  # maps that were asked for a pose, in this order
+    runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
+    ranking: tuple[MapSimilarity, ...]  # all maps, most similar first
+    asked: tuple[str, ...]  # maps in which a pose was sought, in order
 
     @property
     def converged(self) -> bool:
@@ -64,14 +64,16 @@ class Placement:
 
     @property
     def rival(self) -> str | None:
-        """The runner-up, where it accepts the image as well: both maps show the place, or it exists twice."""
+        """The runner-up if it accepts the image as well: both maps show the place, or the place exists twice."""
         return self.runner_up[0] if self.runner_up is not None and self.runner_up[1].converged else None
 
 
 class MapCollection:
-    """Finds the map that an image shows, and its pose there. Maps are ranked by pooled descriptors, and only the first are asked.
+    """Finds the map that an image shows, and its pose there. Maps are ranked by pooled descriptors, and only
+    the first are tried.
 
-    Maps without landmarks cannot be ranked and are asked last. It keeps some of the maps that it has read, and belongs to one thread.
+    Maps without landmarks cannot be ranked and are tried last. Some of the loaded maps stay in memory. Use it
+    from one thread only.
     """
 
     def __init__(
@@ -83,10 +85,11 @@ class MapCollection:
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
     ) -> None:
-        """Read the landmarks of all maps: those in the sub-folders of one folder, or a list of maps and of folders of maps.
+        """Read the landmarks of all maps: those in the subfolders of one folder, or a list of maps and of
+        folders of maps.
 
-        ``asked`` is the largest number of maps that are asked for a pose. Raises ``InputError`` where there is no map, or two have
-        the same name, and ``Cancelled`` once ``cancel`` returns True.
+        ``asked`` is the largest number of maps that are tried. Raises ``InputError`` if there is no map, or
+        two have the same name, and ``Cancelled`` once ``cancel`` returns True.
         """
         if asked < 1:
             raise InputError(f"asked is {asked}, expected 1 or more")
@@ -108,11 +111,13 @@ class MapCollection:
 
     @property
     def cameras(self) -> tuple[Intrinsics, ...]:
-        """The cameras of the images of all maps, which serve for photos without any."""
+        """The cameras of the images of all maps, which serve as candidates for photos without any."""
         return tuple(camera.intrinsics for info in self._infos.values() for camera in info.cameras)
 
     def localizer(self, name: str) -> Localizer:
-        """Return the localizer of a map, read from its folder unless it was used lately. Raises ``InputError`` for an unknown name."""
+        """Return the localizer of a map, loaded from its folder unless used recently. Raises ``InputError``
+        for an unknown name.
+        """
         if name not in self._maps:
             raise InputError(f"no map {name!r}, expected one of {', '.join(self._maps)}")
         if name not in self._localizers:
@@ -125,7 +130,7 @@ class MapCollection:
         return self._localizers[name]
 
     def ranked(self, frame: Frame) -> list[MapSimilarity]:
-        """Return all maps by their similarity to an image, the most similar first; maps without landmarks come last."""
+        """Return all maps by their similarity to an image, most similar first; maps without landmarks come last."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
             descriptors = detected(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
@@ -143,9 +148,9 @@ class MapCollection:
     def __call__(self, frame: Frame, seed: int = 0) -> Placement:
         """Find the map that a frame shows, and its pose there.
 
-        The most similar maps are asked by their landmarks, one after another until one recognises the image, and then the next as
-        runner-up. The whole method answers in the map that recognises it, or in the first one where none does. Raises
-        ``InputError`` for a frame that cannot be localized at all.
+        The landmarks of the most similar maps are tried one after another until one accepts the image, and
+        then the next map as runner-up. The full method then localizes in the accepting map, or in the first
+        one if none accepts. Raises ``InputError`` for a frame that cannot be localized at all.
         """
         ranking = self.ranked(frame)
         quick: dict[str, Localization] = {}
@@ -154,7 +159,7 @@ class MapCollection:
             quick[similarity.map] = self._by_landmarks(similarity.map, frame, seed)
             if recognised:
                 break
-        chosen = max(quick, key=lambda name: _merit(quick[name]))  # the first of equals
+        chosen = max(quick, key=lambda name: _merit(quick[name]))  # the first of equal ones
         found = self.localizer(chosen)(frame, seed=seed)
         others = [name for name in quick if name != chosen]
         second = max(others, key=lambda name: _merit(quick[name]), default=None)
@@ -162,7 +167,9 @@ class MapCollection:
         return Placement(chosen, found, runner_up, tuple(ranking), tuple(quick))
 
     def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
-        """Return what the landmarks of a map say about a frame; maps without landmarks, and other methods, say all they can."""
+        """Localize a frame with the landmarks of a map; the full method is used for maps without landmarks,
+        and for other methods.
+        """
         localizer = self.localizer(name)
         try:
             if not localizer.matches_landmarks or localizer.matcher is None:
@@ -192,11 +199,11 @@ class MapCollection:
             cameras = cameras_of(self._infos[name])
             self._pooled[name] = pooled_views(self._vocabularies[self._key[name]], found, cameras)
         if bare := [name for name in self._maps if name not in landmarks]:
-            log.info(f"{amount(len(bare), 'map')} without landmarks, asked last: {', '.join(bare)}")
+            log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
 
 
 def maps_in(folder: Path) -> list[Path]:
-    """Return the folder itself if it is a map, else those of its sub-folders that are maps, by name."""
+    """Return the folder itself if it is a map, else its subfolders that are maps, by name."""
     if (folder / DESCRIPTION).exists():
         return [folder]
     if not folder.is_dir():
@@ -215,7 +222,7 @@ def _named(maps: Sequence[Map | str | Path]) -> dict[str, Map | Path]:
                 scene.info.data or "map" if isinstance(scene, Map) and scene.folder is None else _name(scene)
             )
             if name in found:
-                raise InputError(f"two maps are called {name!r}, expected folders with names that differ")
+                raise InputError(f"two maps are named {name!r}, expected folders with different names")
             found[name] = scene
     if not found:
         raise InputError("no maps, expected at least one")
@@ -241,7 +248,7 @@ def _landmarks(scene: Map | Path, info: MapInfo) -> LandmarkMap | None:
 
 
 def _unrecognised(reason: str, method: str) -> Localization:
-    """Return the answer of a map that does not recognise an image at all; its pose has no meaning."""
+    """Return the answer of a map in which an image was not recognized at all; its pose is meaningless."""
     T = SE3.identity()
     return Localization(
         T, Outcome.TOO_FEW_MATCHES, reason, 0, 0.0, math.nan, method, SE3.stack([T]), torch.zeros(0, dtype=torch.float64)
@@ -249,6 +256,6 @@ def _unrecognised(reason: str, method: str) -> Localization:
 
 
 def _merit(found: Localization) -> tuple[bool, float, float]:
-    """Return by what answers of several maps are compared: whether they are accepted, inliers, and confidence."""
+    """Return the sort key for answers of several maps: whether they are accepted, inliers, and confidence."""
     inliers = getattr(found.diagnostics, "inliers", 0)
     return found.converged, float(inliers), -1.0 if found.confidence is None else found.confidence

@@ -27,9 +27,9 @@ LandmarkSource = Literal["photos", "rendered images"]
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """The unit that the field of a map was trained in, where the map was scaled since."""
+    """The length unit in which the field of a map was trained, if the map was scaled later."""
 
-    scale: float  # units of the map in a unit of the field
+    scale: float  # units of the map per unit of the field
     bounds: SceneBounds  # of the field, in its own unit
 
     def __post_init__(self) -> None:
@@ -50,22 +50,22 @@ class MapInfo:
     seconds: float = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
-    unit: LengthUnit = "units"  # of all lengths in the map; "units" where nothing says how long one is
-    added: int = 0  # number of cameras that were added after training, at the end of ``cameras``
+    unit: LengthUnit = "units"  # of all lengths in the map; "units" if their length is unknown
+    added: int = 0  # number of cameras added after training, at the end of ``cameras``
     gravity_up: tuple[float, float, float] | None = (
-        None  # upward direction (world), where the capture measured gravity
+        None  # upward direction (world), if the capture measured gravity
     )
-    field_frame: FieldFrame | None = None  # where the map was scaled after training
-    distances: bool = True  # False if all images are from one place, so that they do not determine distances
+    field_frame: FieldFrame | None = None  # set if the map was scaled after training
+    distances: bool = True  # False if all images are from one place and thus do not determine distances
     sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
     hidden: int = 0  # number of training pixels that masks hid
     weights: str = ""  # file names
-    training: str | None = None  # state that resuming needs; dropped when training is complete
+    training: str | None = None  # the state needed to resume; dropped when training is complete
     surface: str | None = None  # baked from these weights
     landmarks: str | None = None
-    landmark_source: LandmarkSource | None = None  # the images they were built from, where that is recorded
-    landmark_features: str = USUAL_FEATURES  # name of the detector whose keypoints they are
-    capture: str | None = None  # record of the photos that gave the landmarks
+    landmark_source: LandmarkSource | None = None  # the images they were built from, if recorded
+    landmark_features: str = USUAL_FEATURES  # name of the detector of their keypoints
+    capture: str | None = None  # capture record of the photos the landmarks were built from
     anchor: str | None = None  # takes the place of ``anchor.json`` while a file of this name exists
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
@@ -74,10 +74,10 @@ class MapInfo:
 
     @property
     def interruption(self) -> str | None:
-        """A clause on the training that stopped, where it is not complete."""
+        """A clause about the interrupted training, if it is not complete."""
         if self.complete:
             return None
-        return f"its training stopped at step {self.step}; 'bidnerf train' with --resume goes on with it"
+        return f"its training stopped at step {self.step}; 'bidnerf train' with --resume continues it"
 
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
@@ -86,29 +86,29 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
 
 
 def longest_side(info: MapInfo) -> int | None:
-    """Return the columns or rows of the largest training image, to which images were reduced; None without cameras."""
+    """Return the longer side of the largest training image, to which images were downscaled; None without cameras."""
     return max((max(c.intrinsics.width, c.intrinsics.height) for c in info.cameras), default=None)
 
 
 def load_info(folder: Path) -> MapInfo:
-    """Return the content of ``map.json``, checked. Raises ``InputError`` where it does not describe a map of this version."""
+    """Load and check ``map.json``. Raises ``InputError`` if it does not describe a map of this version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {what}, expected a map: a folder as written by 'bidnerf train'")
     if not path.exists():
-        raise InputError(f"{folder}: no {DESCRIPTION} in it, expected a map as written by 'bidnerf train'")
+        raise InputError(f"{folder}: no {DESCRIPTION} found, expected a map as written by 'bidnerf train'")
     found = read_json(path, "the description of a map")
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:
         newer = isinstance(found.get("version"), int) and found["version"] > VERSION
-        advice = "it was written by a newer bidnerf, update yours" if newer else "train the map anew"
+        advice = "it was written by a newer bidnerf; upgrade bidnerf" if newer else "retrain the map"
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
     info = from_plain(MapInfo, found, str(path))
     for name in (info.weights, info.training, info.surface, info.landmarks, info.capture, info.anchor):
         if name is not None and (not name or Path(name).name != name):
-            raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
+            raise InputError(f"{path}: names {name!r}, expected the name of a file next to it")
     for name in with_wrong_pose(info.cameras):
         raise InputError(f"{path}: pose of camera {name!r} is not a rigid transform, expected 4x4 rows")
     return info

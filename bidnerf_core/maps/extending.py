@@ -1,4 +1,4 @@
-"""Extending a map by new photos: they are located in it, the field is trained on, and landmarks and surface are completed."""
+"""Extending a map with new photos: they are localized, training continues, and landmarks and surface are updated."""
 
 from __future__ import annotations
 
@@ -59,29 +59,30 @@ from bidnerf_core.training import TrainingState, TrainingStopped
 log = logging.getLogger("bidnerf")
 
 NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Dataset | str | Path
-"""Photos to add: frames, a dataset or the path to one, whose own poses are not used, or the path to a photo or a folder of photos."""
+"""Photos to add: frames, a dataset or the path to one (whose own poses are ignored), or the path to a photo
+or a folder of photos."""
 
 LeftOut: TypeAlias = tuple[str, str]
-"""The name of a photo that is not added, and why."""
+"""The name of a photo that is not added, and the reason."""
 LEAST_LOCATED = 0.25
-"""Least share of new photos that a map of their scene recognises."""
+"""Smallest fraction of new photos that must be localized for them to show the scene of the map."""
 SAME_PLACE = 0.02
-"""Distance, as a share of the scene, within which a photo with the name of one of the map's counts as that photo."""
+"""Distance, relative to the scene, within which a photo with the same name as one of the map's counts as that photo."""
 STAND_IN_SIDE = 320
-"""Pixels along the longer side of what the field renders in place of the photos that it was made of."""
+"""Longer side, in pixels, of the renderings that replace the photos the map was built from."""
 STAND_IN_DEPTHS = 400
-"""Number of pixels of such a rendering whose distances are kept in training."""
+"""Number of pixels of such a rendering whose distances are used in training."""
 SAME_DESCRIPTOR = 0.42
-"""Largest distance of the descriptors of one landmark, in units of that between descriptors of different landmarks."""
+"""Largest distance between descriptors of one landmark, relative to that between descriptors of different landmarks."""
 
 
 @dataclass(frozen=True, eq=False)
 class LocatedPhotos:
-    """New photos that were found in a map, and those that were not."""
+    """New photos that were localized in a map, and those that were not."""
 
     views: tuple[View, ...]
     left_out: tuple[LeftOut, ...] = ()
-    known: tuple[str, ...] = ()  # photos that the map was made of
+    known: tuple[str, ...] = ()  # photos that the map was built from
 
 
 def extend(
@@ -95,22 +96,25 @@ def extend(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
-    """Return a map with more photos of its scene; one that lies in a folder is replaced there, once all is done.
+    """Return a map extended with more photos of its scene; a map in a folder is replaced there once
+    everything is done.
 
-    The photos are located by the map; those that it does not recognise, and those that it was made of, are left out. Training goes on
-    with the others and with ``data``, the images that the map was made of, or, without these, with what the field renders at their
-    cameras, so that it does not forget them. ``steps`` is the number of training steps, by default in proportion to the new photos.
-    Landmarks of the new photos are added (with ``data``, all are built anew), and the surface is baked anew from all cameras.
+    The photos are localized in the map; those that fail, and those the map was built from, are left out.
+    Training continues with the others and with ``data``, the images that the map was built from, or, without
+    these, with renderings at their cameras, so that the field does not forget them. ``steps`` is the number
+    of training steps, by default in proportion to the new photos. Landmarks of the new photos are added (with
+    ``data``, all are rebuilt), and the surface is rebaked from all cameras.
 
-    A map whose photos are all known is returned as it is. Raises ``InputError`` where the photos show another scene, where the map has
-    no landmarks to find them by, and where its folder is changed meanwhile; raises ``Cancelled`` once ``cancel`` returns True. The map
-    in the folder then stays what it was, as it does if the process is killed.
+    A map whose photos are all known is returned unchanged. Raises ``InputError`` if the photos show another
+    scene, if the map has no landmarks for localizing them, and if its folder changes meanwhile; raises
+    ``Cancelled`` once ``cancel`` returns True. The map in the folder is then unchanged, as it is if the
+    process is killed.
     """
     if steps is not None and (isinstance(steps, bool) or steps < 1):
         raise InputError(f"steps is {steps!r}, expected a positive whole number")
     folder = scene.folder if isinstance(scene, Map) else Path(scene)
     if folder is not None:
-        load_info(folder)  # raises where there is no map
+        load_info(folder)  # raises if there is no map
     with contextlib.nullcontext() if folder is None else locked(folder):
         scene = scene if isinstance(scene, Map) else load_map(scene)
         where = scene.name
@@ -119,7 +123,7 @@ def extend(
         frames, unread = _frames(photos, scene, split)
         located = locate(scene, frames, where, progress, cancel, unread)
         if not located.views:
-            log.info(f"{where}: made of these photos already; nothing to add")
+            log.info(f"{where}: was built from these photos already; nothing to add")
             return scene
         old = _old_views(scene, data, split, where, progress, cancel)
         return _extended(
@@ -131,13 +135,14 @@ def locate(
     scene: Map, frames: Sequence[Frame], where: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
     unread: Sequence[LeftOut] = (),
 ) -> LocatedPhotos:  # fmt: skip
-    """Return frames at the poses at which a map finds them, with names that the map does not have yet.
+    """Localize frames in a map, and return them with names that the map does not use yet.
 
-    ``unread`` are photos that could not be read, which count as left out. Raises ``InputError`` where the map has no landmarks, and where it recognises hardly any of the frames.
+    ``unread`` are photos that could not be read, which count as left out. Raises ``InputError`` if the map
+    has no landmarks, and if hardly any of the frames is localized.
     """
     if scene.landmarks is None:
         raise InputError(
-            f"{where}: has no landmarks to locate photos by; 'bidnerf bake MAP --data DATA' builds them"
+            f"{where}: has no landmarks for localizing photos; 'bidnerf bake MAP --data DATA' builds them"
         )
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
     near = SAME_PLACE * scene.bounds.side
@@ -167,17 +172,18 @@ def locate(
         log.info(f"{name}: left out: {why}")
     if len(views) + len(known) < max(1.0, LEAST_LOCATED * len(frames)):
         raise InputError(
-            f"{where}: recognises {len(views) + len(known)} of {amount(len(frames), 'photo')}, expected photos of its scene"
+            f"{where}: localizes {len(views) + len(known)} of {amount(len(frames), 'photo')}, expected"
+            " photos of its scene"
         )
     log.info(
-        f"{where}: {len(views)} of {amount(len(frames) + len(unread), 'photo')} located, {len(known)} already in the map,"
-        f" {len(left_out)} left out"
+        f"{where}: {len(views)} of {amount(len(frames) + len(unread), 'photo')} localized, {len(known)}"
+        f" already in the map, {len(left_out)} left out"
     )
     return LocatedPhotos(tuple(views), tuple(left_out), tuple(known))
 
 
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
-    """Read photos, reduced to the size of the largest image of the map; return those that cannot be read as well."""
+    """Read photos, downscaled to the size of the map's largest image; also return those that cannot be read."""
     sides = [max(c.intrinsics.width, c.intrinsics.height) for c in scene.info.cameras]
     side, unread = max(sides, default=None), list[LeftOut]()
     source = _opened(Path(photos), scene) if isinstance(photos, str | Path) else photos
@@ -203,7 +209,7 @@ def _opened(path: Path, scene: Map) -> Dataset | Photos:
 
 
 def _read_each(photos: Dataset | Photos, split: str, side: int | None) -> tuple[list[Frame], list[LeftOut]]:
-    """Read the frames of a split, or photos, of at most ``side`` pixels; return those that cannot be read as well."""
+    """Read the frames of a split, or photos, of at most ``side`` pixels; also return those that cannot be read."""
     frames, unread = list[Frame](), list[LeftOut]()
     names = photos.names if isinstance(photos, Photos) else photos.frame_names(split)
     for place, name in enumerate(names):
@@ -222,7 +228,7 @@ def _read_each(photos: Dataset | Photos, split: str, side: int | None) -> tuple[
 def _old_views(
     scene: Map, data: Images | None, split: str, where: str, progress: ProgressCallback | None, cancel: Cancel | None
 ) -> list[View]:  # fmt: skip
-    """Return the images that the map was made of, or what its field renders at their cameras."""
+    """Return the images that the map was built from, or renderings at their cameras."""
     if data is not None:
         background = scene.bounds.background if isinstance(data, str | Path) else None
         views = at_stored_poses(
@@ -230,7 +236,9 @@ def _old_views(
         )
         own = {camera.name for camera in scene.info.cameras}
         if not any(view.frame.name in own for view in views):
-            raise InputError(f"{where}: data has none of the images that the map was made of, expected these")
+            raise InputError(
+                f"{where}: data has none of the images that the map was built from, expected these"
+            )
         return views
     count, cameras = counter("rendering", "images", progress, cancel), cameras_of(scene.info)
     views = []
@@ -248,7 +256,9 @@ def _old_views(
 
 
 def _distances(frame: Frame, depth: Tensor, opacity: Tensor, seed: int) -> SeenLandmarks:
-    """Return some of the distances that a field renders, so that training keeps them without taking them for measurements."""
+    """Return some of the distances that a field renders, so that training preserves them without treating
+    them as measurements.
+    """
     solid = ((opacity > 0.95) & (depth > 0)).nonzero()
     generator = torch.Generator().manual_seed(seed)
     rows = solid[torch.randperm(len(solid), generator=generator)[:STAND_IN_DEPTHS]]
@@ -295,7 +305,7 @@ def _extended(
     if scene.folder is None:
         return grown
     if load_info(scene.folder).weights != scene.info.weights:
-        raise InputError(f"{where}: was trained anew meanwhile; extend it again")
+        raise InputError(f"{where}: was retrained meanwhile; extend it again")
     check_cancelled(cancel, "extending")
     state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
     here = grown.to("cpu")
@@ -304,10 +314,10 @@ def _extended(
 
 
 def _with_distances(views: Sequence[View], tracked: TrackedViews) -> list[View]:
-    """Return the views, those without dense depth with the landmarks that they show, from which training takes distances."""
+    """Return the views; those without dense depth get the landmarks they show, from which training takes distances."""
     try:
         seen = tracked.seen(DEFAULT_LANDMARKS)
-    except InputError:  # one photo, or photos that share nothing
+    except InputError:  # one photo, or photos without overlap
         return list(views)
     return [
         view if view.frame.has_dense_depth else replace(view, landmarks=part)
@@ -316,7 +326,9 @@ def _with_distances(views: Sequence[View], tracked: TrackedViews) -> list[View]:
 
 
 def _repeated(old: Sequence[View], new: Sequence[View]) -> int:
-    """Return how often renderings are given so that, with fewer pixels than photos, they count as much; three times at most."""
+    """Return how often renderings are repeated so that, with fewer pixels than photos, they count as much;
+    three times at most.
+    """
     if not old:
         return 1
     pixels = [
@@ -329,7 +341,7 @@ def _repeated(old: Sequence[View], new: Sequence[View]) -> int:
 def _trained_on(
     scene: Map, views: Sequence[View], steps: int | None, share: float, progress: ProgressCallback | None, cancel: Cancel | None
 ) -> tuple[RadianceField, int]:  # fmt: skip
-    """Train a copy of the field on; return it, in the unit of its own training, and the number of steps."""
+    """Continue training a copy of the field; return it, in the unit of its own training, and the number of steps."""
     info = scene.info
     backend = load_backend(info.backend, str(scene.folder or ""))
     settings: Any = from_plain(backend.config_type, info.config, "config")
@@ -347,13 +359,13 @@ def _trained_on(
     try:
         backend.train(cast(RadianceField, field), own, settings, report)
     except TrainingStopped as stopped:
-        raise Cancelled(f"cancelled after step {stopped.step}; the map is what it was") from stopped
+        raise Cancelled(f"cancelled after step {stopped.step}; the map is unchanged") from stopped
     field.requires_grad_(False).eval()
     return cast(RadianceField, field), int(getattr(settings, "steps", report.info.step))
 
 
 def _in_field_unit(view: View, factor: float) -> View:
-    """Return a view whose lengths are multiplied by a factor."""
+    """Return a view with all lengths multiplied by a factor."""
     pose = SE3(view.T_ref_camera.rotation, view.T_ref_camera.translation * factor)
     frame, seen = view.frame, view.landmarks
     if frame.depth is not None:
@@ -370,7 +382,7 @@ def _surface(
     progress: ProgressCallback | None,
     cancel: Cancel | None,
 ) -> SurfaceMap | None:
-    """Bake the surface from measured depth where views have it, and elsewhere from what the field renders."""
+    """Bake the surface from measured depth if views have it, and otherwise from rendered depth."""
     measured = [view for view in views if view.frame.has_dense_depth]
     names = {view.frame.name for view in measured}
     cameras = [
@@ -383,16 +395,16 @@ def _surface(
             scene.field, scene.bounds, cameras, measured, config, counter("baking", "views", progress, cancel)
         )
     except InputError as error:
-        log.info(f"the surface stays as it was: {error}")
+        log.info(f"the surface is unchanged: {error}")
         return None
 
 
 def _with_more_landmarks(scene: Map, tracked: TrackedViews) -> LandmarkMap | None:
-    """Return the landmarks of a map with those of new photos that it lacks."""
+    """Return the landmarks of a map plus those of new photos that it lacks."""
     landmarks = scene.landmarks
     try:
         more = tracked.landmarks(DEFAULT_LANDMARKS)
-    except InputError as error:  # one photo, or photos that share nothing
+    except InputError as error:  # one photo, or photos without overlap
         log.info(f"no new landmarks: {error}")
         return landmarks
     if landmarks is None or not len(more):
@@ -402,7 +414,9 @@ def _with_more_landmarks(scene: Map, tracked: TrackedViews) -> LandmarkMap | Non
 
 
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
-    """Return which landmarks of ``more`` are among ``landmarks``: near one in space, by its accuracy, with a like descriptor."""
+    """Return which landmarks of ``more`` match one of ``landmarks``: near in space, given its accuracy, with
+    a similar descriptor.
+    """
     count = min(4, len(landmarks))
     away, near = cKDTree(landmarks.positions.numpy()).query(more.positions.numpy(), k=count)
     distance = torch.from_numpy(np.asarray(away).reshape(len(more), -1))
@@ -418,7 +432,7 @@ def _apart(first: SE3, second: SE3) -> float:
 
 
 def _names_like(name: str, taken: Container[str]) -> list[str]:
-    """Return the names that are taken by photos called ``name``: the name itself, and those that ``_free`` made of it."""
+    """Return the names taken by photos called ``name``: the name itself, and those that ``_free`` derived from it."""
     found = itertools.takewhile(
         lambda each: each in taken, itertools.chain([name], (f"{name}_{n}" for n in itertools.count(2)))
     )
@@ -426,6 +440,6 @@ def _names_like(name: str, taken: Container[str]) -> list[str]:
 
 
 def _free(name: str, taken: Container[str]) -> str:
-    """Return a name that is not taken: the name itself, or with the first number that makes it one."""
+    """Return a free name: the name itself, or with the first number that makes it free."""
     like = _names_like(name, taken)
     return f"{name}_{len(like) + 1}" if like else name

@@ -45,7 +45,7 @@ from bidnerf_core.training import TrainingState
 
 PART_NAMES = ("weights", "training", "surface", "landmarks", "capture", "anchor")
 PARTS = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
-BAKED = "a safetensors file, which 'bidnerf bake' writes anew"
+BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
 OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind; other files in the folder are never removed."""
 
@@ -55,7 +55,7 @@ def save_map(
     landmarks: LandmarkMap | None = None, capture: CaptureReport | None = None,
     anchor: Anchor | Literal["kept"] | None = None,
 ) -> MapInfo:  # fmt: skip
-    """Write a map, and remove the files of an earlier one once the new one is completely written.
+    """Write a map, and remove the files of an earlier one once the new one is complete.
 
     Parts that are not given, such as a surface that was baked from earlier weights, are dropped from the description, and so is
     the anchor, which is that of the earlier map unless it is "kept".
@@ -90,9 +90,9 @@ def save_map(
 
 
 def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
-    """Add the surface that was baked from map ``of`` to it, replacing an earlier one.
+    """Add to map ``of`` the surface baked from it, replacing an existing one.
 
-    Raises ``InputError`` where another training has replaced that map meanwhile.
+    Raises ``InputError`` if the map was retrained meanwhile.
     """
     return _save_part(folder, of, "surface", tensors_to_bytes(surface_tensors(surface)))
 
@@ -101,10 +101,10 @@ def save_landmarks(
     folder: Path, of: MapInfo, landmarks: LandmarkMap, colour_noise: float | None = None,
     source: LandmarkSource = "photos",
 ) -> MapInfo:  # fmt: skip
-    """Add landmarks to map ``of``, replacing earlier ones, and what its images showed of the errors of the field.
+    """Add landmarks to map ``of``, replacing existing ones, and the field's errors measured on its images.
 
-    ``source`` is the kind of images that the landmarks were built from. Raises ``InputError`` where another training has
-    replaced that map meanwhile, and where the detector of the landmarks has no name by which a query could find it.
+    ``source`` is the kind of images that the landmarks were built from. Raises ``InputError`` if the map was
+    retrained meanwhile, and if the detector of the landmarks has no name by which a query could find it.
     """
     _check_features(landmarks, folder)
     content = tensors_to_bytes(landmark_tensors(landmarks))
@@ -115,23 +115,23 @@ def save_landmarks(
 
 
 def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:
-    """Add the record of its photos to map ``of``, replacing an earlier one.
+    """Add the capture record of its photos to map ``of``, replacing an existing one.
 
-    Raises ``InputError`` where another training has replaced that map meanwhile.
+    Raises ``InputError`` if the map was retrained meanwhile.
     """
     return _save_part(folder, of, "capture", _json(capture))
 
 
 def _check_features(landmarks: LandmarkMap, folder: Path) -> None:
     if not landmarks.features:
-        raise InputError(f"{folder}: landmarks of a detector without a name; expected one that is registered")
+        raise InputError(f"{folder}: the landmarks' detector has no name; expected a registered one")
 
 
 def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: Any) -> MapInfo:
     """Add a file to a map under the name of a part of its description."""
     info = load_info(folder)
     if info.weights != of.weights:
-        raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
+        raise InputError(f"{folder}: was retrained while its {part} was built; bake it again")
     name = _file_name(part, of.step)
     info = replace(info, **(facts | {part: name}))
     description = _json(info)
@@ -144,7 +144,7 @@ def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: An
 
 
 def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:
-    """Return a digest of what a map consists of, in hexadecimal."""
+    """Return a hexadecimal digest of a map's content."""
     trained = trained_field(field)
     parts = [packed(trained.state_dict())] if isinstance(trained, nn.Module) else []
     if isinstance(field, ScaledField):
@@ -167,18 +167,18 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
 
 
 def load_surface(path: Path) -> SurfaceMap:
-    """Return the baked surface of a map. Raises ``InputError`` where the file does not hold the tensors of one."""
+    """Load the baked surface of a map. Raises ``InputError`` if the file does not hold the tensors of one."""
     return load_part(path, surface_from_tensors, "a baked surface", BAKED)
 
 
 def load_landmarks(path: Path) -> LandmarkMap:
-    """Return the landmarks of a map. Raises ``InputError`` where the file does not hold the tensors of landmarks."""
+    """Load the landmarks of a map. Raises ``InputError`` if the file does not hold the tensors of landmarks."""
     return load_part(path, landmarks_from_tensors, "landmarks", BAKED)
 
 
 def load_capture(path: Path) -> CaptureReport:
-    """Return the record of a capture. Raises ``InputError`` where the file does not hold one."""
-    expected = "the record of a capture, which 'bidnerf bake' with --data writes anew"
+    """Load a capture record. Raises ``InputError`` if the file does not hold one."""
+    expected = "a capture record, which 'bidnerf bake' with --data can recreate"
     return from_plain(CaptureReport, read_json(path, expected), str(path))
 
 
@@ -204,7 +204,7 @@ def _described(folder: Path) -> str | None:
 
 
 def _file_name(part: str, step: int) -> str:
-    """Return a new name for a file of a map; ``OURS`` recognises it."""
+    """Return a new name for a file of a map, which matches ``OURS``."""
     ending = "json" if part in ("capture", "anchor") else "safetensors"
     return f"{part}-{step:08d}-{secrets.token_hex(4)}.{ending}"
 
@@ -228,7 +228,7 @@ def _finish_anchor(folder: Path) -> set[str] | None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove the files of earlier and of interrupted saves that ``map.json`` does not name."""
+    """Remove the files of earlier and interrupted saves that ``map.json`` does not name."""
     kept = _finish_anchor(folder)
     if kept is None:
         return

@@ -1,4 +1,4 @@
-"""Importers: what reads a trained field, a mesh or the like from a file, found by name as backends are."""
+"""Importers, which read a trained field, a mesh or the like from a file; found by name as backends are."""
 
 from __future__ import annotations
 
@@ -19,58 +19,58 @@ from bidnerf_core.geometry.similarity import Similarity
 from bidnerf_core.registry import Plugins, interface_defects
 
 UNMOVED = Similarity(1.0, SE3.identity())
-"""The placement of a field in the coordinates of its file."""
+"""The identity placement: the field stays in its file's coordinates."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedField:
-    """What an importer found in a file: how a backend builds the field, and its tensors."""
+    """Result of an importer: how a backend builds the field, and its tensors."""
 
     backend: str  # name of the backend that builds the field
     config: Any  # of the backend's ``config_type``
     tensors: dict[str, Tensor]  # state_dict of the field
     bounds: SceneBounds
     _: KW_ONLY
-    found: tuple[str, ...] = ()  # sentences on what the file holds, such as counts, and what was left out
-    steps: int = 1  # of its training, where that is known
+    found: tuple[str, ...] = ()  # sentences on the content of the file, such as counts, and what was left out
+    steps: int = 1  # of its training, if known
     points: Float[Tensor, "n 3"] | None = (
-        None  # metres, world: places on the matter, from which its extent is told
+        None  # metres, world: points on the matter, from which its extent is reported
     )
-    cameras: tuple[StoredCamera, ...] = ()  # those of its training images, where files beside it tell
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # direction that is upwards by the format's convention
+    cameras: tuple[StoredCamera, ...] = ()  # those of its training images, if files next to it provide them
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # upward direction by the format's convention
     surface: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = (
-        None  # points (metres, world) on the matter of a scan, and their colours: its surface, which need not be rendered
+        None  # points (metres, world) on the matter of a scan, and their colours: its surface, which then need not be rendered
     )
-    is_coloured: bool = True  # whether its colours mean something; otherwise renderings give no landmarks
+    is_coloured: bool = True  # whether its colours are meaningful; otherwise renderings give no landmarks
     photos: Path | None = (
-        None  # dataset of its training images, whose poses are in the world; not used where others are given
+        None  # dataset of its training images, with poses in the world; unused if others are given
     )
-    is_solid: bool = False  # whether matter encloses no free space, so that the scene is seen from around it
+    is_solid: bool = False  # whether matter encloses no free space, so that the scene is viewed from outside
 
 
 @runtime_checkable
 class Importer(Protocol):
-    """What reads fields of one kind."""
+    """Reads fields of one kind."""
 
     @property
     def summary(self) -> str:
-        """One line for ``bidnerf plugins importers``: which files it reads."""
+        """One-line description for ``bidnerf plugins importers``: which files it reads."""
         ...
 
     @property
     def config_type(self) -> type:
-        """A frozen dataclass with a default for every field: what the user may have to say about a file."""
+        """A frozen dataclass with a default for every field: the settings a user may need to give for a file."""
         ...
 
     def recognises(self, path: Path) -> bool:
-        """Return whether the file or folder is one to read, as told from its name and its first bytes. Raises nothing."""
+        """Return whether it can read the file or folder, judging by its name and first bytes. Never raises."""
         ...
 
     def read(self, path: Path, config: Any, placement: Similarity) -> ImportedField:
-        """Return the field in a file, moved by ``placement`` from the file's coordinates to the world.
+        """Return the field in a file, transformed by ``placement`` from the file's coordinates to the world.
 
-        Raises ``InputError`` for a damaged file, before memory is allocated for what it only declares, and for a placement that
-        a field of its kind cannot take. Code in a file is never run.
+        Raises ``InputError`` for a damaged file, before memory is allocated for data that it only declares,
+        and for a placement that this kind of field does not support. Code in a file is never run.
         """
         ...
 
@@ -85,9 +85,10 @@ IMPORTERS: Plugins[Importer] = Plugins("importers", _defects)
 
 
 def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
-    """Return the importer of that name or, without one, that which recognises the file, with its name.
+    """Return an importer and its name: the one with that name or, without a name, the one that recognizes the
+    file.
 
-    Raises ``InputError`` where there is no such file, and where none or several recognise it.
+    Raises ``InputError`` if there is no such file, and if none or several recognize it.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder, expected a trained field")
@@ -99,14 +100,14 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
         return able[0]
     if able:
         names = enumeration([each for each, _ in able])
-        raise InputError(f"{path}: {names} can each read it; expected one of them to be chosen (--as)")
+        raise InputError(f"{path}: {names} can each read it; choose one of them (--as)")
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
     raise InputError(
-        f"{path}: no installed importer recognises it"
+        f"{path}: no installed importer recognizes it"
         + (
             f" ({known})"
             if known
-            else ", since none is installed (pip install bidnerf-gaussians is one for splats)"
+            else ", since none is installed (pip install bidnerf-gaussians adds one for splats)"
         )
     )
 
@@ -114,7 +115,8 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
 def robust_box(
     points: Float[Tensor, "n 3"], outside: float = 0.005, margin: float = 0.05
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return the corners of a box about all points but a share of ``outside`` at each end of each axis.
+    """Return the corners of a box around all points except a fraction of ``outside`` at each end of each
+    axis.
 
     It is widened by ``margin`` times its longest side.
     """
@@ -129,10 +131,10 @@ def bounds_about(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     footprint: float = 0.0,
 ) -> SceneBounds:
-    """Return bounds for matter at ``points`` (metres, world) whose training images are not known.
+    """Return bounds for matter at ``points`` (metres, world) whose training images are unknown.
 
-    Where much of the matter is far outside of the box about most of it, the scene is unbounded: the box is then that about its
-    dense part, and ``contracted``.
+    If much of the matter is far outside the box around most of it, the scene is unbounded: the box is then
+    the one around its dense part, and ``contracted`` is set.
     """
     inner, outer = robust_box(points, 0.15, 0.25), robust_box(points)
     sides = [float((upper - lower).max()) for lower, upper in (inner, outer)]
@@ -147,4 +149,4 @@ def bounds_about(
 
 
 UNBOUNDED = 3.0
-"""Ratio of the sides of the boxes about nearly all matter and about most of it, above which a scene is unbounded."""
+"""Ratio of the sides of the boxes around nearly all matter and around most of it above which a scene is unbounded."""

@@ -1,4 +1,4 @@
-"""Importing: a map of a field that others trained, or of a mesh or the like."""
+"""Importing: a map from a field trained elsewhere, or from a mesh or the like."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ from bidnerf_core.training import TrainingState
 log = logging.getLogger("bidnerf")
 
 SMALLEST, LARGEST = 0.05, 500.0
-"""Metres: longest sides of a scene beyond which its lengths are hardly metres."""
+"""Metres: longest sides of a scene outside which its lengths are hardly in metres."""
 RAYS_WITH_DEPTH = 4096
 SAME_LENGTH = 0.03
-"""Relative difference between rendered and measured depth that is not worth a word."""
+"""Relative difference between rendered and measured depth that is not worth reporting."""
 FEWEST_COMPARED = 200
 OPAQUE = 0.5
-"""Opacity of a ray whose rendered depth means something."""
+"""Opacity of a ray above which its rendered depth is meaningful."""
 
 
 def import_map(
@@ -68,17 +68,18 @@ def import_map(
     *,
     features: str = USUAL_FEATURES,
 ) -> Map:
-    """Make a map of a field in a file: splats, a checkpoint, whatever an installed importer reads.
+    """Build a map from a field in a file: splats, a checkpoint, or whatever an installed importer reads.
 
-    ``importer`` is the name of one, by default that which recognises the file; ``config`` holds its settings: an object of its
-    ``config_type``, or a dict of those that differ from the defaults. Lengths are multiplied by ``scale``, and ``T_world_file``
-    then takes the file's coordinates to the world. ``photos`` are images with poses in the world (a dataset, the path to one, or
-    views), of which ``split`` names the part; they give the landmarks. Without any, landmarks come from images that the field
-    renders, which photos match less well. ``features`` is the name of the detector of the landmarks. The map is stored in folder
-    ``out``, and stays in memory only if that is None.
+    ``importer`` is the name of one, by default the one that recognizes the file; ``config`` holds its
+    settings: an object of its ``config_type``, or a dict of those that differ from the defaults. Lengths are
+    multiplied by ``scale``, and ``T_world_file`` then transforms the file's coordinates to the world.
+    ``photos`` are images with poses in the world (a dataset, the path to one, or views), of which ``split``
+    selects a part; landmarks are built from them. Without any, landmarks come from rendered images, which
+    match photos less well. ``features`` is the name of the landmarks' detector. The map is stored in folder
+    ``out``, or only in memory if that is None.
 
-    Raises ``InputError`` where the file, the photos, the settings or the folder are not usable, and where the photos do not show
-    the scene of the field; the folder must be empty unless ``overwrite`` is set.
+    Raises ``InputError`` if the file, the photos, the settings or the folder cannot be used, and if the
+    photos do not show the scene of the field; the folder must be empty unless ``overwrite`` is set.
     """
     path = Path(path)
     if not (math.isfinite(scale) and scale > 0):
@@ -120,15 +121,15 @@ def import_map(
 
 
 def _own_photos(found: ImportedField, where: str) -> Dataset | None:
-    """Return the dataset of the training images that the file names, or None where that names none or cannot be read."""
+    """Return the dataset of the training images that the file names, or None if it names none or they cannot be read."""
     if found.photos is None:
         return None
     try:
         dataset = open_dataset(found.photos)
     except InputError as error:
-        log.info(f"{where}: the images of its training cannot be read: {error}")
+        log.info(f"{where}: its training images cannot be read: {error}")
         return None
-    log.info(f"{where}: photos of its training in {found.photos}")
+    log.info(f"{where}: training photos found in {found.photos}")
     return dataset
 
 
@@ -136,18 +137,18 @@ def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], 
     if views:
         return stored_cameras(views)
     if found.cameras:
-        log.info(f"{where}: {amount(len(found.cameras), 'camera')} of its training images beside it")
+        log.info(f"{where}: {amount(len(found.cameras), 'camera')} of its training images found next to it")
         return found.cameras
     chosen = viewpoints(field, found.bounds, found.up, found.is_solid)
     log.info(
-        f"{where}: no photos; looked at from {amount(len(chosen), 'viewpoint')}"
-        + (" around it" if found.is_solid else " that were found in free space")
+        f"{where}: no photos; viewed from {amount(len(chosen), 'viewpoint')}"
+        + (" around it" if found.is_solid else "found in free space")
     )
     return chosen
 
 
 def _tell_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
-    """Say how large the scene is, and warn where its lengths are hardly metres."""
+    """Log how large the scene is, and warn if its lengths are hardly in metres."""
     if found.points is None or not len(found.points):
         size = found.bounds.size
     else:
@@ -157,10 +158,10 @@ def _tell_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     extent = " x ".join(f"{side:.3g}" for side in size)
     log.info(
         f"{where}: extent {extent}"
-        + (" metres" if unit == "metres" else "; its unit is not stored (--scale says how many metres it is)")
+        + (" metres" if unit == "metres" else "; its unit is not stored (--scale gives its length in metres)")
     )
     if not SMALLEST <= max(size) <= LARGEST:
-        other = "millimetres" if max(size) > LARGEST else "kilometres or a unit of its own"
+        other = "millimetres" if max(size) > LARGEST else "kilometres or an arbitrary unit"
         warnings.warn(
             f"{where}: {extent} would be {'very large' if max(size) > LARGEST else 'tiny'} in metres; are its lengths {other}?"
             " --scale changes them",
@@ -170,13 +171,13 @@ def _tell_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
 
 
 def _check_photos(scene: Map, views: Sequence[View], where: str) -> None:
-    """Raise ``InputError`` for photos that do not show the field, and warn where their depth has another unit."""
+    """Raise ``InputError`` for photos that do not show the field, and warn if their depth has another unit."""
     check_alike(scene.info, scene.field, views, where)
     ratio = ratio_to_measured_depth(scene.field, scene.bounds, views)
     if ratio is not None and abs(ratio - 1) > SAME_LENGTH:
         warnings.warn(
-            f"{where}: the depth that the photos measured is {ratio:.3g} times what the field shows; is its scale another one? The"
-            " poses of the photos would have to be scaled as well",
+            f"{where}: the photos' measured depth is {ratio:.3g} times the field's; is its scale different?"
+            " The poses of the photos would have to be scaled as well",
             InputWarning,
             stacklevel=3,
         )
@@ -184,7 +185,7 @@ def _check_photos(scene: Map, views: Sequence[View], where: str) -> None:
 
 @torch.no_grad()
 def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float | None:
-    """Return the median ratio of measured to rendered depth, or None where too few rays have both."""
+    """Return the median ratio of measured to rendered depth, or None if too few rays have both."""
     measured = [view for view in views if view.frame.has_depth]
     if not measured:
         return None
@@ -209,8 +210,8 @@ def _baked(
     has_landmarks = bool(views) or found.is_coloured
     if not views and found.is_coloured:
         log.info(
-            f"{scene.info.data}: landmarks from rendered images: a photo matches them less well than other photos;"
-            " --photos gives landmarks as a map that was trained here has"
+            f"{scene.info.data}: landmarks are from rendered images, which match photos less well; --photos"
+            " builds them from photos, as in training"
         )
     try:
         surface = None
@@ -223,8 +224,8 @@ def _baked(
         if not has_landmarks:
             return scene.with_baked_surface(config, surface, progress, cancel)
         return scene.with_baked_parts(list(views), config, not views, None, progress, cancel, surface)
-    except PluginError:  # nothing that other images would mend
+    except PluginError:  # nothing that other images would fix
         raise
-    except InputError as error:  # the map itself is sound
+    except InputError as error:  # the map itself is valid
         log.info(f"{scene.info.data}: no surface baked: {error}")
         return scene

@@ -1,4 +1,4 @@
-"""A map: a field with what localization needs beside it."""
+"""A map: a field together with what localization needs."""
 
 from __future__ import annotations
 
@@ -58,19 +58,19 @@ log = logging.getLogger("bidnerf")
 class Map:
     """A map, ready for use: its field is frozen (no parameter requires a gradient).
 
-    A map that was loaded or trained into a folder remembers it, and baking stores new parts there.
+    A map that was loaded from or trained into a folder remembers it, and baking stores new parts there.
     """
 
     info: MapInfo
     field: RadianceField
-    surface: SurfaceMap | None = None  # None where it was not baked
-    landmarks: LandmarkMap | None = None  # None where none were built
+    surface: SurfaceMap | None = None  # None if not baked
+    landmarks: LandmarkMap | None = None  # None if none were built
     folder: Path | None = None  # None for a map in memory
-    record: CaptureReport | None = None  # of the photos, for a map in memory; see ``capture``
-    anchor: Anchor | None = None  # where on the earth the map lies, if that is known
+    record: CaptureReport | None = None  # capture record, for a map in memory; see ``capture``
+    anchor: Anchor | None = None  # where on earth the map lies, if known
 
     def __repr__(self) -> str:
-        """A line, in place of all tensors and cameras; ``describe`` has the facts."""
+        """A one-line description without tensors or cameras; ``describe`` gives the details."""
         info = self.info
         trained = f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
         surfels = amount(0 if self.surface is None else len(self.surface.surfels), "surfel")
@@ -89,14 +89,15 @@ class Map:
 
     @property
     def unit(self) -> LengthUnit:
-        """The unit of all lengths: ``"metres"``, or ``"units"`` where nothing says how long one is."""
+        """The unit of all lengths: ``"metres"``, or ``"units"`` if their length is unknown."""
         return self.info.unit
 
     @cached_property
     def up(self) -> UpDirection | None:
-        """The upward direction in the world, and what it was found from; None for a map without cameras.
+        """The upward direction in the world, and its source; None for a map without cameras.
 
-        It is that of gravity where the capture measured it, else the one that planes of the surface and the cameras support.
+        It comes from gravity if the capture measured it, else from planes of the surface and from the
+        cameras.
         """
         if self.info.gravity_up is not None:
             return given_up(self.info.gravity_up)
@@ -112,9 +113,9 @@ class Map:
 
     @cached_property
     def capture(self) -> CaptureReport | None:
-        """The record of the photos that gave the landmarks, read when it is first used; None where there is none.
+        """Capture record of the photos the landmarks were built from (loaded lazily); None if there is none.
 
-        Raises ``InputError`` where its file is damaged.
+        Raises ``InputError`` if its file is damaged.
         """
         if self.record is not None or self.folder is None or self.info.capture is None:
             return self.record
@@ -122,7 +123,7 @@ class Map:
 
     @cached_property
     def training(self) -> str:
-        """What identifies the training of the map: the name of its file of weights or, in memory, a digest of its content."""
+        """Identifier of the training run: the weights file's name or, in memory, a content digest."""
         return self.info.weights or f"memory-{content_digest(self.field, self.surface, self.landmarks)}"
 
     @property
@@ -131,32 +132,36 @@ class Map:
         return str(self.folder or self.info.data or "map in memory")
 
     def to(self, device: torch.device | str) -> Map:
-        """Return the map with its field, surface and landmarks on ``device``; what is not there yet is copied.
+        """Return the map with its field, surface and landmarks on ``device``; only what is not there yet is
+        copied.
 
-        Of all computations with landmarks, only descriptors are compared there, see ``LandmarkMap.to``. Raises ``InputError``
-        for a device that does not work here.
+        Of all computations with landmarks, only the comparison of descriptors runs there, see
+        ``LandmarkMap.to``. Raises ``InputError`` for a device that does not work here.
         """
         return on_device(self, device)
 
     def describe(self) -> MapSummary:
-        """Return the facts about the map; ``str()`` of them is a description for people."""
+        """Return the facts about the map; ``str()`` gives a human-readable description."""
         return summarized(
             self.info, self.field, self.surface, self.landmarks, self.capture, self.folder, self.up
         )
 
     def scaled(self, factor: float, unit: LengthUnit = "metres") -> Map:
-        """Return the map with all lengths multiplied by ``factor``, in memory: field, bounds, surface, landmarks and record.
+        """Return the map with all lengths multiplied by ``factor``, in memory: field, bounds, surface,
+        landmarks and record.
 
-        ``unit`` is what lengths are in then; ``scaled(1)`` says that they are metres. ``save`` stores it, over the map itself too.
-        Raises ``InputError`` for a factor that is not positive, and for a map whose training is not complete.
+        ``unit`` is the resulting length unit; ``scaled(1)`` declares that lengths are metres. ``save`` stores
+        it, also over the map itself. Raises ``InputError`` for a factor that is not positive, and for a map
+        whose training is not complete.
         """
         return scaled(self, factor, unit)
 
     def render(self, view: View, level: int | None = None) -> RenderedImage:
-        """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with camera and pose of ``view``.
+        """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with the camera and pose of
+        ``view``.
 
-        ``level`` is the level of detail, 0 the coarsest; None is the field itself. Raises ``InputError`` for a level that the
-        field does not have, and for what is no view.
+        ``level`` is the level of detail, 0 being the coarsest; None is the field itself. Raises
+        ``InputError`` for a level that the field does not have, and if ``view`` is not a view.
         """
         if not isinstance(view, View):
             raise InputError(
@@ -184,21 +189,24 @@ class Map:
     ) -> Map:
         """Return the map with a new surface and new landmarks, which are stored with it if it has a folder.
 
-        For the surface, views with measured depth replace rendered ones; landmarks are built from all views of ``data``
-        (those of ``split``, where it is a dataset or the path to one). Without data, landmarks are built from images that the
-        field renders, unless the map has landmarks of photos: these are kept unless ``rendered_landmarks`` is set.
-        ``features`` is the name of another detector of landmarks than the map's, and ``largest`` is as for ``train``. Raises ``InputError`` where the data is not
-        usable or shows another scene, where nothing can be baked, and where another program writes into the folder; raises
-        ``Cancelled`` once ``cancel`` returns True. Parts that are finished then stay.
+        For the surface, views with measured depth replace rendered ones; landmarks are built from all views
+        of ``data`` (those of ``split``, for a dataset or the path to one). Without data, landmarks are built
+        from rendered images, unless the map has landmarks from photos: these are kept unless
+        ``rendered_landmarks`` is set. ``features`` names a landmark detector other than the map's, and
+        ``largest`` is as for ``train``. Raises ``InputError`` if the data cannot be used or shows another
+        scene, if nothing can be baked, and if another program is writing to the folder; raises ``Cancelled``
+        once ``cancel`` returns True. Finished parts are kept in that case.
         """
         if rendered_landmarks and data is not None:
-            raise InputError("rendered_landmarks takes no photos, but data gives some; expected one of them")
+            raise InputError(
+                "rendered_landmarks uses no photos, but data gives some; expected only one of them"
+            )
         if features is not None and features != self.info.landmark_features:
             find_features(features)
             if data is None and not rendered_landmarks and self.info.landmark_source == "photos":
                 raise InputError(
-                    f"{self.name}: its landmarks are of photos and detector {self.info.landmark_features!r}; for"
-                    f" {features!r} give the photos again (--data), or take --rendered-landmarks"
+                    f"{self.name}: its landmarks are from photos and detector {self.info.landmark_features!r};"
+                    f" for {features!r}, give the photos again (--data) or use --rendered-landmarks"
                 )
             return replace(self, info=replace(self.info, landmark_features=features)).bake(
                 data, split, config, rendered_landmarks=rendered_landmarks, largest=largest, progress=progress,
@@ -224,15 +232,16 @@ class Map:
         tracked: TrackedViews | None = None, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
         surface: SurfaceMap | None = None,
     ) -> Map:  # fmt: skip
-        """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the folder.
+        """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the
+        folder.
 
-        ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if it is known.
+        ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if known.
         """
         check_cancelled(cancel, "baking")
         surface = surface or bake_surface(self.info, self.field, views, config, self.name, progress, cancel)
         scene = self._with_surface(surface)
         if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
-            log.info(f"{self.name}: the landmarks of its photos are kept; --rendered-landmarks replaces them")
+            log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
             return replace(scene, landmarks=kept)
         check_cancelled(cancel, "baking")
         found = bake_landmarks(self.info, self.field, views, self.name, tracked, progress, cancel, scene.up)
@@ -254,7 +263,7 @@ class Map:
         self, config: BakeConfig, surface: SurfaceMap | None = None, progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
     ) -> Map:  # fmt: skip
-        """Bake the surface alone, if it is not known, while the caller holds the lock of the folder."""
+        """Bake only the surface, unless it is given, while the caller holds the lock of the folder."""
         if surface is None:
             surface = bake_surface(self.info, self.field, [], config, self.name, progress, cancel)
         return self._with_surface(surface)
@@ -280,9 +289,9 @@ class Map:
     def save(self, folder: str | Path, overwrite: bool = False) -> Map:
         """Write the whole map into a folder, and return it with that folder.
 
-        Baked parts that were left unread (``load_map`` with ``baked=False``) are written as well, and returned. Raises ``InputError``
-        where the folder cannot be written, where it is not empty and ``overwrite`` is not set, and where the field is not that of a
-        backend.
+        Baked parts that were not loaded (``load_map`` with ``baked=False``) are written as well, and
+        returned. Raises ``InputError`` if the folder cannot be written, if it is not empty and ``overwrite``
+        is not set, and if the field does not come from a backend.
         """
         with map_folder(Path(folder), overwrite):
             return self.stored_in(Path(folder))
@@ -302,7 +311,7 @@ class Map:
         return replace(whole, info=info, folder=folder, record=self.capture)
 
     def whole(self) -> Map:
-        """Return the map with the parts of its folder that were left unread, or added since."""
+        """Return the map including the parts of its folder that were not loaded, or were added since."""
         if self.folder is None:
             return self
         surface, landmarks = self.surface, self.landmarks
@@ -315,10 +324,10 @@ class Map:
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
-    """Return the map in ``folder``, on ``device``, with its field built by its backend and frozen.
+    """Load the map in ``folder`` onto ``device``, with its field built by its backend and frozen.
 
-    ``baked`` determines whether the surface and the landmarks are read. Raises ``InputError`` where the folder is not a map,
-    or a damaged one.
+    ``baked`` determines whether the surface and landmarks are loaded. Raises ``InputError`` if the folder is
+    not a map, or is a damaged one.
     """
     folder = Path(folder)
     info, tensors, surface, landmarks, anchor = _read(folder, baked)
@@ -331,15 +340,15 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
 
 
 def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
-    """Return the field that ``info`` describes with the weights ``tensors``; no parameter requires a gradient.
+    """Build the field that ``info`` describes with the weights ``tensors``; no parameter requires a gradient.
 
-    Errors name the files of ``folder``. Raises ``InputError`` where the backend or the weights do not fit.
+    Errors name the files of ``folder``. Raises ``InputError`` if the backend or the weights do not fit.
     """
     where = str(DESCRIPTION if folder is None else folder / DESCRIPTION)
     backend = load_backend(info.backend, "" if folder is None else str(folder))
     path = Path(info.weights) if folder is None else folder / info.weights
     outline = _outline(backend, info, where)
-    if outline is not None:  # before memory is allocated for a field, of whatever size map.json describes
+    if outline is not None:  # before memory is allocated for a field of whatever size map.json describes
         tensors = checked_weights(outline, tensors, path)
     field, _ = build_field(backend, info, where)
     if outline is None:
@@ -350,18 +359,18 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
 
 
 def _with_cameras(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
-    """Return the landmarks with what the description of a map says about the images that they were built from."""
+    """Return the landmarks with what a map's description records about the images they were built from."""
     cameras = tuple(camera.intrinsics for camera in info.cameras)
     return replace(landmarks, cameras=cameras, features=info.landmark_features)
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
-    """Return an untrained field (an ``nn.Module``) and its config, as ``info`` describes them."""
+    """Build the untrained field (an ``nn.Module``) that ``info`` describes, and its config."""
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
     try:
         field = backend.build(config, info.bounds if info.field_frame is None else info.field_frame.bounds)
     except ValueError as error:
-        raise InputError(f"{where}: backend {info.backend!r} refuses its config: {error}") from error
+        raise InputError(f"{where}: backend {info.backend!r} rejects its config: {error}") from error
     if not (isinstance(field, nn.Module) and isinstance(field, RadianceField)):
         found = type(field).__name__
         raise InputError(
@@ -371,20 +380,20 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
 
 
 def _outline(backend: Backend, info: MapInfo, where: str) -> RadianceField | None:
-    """Return the field with only the shapes of its tensors, or None where its backend needs real tensors to build it."""
+    """Return the field with only the shapes of its tensors, or None if its backend needs real tensors to build it."""
     try:
         with torch.device("meta"):
             return build_field(backend, info, where)[0]
     except InputError:
         raise
-    except Exception:  # a backend may do anything with the values that it lacks
+    except Exception:  # a backend may raise anything for missing values
         return None
 
 
 def _read(
     folder: Path, baked: bool
 ) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None, Anchor | None]:
-    """Return parts that belong to the same map, even while a training replaces them."""
+    """Load parts that belong to the same map, even while a training run replaces them."""
     info = load_info(folder)
     while True:
         try:

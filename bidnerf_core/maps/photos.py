@@ -1,4 +1,4 @@
-"""Photos without poses as the images of a map: their poses are found first, in a folder beside the map."""
+"""Photos without poses as the images of a map: their poses are found first, in a folder next to the map."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger("bidnerf")
 
 
 def poses_folder(out: Path) -> Path:
-    """Return the folder beside a map in which the poses of its photos are kept: MAP-poses."""
+    """Return the folder next to a map that holds the poses of its photos: MAP-poses."""
     place = out if out.name else out.absolute()  # "." has no name
     return place.with_name(f"{place.name}-poses")
 
@@ -29,11 +29,11 @@ def posed_images(
     data: Images, split: str, out: Path | None, camera: Intrinsics | str | Path | None = None, overwrite: bool = False,
     progress: ProgressCallback | None = None, cancel: Cancel | None = None,
 ) -> Iterator[tuple[Images, Intrinsics | str | Path | None]]:  # fmt: skip
-    """Yield images with poses, and the camera with which a dataset of them is to be opened.
+    """Yield images with poses, and the camera with which to open a dataset of them.
 
-    For a folder of photos without poses, or a video, that is the dataset of the poses found by structure from motion, beside
-    the map ``out``, or in a temporary folder for a map in memory; poses that were found there before are used. Anything else
-    is yielded as it is.
+    For a folder of photos without poses, or a video, this is the dataset of poses found by structure from
+    motion, next to the map ``out``, or in a temporary folder for a map in memory; existing poses are reused.
+    Anything else is yielded unchanged.
     """
     if not isinstance(data, str | Path) or not lacks_poses(data):
         yield data, camera

@@ -1,4 +1,4 @@
-"""How well a rendered image fits a photographed one."""
+"""How well a rendered image matches a photo."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bidnerf_core.geometry.units import LengthUnit, symbol
 
 @dataclass(frozen=True, eq=False)
 class RenderingScores:
-    """The quality of a rendered image, by comparison with the photo from the same pose."""
+    """The quality of a rendered image, compared with the photo from the same pose."""
 
     psnr: float  # dB
     depth_errors: Float[Tensor, "n"]  # absolute errors of planar z, at the pixels with measured depth
@@ -33,9 +33,9 @@ class RenderingScores:
 
 
 def rendering_scores(image: RenderedImage, frame: Frame, unit: LengthUnit = "units") -> RenderingScores:
-    """Compare a rendered image with the colours and the measured depth of the frame from the same pose, where it is not hidden.
+    """Compare a rendered image with the visible colours and measured depth of the frame from the same pose.
 
-    ``unit`` is that of the map, which serves to print the depth error.
+    ``unit`` is the map's, for printing the depth error.
     """
     errors = torch.zeros(0)
     if frame.depth is not None and frame.has_depth:

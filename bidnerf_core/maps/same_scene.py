@@ -1,4 +1,4 @@
-"""Whether photos show the scene of a map, so that they may be baked into it."""
+"""Check that photos show the scene of a map, so that they may be baked into it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from bidnerf_core.mapping import colour_noise
 from bidnerf_core.maps.description import MapInfo
 
 UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3
-"""Least difference (RMS) between rendered and photographed colours in another scene: as such, and as a multiple of that between
-the field and the photos that the map was made of; and where the latter is not known, as in a map that was never baked."""
+"""Smallest difference (RMS) between rendered and photographed colours that indicates another scene: absolute;
+relative to that between the field and the photos the map was built from; and absolute if the latter is
+unknown, as in a map that was never baked."""
 
 
 def check_same_scene(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
-    """Raise ``InputError`` for photos of another scene: none of those that the map was made of, and unlike its field.
+    """Raise ``InputError`` for photos of another scene: none of them was used to build the map, and they are
+    unlike its field.
 
     The message begins with ``where``.
     """
@@ -29,10 +31,11 @@ def check_same_scene(info: MapInfo, field: RadianceField, views: Sequence[View],
 
 
 def check_alike(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
-    """Raise ``InputError`` for photos that are unlike the field, whichever they are."""
+    """Raise ``InputError`` for photos that are unlike the field, regardless of whether the map was built from them."""
     off, usual = colour_noise(field, info.bounds, views), info.colour_noise
     if off > (UNLIKE_ANY if usual is None else max(UNLIKE, UNLIKE_ITS_OWN * usual)):
         raise InputError(
-            f"{where}: made from {info.data or 'other views'!r}, and its renderings differ from the photos by {off:.0%} of the"
-            " range of colours; expected photos of the same scene, with poses in the coordinates of the map"
+            f"{where}: built from {info.data or 'other views'!r}, and its renderings differ from the photos"
+            f" by {off:.0%} of the range of colours; expected photos of the same scene, with poses in the"
+            " coordinates of the map"
         )

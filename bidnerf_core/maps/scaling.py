@@ -1,4 +1,6 @@
-"""Maps in another unit of length: all of a map scaled about the origin, and the factor that makes its unit the metre."""
+"""Maps in another length unit: scaling a whole map about the origin, and finding the factor that converts it
+to metres.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,12 @@ if TYPE_CHECKING:
     from bidnerf_core.maps.map import Map
 
 Place = str | Sequence[float] | Float[Tensor, "3"]
-"""A point of a map: its three coordinates, the name of a camera of the map, or ``NAME@U,V``, what that camera shows at a pixel."""
+"""A point of a map: its three coordinates, the name of one of its cameras, or ``NAME@U,V``, what that camera
+shows at a pixel."""
 LEAST_CAMERAS = 3
-"""Least number of cameras with known positions that give a scale which can be checked."""
+"""Smallest number of cameras with known positions that gives a scale that can be checked."""
 WORST_FIT = 0.2
-"""Largest distance (root mean square) of scaled cameras from their known positions, as a share of the spread of these."""
+"""Largest distance (root mean square) of scaled cameras from their known positions, relative to the spread of these."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +52,11 @@ class ScaleFit:
 
 
 def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
-    """Return the map with all lengths multiplied by ``factor``, in memory; ``unit`` is what they are in then.
+    """Return the map with all lengths multiplied by ``factor``, in memory; ``unit`` is the resulting length
+    unit.
 
-    Raises ``InputError`` for a factor that is not positive or makes lengths too large, and for a map whose training is not complete.
+    Raises ``InputError`` for a factor that is not positive or makes lengths too large, and for a map whose
+    training is not complete.
     """
     if isinstance(factor, bool) or not (isinstance(factor, int | float) and 0 < factor < math.inf):
         raise InputError(f"factor is {factor!r}, expected a positive number")
@@ -77,12 +82,12 @@ def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
 
 
 def in_map_frame(field: RadianceField, info: MapInfo) -> RadianceField:
-    """Return a field as its backend built it in the unit of its map."""
+    """Convert a field as its backend built it to the unit of its map."""
     return field if info.field_frame is None else scaled_field(field, info.field_frame.scale)
 
 
 def scaled_info(info: MapInfo, factor: float, unit: LengthUnit) -> MapInfo:
-    """Return the description of a map whose lengths are multiplied by ``factor``; weights stay those of the unit of training."""
+    """Return the description of a map with lengths multiplied by ``factor``; weights stay in the unit of training."""
     frame = info.field_frame or FieldFrame(1.0, info.bounds)
     scale = frame.scale * factor
     bounds = frame.bounds if scale == 1 else scaled_bounds(info.bounds, factor)
@@ -92,7 +97,7 @@ def scaled_info(info: MapInfo, factor: float, unit: LengthUnit) -> MapInfo:
 
 
 def scaled_bounds(bounds: SceneBounds, factor: float) -> SceneBounds:
-    """Return the bounds of a scene whose lengths are multiplied by ``factor``."""
+    """Return the bounds of a scene with lengths multiplied by ``factor``."""
     return replace(
         bounds, lower=_three(bounds.lower, factor), upper=_three(bounds.upper, factor), near=bounds.near * factor,
         far=bounds.far * factor, footprint=bounds.footprint * factor,
@@ -100,7 +105,7 @@ def scaled_bounds(bounds: SceneBounds, factor: float) -> SceneBounds:
 
 
 def scaled_surface(surface: SurfaceMap, factor: float) -> SurfaceMap:
-    """Return a surface whose lengths are multiplied by ``factor``; its index stays as it is."""
+    """Return a surface with lengths multiplied by ``factor``; its index is unchanged."""
     parts, grid = surface.surfels, surface.grid
     surfels = replace(parts, positions=parts.positions * factor, rgb_gradient=parts.rgb_gradient / factor)
     moved = VoxelGrid(_three(grid.lower, factor), grid.cell * factor, grid.shape)
@@ -110,7 +115,7 @@ def scaled_surface(surface: SurfaceMap, factor: float) -> SurfaceMap:
 
 
 def scaled_landmarks(landmarks: LandmarkMap, factor: float) -> LandmarkMap:
-    """Return landmarks whose lengths are multiplied by ``factor``."""
+    """Return landmarks with lengths multiplied by ``factor``."""
     lengths = landmarks.pose_covariance.new_tensor([factor] * 3 + [1.0] * 3)
     return replace(
         landmarks, positions=landmarks.positions * factor, deviations=landmarks.deviations * factor,
@@ -120,7 +125,7 @@ def scaled_landmarks(landmarks: LandmarkMap, factor: float) -> LandmarkMap:
 
 
 def scaled_capture(capture: CaptureReport, factor: float) -> CaptureReport:
-    """Return the record of a capture whose lengths are multiplied by ``factor``."""
+    """Return a capture record with lengths multiplied by ``factor``."""
     photos = tuple(
         replace(
             photo, position=_three(photo.position, factor),
@@ -133,31 +138,33 @@ def scaled_capture(capture: CaptureReport, factor: float) -> CaptureReport:
 
 
 def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -> float:
-    """Return the factor by which the distance of two places becomes ``metres``.
+    """Return the factor that makes the distance between two places ``metres``.
 
-    Raises ``InputError`` for places that the map does not have or that coincide, and for a length that is not positive.
+    Raises ``InputError`` for places that the map does not have or that coincide, and for a length that is not
+    positive.
     """
     if not 0 < metres < math.inf:
         raise InputError(f"distance is {metres} m, expected a positive length")
     apart = float(torch.linalg.vector_norm(place_of(scene, first) - place_of(scene, second)))
     if not apart > 0:
-        raise InputError(f"{first} and {second} are the same place, expected two places that are apart")
+        raise InputError(f"{first} and {second} are the same place, expected two different places")
     return metres / apart
 
 
 def factor_of_poses(scene: Map, known: Mapping[str, SE3]) -> ScaleFit:
-    """Return the factor by which the cameras of the map fit ``known`` poses (T_world_camera, metres, any world), by their names.
+    """Return the factor by which the map's cameras fit ``known`` poses (T_world_camera, metres, any world),
+    matched by name.
 
-    Only positions count. Raises ``InputError`` where fewer than three cameras are known, all are in one place, or they do not
-    fit whatever the factor.
+    Only positions count. Raises ``InputError`` if fewer than three cameras are known, all are in one place,
+    or they do not fit with any factor.
     """
     poses = {camera.name: camera.pose for camera in scene.info.cameras}
     names = [name for name in known if name in poses]
     if len(names) < LEAST_CAMERAS:
         example = f" such as {next(iter(poses))!r}" if poses else ""
         raise InputError(
-            f"{len(names)} of {len(known)} known poses are of cameras of the map, expected {LEAST_CAMERAS} or more by their"
-            f" names{example}"
+            f"{len(names)} of {len(known)} known poses belong to cameras of the map, expected at least"
+            f" {LEAST_CAMERAS}, matched by name{example}"
         )
     source = torch.stack([poses[name].translation for name in names])
     target = torch.stack([known[name].translation.double() for name in names])
@@ -172,7 +179,7 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3]) -> ScaleFit:
 
 
 def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
-    """Return the coordinates of a place of the map (float64), see ``Place``. Raises ``InputError`` where it has none."""
+    """Return the coordinates of a place of the map (float64), see ``Place``. Raises ``InputError`` if it has none."""
     if not isinstance(place, str):
         point = torch.as_tensor(place, dtype=torch.float64).cpu()
         if point.shape != (3,) or not bool(point.isfinite().all()):
@@ -198,7 +205,7 @@ def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tens
     """Return the point that the field shows at a pixel of a camera."""
     if not (0 <= u <= camera.intrinsics.width and 0 <= v <= camera.intrinsics.height):
         size = f"{camera.intrinsics.width}x{camera.intrinsics.height}"
-        raise InputError(f"pixel {u:g},{v:g} is outside of {camera.name}, whose image in the map is {size}")
+        raise InputError(f"pixel {u:g},{v:g} is outside {camera.name}, whose image in the map is {size}")
     ray = camera.intrinsics.unproject(torch.tensor([[u, v]], dtype=torch.float64))
     direction = camera.pose.rotate(ray / ray.norm(dim=-1, keepdim=True))
     origin = camera.pose.translation[None]
@@ -207,7 +214,7 @@ def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tens
     shown = render(scene.field, rays, scene.bounds.background)
     if float(shown.opacity[0]) < 0.5:
         raise InputError(
-            f"{camera.name}@{u:g},{v:g} shows the background, expected a pixel that shows a thing"
+            f"{camera.name}@{u:g},{v:g} shows the background, expected a pixel that shows the scene"
         )
     return origin[0] + float(shown.distance[0] / shown.opacity[0]) * direction[0]
 

@@ -1,4 +1,4 @@
-"""The summary of a map: what a person wants to know about it."""
+"""The summary of a map for users."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ class SurfaceSize:
     """The size of a map's surface."""
 
     cell: float  # metres: side of a cell of its index
-    cells: int  # that are stored
+    cells: int  # number of stored cells
     MiB: float
 
 
 @dataclass(frozen=True)
 class MapSummary:
-    """The facts about a map. ``str()`` of it is a description for people, ``plain()`` an object for JSON."""
+    """The facts about a map. ``str()`` gives a human-readable description, ``plain()`` a JSON object."""
 
     map: str  # its folder; empty for a map in memory
     backend: str
     data: str  # name of the dataset's folder
     cameras: int
-    added: int  # of these cameras, after the training
+    added: int  # of these cameras, after training
     unit: LengthUnit  # of all lengths
-    up: UpDirection | None  # the upward direction in the world, and what it was found from
+    up: UpDirection | None  # the upward direction in the world, and its source
     distances: bool  # whether the training images determine distances
-    poses: PoseRefinement | None  # the consistency of the given poses, where it is known
+    poses: PoseRefinement | None  # the consistency of the given poses, if known
     step: int
     complete: bool
     seconds: float  # of training
@@ -52,17 +52,17 @@ class MapSummary:
     surface: SurfaceSize | None
     landmarks: int
     trial: HeldOutTrial | None
-    bytes: int | None  # of the files in its folder
+    bytes: int | None  # total size of the files in its folder
     bounds: SceneBounds
     config: dict[str, Any]
     bidnerf: str  # the version that wrote it
     moved: tuple[MovedCamera, ...]  # by the refinement of poses
-    capture: CaptureReport | None  # the record of the photos, where there is one
+    capture: CaptureReport | None  # the capture record, if there is one
     colour_noise: float | None  # root mean square error of rendered colours on training images
     remarks: tuple[str, ...]  # sentences about the poses and the photos
 
     def plain(self) -> dict[str, Any]:
-        """Return the facts as values that JSON can hold."""
+        """Return the facts as JSON-serializable values."""
         facts: dict[str, Any] = to_plain(replace(self, remarks=()))
         del facts["remarks"]
         return facts
@@ -73,7 +73,7 @@ class MapSummary:
 
     def _lines(self) -> dict[str, str]:
         photos = amount(self.cameras, "image") if self.cameras else "cameras not recorded"
-        state = "complete" if self.complete else "not complete; 'bidnerf train --resume' goes on with it"
+        state = "complete" if self.complete else "not complete; 'bidnerf train --resume' continues it"
         time = duration_text(self.seconds)
         place = f"{self.map}, {(self.bytes or 0) / 2**20:.1f} MiB" if self.map else "in memory"
         return {
@@ -82,9 +82,7 @@ class MapSummary:
             "training": f"{self.step} steps of backend {self.backend} in {time}, {state}",
             "field": self._field_line(),
             "scene": _scene_line(self.bounds),
-            "distances": "known"
-            if self.distances
-            else "not known, since all images were taken from one place",
+            "distances": "known" if self.distances else "unknown, since all images were taken from one place",
             "frame": self._frame_line(),
             "surface": self._surface_line(),
             "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
@@ -115,7 +113,7 @@ class MapSummary:
 
     def _surface_line(self) -> str:
         if self.surface is None:
-            return "none; 'bidnerf bake MAP' makes one"
+            return "none; 'bidnerf bake MAP' builds it"
         cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
         return f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
 

@@ -1,4 +1,4 @@
-"""Making maps: training a field on posed images, baking what localization needs beside it, and going on where that stopped."""
+"""Building maps: training a field on posed images, baking what localization needs, and resuming interrupted work."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ USUAL_BAKE = BakeConfig()
 
 
 class OtherSettings(InputError):
-    """A training cannot be resumed with settings that differ from those that it was begun with."""
+    """A training run cannot be resumed with settings that differ from its original ones."""
 
 
 @dataclass(frozen=True)
 class _Work:
-    """How to train and bake, whatever the views."""
+    """How to train and bake, independent of the views."""
 
     out: Path | None
     bake: BakeConfig | None
@@ -81,27 +81,29 @@ def train(
 ) -> Map:
     """Train a map on images: check and refine their poses, train the field, and bake a surface and landmarks.
 
-    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``split`` names the views of a dataset,
-    and "all" stands for those of all splits. The path may also be that of a folder of photos without poses, or of a video:
-    ``find_poses`` then finds the poses first, in the folder OUT-poses beside the map. ``camera`` (intrinsics or a file) is for
-    such photos, and for the path to a dataset without a camera of its own.
-    ``backend`` is the name of an installed backend, and ``config`` holds its settings: an object of its ``config_type``, or a
-    dict of those that differ from the defaults. The map is stored in folder ``out`` while it is trained, and stays in memory
-    only if that is None. ``refine_poses`` is "always", "never", or "auto": if the images contradict the given poses. ``bake`` may hold
-    the settings of baking.
+    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``split`` selects the
+    views of a dataset, and "all" stands for all splits. The path may also be a folder of photos without
+    poses, or a video: ``find_poses`` then finds the poses first, in the folder OUT-poses next to the map.
+    ``camera`` (intrinsics or a file) is for such photos, and for the path to a dataset that stores no camera.
+    ``backend`` is the name of an installed backend, and ``config`` holds its settings: an object of its
+    ``config_type``, or a dict of those that differ from the defaults. The map is stored in folder ``out``
+    during training, or only kept in memory if that is None. ``refine_poses`` is "always", "never", or "auto"
+    (if the images contradict the given poses). ``bake`` may hold the settings of baking.
 
-    ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True, ``Cancelled`` is
-    raised; a map in a folder whose training has begun is then saved, and ``resume`` goes on with it. An error that ``progress``
-    raises ends the training as well; the map in the folder is then that of the last checkpoint, at most
-    ``checkpoint_seconds`` old.
+    ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True,
+    ``Cancelled`` is raised; a map in a folder whose training has begun is saved first, and ``resume``
+    continues it. An exception raised by ``progress`` ends the training as well; the map in the folder is then
+    that of the last checkpoint, at most ``checkpoint_seconds`` old.
 
-    ``background`` is the colour behind images with an alpha channel. Images without depth take that of the points of the COLMAP
-    sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the
-    detector of the landmarks. Images with more than ``largest`` pixels along the longer side are reduced to that, by default
-    to 1600, or fewer where they would take more than 2 GB or a quarter of the available memory; the map's cameras are scaled.
-    Poses that contradict most pairs of images are refused unless ``trust_poses`` is set.
+    ``background`` is the colour behind images with an alpha channel. Images without depth take it from the
+    points of the COLMAP sparse model in folder ``depth_points``, filtered by ``point_choice``. ``features``
+    is the name of the landmarks' detector. Images with more than ``largest`` pixels along the longer side are
+    downscaled to that, by default to 1600, or fewer if they would take more than 2 GB or a quarter of the
+    available memory; the map's cameras are scaled accordingly. Poses that contradict most pairs of images are
+    rejected unless ``trust_poses`` is set.
 
-    Raises ``InputError`` where data, settings or folder are not usable; the folder must be empty unless ``overwrite`` is set.
+    Raises ``InputError`` if data, settings or folder cannot be used; the folder must be empty unless
+    ``overwrite`` is set.
     """
     chosen = load_backend(backend)
     find_features(features)
@@ -124,8 +126,8 @@ def train(
         taken = prepared(read.views, refine_poses, progress, cancel, features, trust_poses)
         if not taken.distances:
             log.info(
-                f"{read.place}: the photos are from one place and show no distances; the map's depth will be arbitrary, and"
-                " localization in it will tell directions, never positions"
+                f"{read.place}: the photos are from one place and do not determine distances; the map's"
+                " depth will be arbitrary, and localization in it will give directions, but no positions"
             )
         check_cancelled(cancel, "training")
         bounds = estimate_bounds(taken.views, read.background)
@@ -153,11 +155,12 @@ def resume(
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     camera: Intrinsics | str | Path | None = None,
 ) -> Map:
-    """Go on with the interrupted training of the map in ``folder``, with the same result as an uninterrupted one.
+    """Resume the interrupted training of the map in ``folder``, with the same result as an uninterrupted run.
 
-    A map that is trained but not baked is baked. Backend, settings and poses are those that the training was begun with;
-    ``data``, ``split``, ``background``, ``depth_points``, ``point_choice`` and ``camera`` must give the same views. The other arguments,
-    and what is raised, are as for ``train``. Raises ``InputError`` where nothing is left to do.
+    A map that is trained but not baked is baked. Backend, settings and poses are those of the original run;
+    ``data``, ``split``, ``background``, ``depth_points``, ``point_choice`` and ``camera`` must give the same
+    views. The other arguments and the errors are as for ``train``. Raises ``InputError`` if nothing is left
+    to do.
     """
     work = _work(folder, bake, device, checkpoint_seconds, progress, cancel)
     out = Path(folder)
@@ -175,20 +178,21 @@ def resume(
         )
         _check_same_views(out, info, read, split)
         views = at_stored_poses(read.views, info.cameras)
-        if info.complete:  # stopped between training and baking
+        if info.complete:  # interrupted between training and baking
             log.info(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
             scene = load_map(out, work.device, baked=False)
             return scene.with_baked_parts(views, work.bake or USUAL_BAKE, progress=progress, cancel=cancel)
         tracked, views = located(
             views, progress, cancel, info.landmark_features, trust_poses=True
-        )  # the same as when the training began
+        )  # the same as when training began
         return _trained(load_backend(info.backend, str(out)), info, views, tracked, work)
 
 
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
-    """Return the description of the map in ``folder``, whose training or, with ``baking``, whose surface is incomplete.
+    """Return the description of the map in ``folder``, whose training or, with ``baking``, whose surface is
+    incomplete.
 
-    Raises ``InputError`` where nothing is left to do.
+    Raises ``InputError`` if nothing is left to do.
     """
     try:
         info = load_info(folder)
@@ -221,31 +225,35 @@ def _work(
     if not isinstance(bake, bool | BakeConfig):
         raise InputError(f"bake is {bake!r}, expected True, False or a BakeConfig")
     if progress is not None and not callable(progress):
-        raise InputError(f"progress is a {type(progress).__name__}, expected a function of a Progress")
+        raise InputError(
+            f"progress is a {type(progress).__name__}, expected a function that takes a Progress"
+        )
     config = bake if isinstance(bake, BakeConfig) else USUAL_BAKE if bake else None
     place = None if out is None else Path(out)
     return _Work(place, config, working_device(device), seconds, progress, cancel)
 
 
 def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
-    """Raise ``InputError`` for views, or their depth or background, that the training was not begun with."""
+    """Raise ``InputError`` for views (or their depth or background) that differ from those the training began with."""
     if read.source and read.background != info.bounds.background:
         raise OtherSettings(
-            f"{out}: was begun over background {info.bounds.background}, got {read.background}"
+            f"{out}: was started with background {info.bounds.background}, got {read.background}"
         )
     if stored_cameras(read.views) != as_given(info.cameras):
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
-            f"{read.place}: {part} other frames or poses than {out} was begun with, expected those of {info.data!r} unchanged"
+            f"{read.place}: {part} frames or poses that differ from those {out} was started with, expected"
+            f" those of {info.data!r} unchanged"
         )
     if read.hidden != info.hidden:
         raise OtherSettings(
-            f"{out}: was begun with {info.hidden} pixels hidden by masks, got {read.hidden}; resuming keeps the masks (--masks)"
+            f"{out}: was started with {info.hidden} pixels hidden by masks, got {read.hidden}; resuming"
+            " keeps the masks (--masks)"
         )
     if read.sparse_depth != info.sparse_depth:
         raise OtherSettings(
-            f"{out}: was begun with the depth of {info.sparse_depth} pixels from points, got {read.sparse_depth}; "
-            "resuming keeps the points (--depth-points) and the choice of them"
+            f"{out}: was started with the depth of {info.sparse_depth} pixels from points, got"
+            f" {read.sparse_depth}; resuming keeps the points (--depth-points) and their selection"
         )
 
 
@@ -259,16 +267,14 @@ def _trained(
     state = None
     if info.step and work.out is not None:
         state = load_state(work.out, info, field)
-        log.info(f"{where}: going on from step {info.step}")
+        log.info(f"{where}: resuming from step {info.step}")
     report = Checkpoints(info, work.out, state, work.checkpoint_seconds, work.progress, work.cancel)
-    del state  # the report frees it once training goes on from it
+    del state  # the report frees it once training resumes from it
     try:
         backend.train(field, views, config, report)
     except TrainingStopped as stopped:
         kept = "saved" if work.out is not None else "cancelled"
-        advice = (
-            "; resuming it (--resume) goes on from there" if work.out is not None else ", nothing is stored"
-        )
+        advice = "; --resume continues from there" if work.out is not None else ", nothing is stored"
         raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
     report.finish(field)
     weights = packed(cast(nn.Module, field).state_dict())
@@ -287,8 +293,8 @@ def _baked(
 ) -> Map:
     try:
         return scene.with_baked_parts(list(views), config, False, tracked, work.progress, work.cancel)
-    except PluginError:  # nothing that other images would mend
+    except PluginError:  # nothing that other images would fix
         raise
-    except InputError as error:  # the map itself is sound
+    except InputError as error:  # the map itself is valid
         log.info(f"{scene.name}: no surface baked: {error}")
         return scene if scene.folder is None else load_map(scene.folder, work.device)

@@ -1,4 +1,4 @@
-"""Viewpoints for a field whose training images are not known: cameras that see its matter from free space."""
+"""Viewpoints for a field whose training images are unknown: cameras that see its matter from free space."""
 
 from __future__ import annotations
 
@@ -17,43 +17,44 @@ from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.geometry.se3 import SE3
 
 SIZE = 192
-"""Pixels along each side of an image."""
+"""Width and height of an image in pixels."""
 FIELD_OF_VIEW = 70.0  # degrees
 VIEWS = 48
 """Number of viewpoints."""
 PLACES = 400
-"""Random places in the box that are tried."""
+"""Number of random places in the box that are tried."""
 DIRECTIONS = 48
-"""Rays from each place, evenly over the sphere."""
+"""Number of rays from each place, evenly over the sphere."""
 SOLID = 0.8
-"""Opacity at which a ray meets something."""
+"""Opacity above which a ray hits something."""
 CLEARANCE = 0.04
-"""Least distance from matter, in units of the box's longest side; near of it, little is seen."""
+"""Smallest distance from matter, relative to the box's longest side; closer up, little is visible."""
 ENCLOSED = 0.6
-"""Share of the rays from a place that meet matter, above which it is inside of a room or the like."""
+"""Fraction of the rays from a place that hit matter above which it is inside a room or the like."""
 ROOMY = 0.2
-"""Share of the places in the box that must be free and enclosed, for the scene to be looked at from inside. An object with hollows
-(Lego: 0.09) has some such places, and a room (0.5) has many."""
+"""Fraction of the places in the box that must be free and enclosed for the scene to be viewed from inside. An
+object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """Places in a field and what rays from them meet."""
+    """Places in a field and what rays from them hit."""
 
     places: Float[Tensor, "p 3"]
-    share: Float[Tensor, "p"]  # of rays that meet matter
-    nearest: Float[Tensor, "p"]  # metres: distance that nine of ten rays exceed
-    distance: Float[Tensor, "p d"]  # metres; 0 where a ray meets nothing
+    share: Float[Tensor, "p"]  # of rays that hit matter
+    nearest: Float[Tensor, "p"]  # metres: exceeded by nine out of ten rays
+    distance: Float[Tensor, "p d"]  # metres; 0 where a ray hits nothing
 
 
 def viewpoints(
     field: RadianceField, bounds: SceneBounds, up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     is_solid: bool = False,
 ) -> tuple[StoredCamera, ...]:  # fmt: skip
-    """Return cameras that see the matter of a field: from all around an object, or from free places within a room.
+    """Return cameras that see the matter of a field: from all around an object, or from free places within a
+    room.
 
-    ``up`` is the direction that is upwards in the images. What lies within an ``is_solid`` object is not free, although nothing
-    is met there. Deterministic.
+    ``up`` is the upward direction in the images. The inside of an ``is_solid`` object is not free, although
+    rays hit nothing there. Deterministic.
     """
     generator = torch.Generator().manual_seed(0)
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
@@ -89,7 +90,7 @@ def _try(field: RadianceField, bounds: SceneBounds, places: Float[Tensor, "p 3"]
 
 
 def _within(tried: _Tried, free: Tensor, up: tuple[float, float, float]) -> list[SE3]:
-    """Return views from free places that are far from each other, each in the directions in which there is most to see."""
+    """Return views from free places far from each other, each in the directions in which there is most to see."""
     places, distance = tried.places[free], tried.distance[free]
     directions = sphere(DIRECTIONS)
     level = (
@@ -98,7 +99,7 @@ def _within(tried: _Tried, free: Tensor, up: tuple[float, float, float]) -> list
     chosen = _spread(places, VIEWS // 4)
     poses = []
     for number in chosen:
-        # Of four sectors about the vertical, the direction with the farthest matter: it shows most.
+        # In each of four sectors about the vertical, the direction with the farthest matter: it shows most.
         for sector in _sectors(directions, up):
             allowed = sector & level & (distance[number] > 0)
             if bool(allowed.any()):
@@ -109,7 +110,7 @@ def _within(tried: _Tried, free: Tensor, up: tuple[float, float, float]) -> list
 
 
 def _spread(places: Float[Tensor, "p 3"], count: int) -> list[int]:
-    """Return the numbers of places that are far from each other (farthest-point sampling)."""
+    """Return the indices of places far from each other (farthest-point sampling)."""
     chosen = [int((places - places.mean(0)).norm(dim=-1).argmin())]
     away = (places - places[chosen[0]]).norm(dim=-1)
     while len(chosen) < min(count, len(places)):
@@ -133,7 +134,7 @@ def _not_along(vertical: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
 
 
 def _around(bounds: SceneBounds, up: tuple[float, float, float]) -> list[SE3]:
-    """Return views from all around the box, at such a distance that it fills them."""
+    """Return views from all around the box, at a distance from which it fills them."""
     centre = torch.tensor(bounds.centre, dtype=torch.float64)
     radius = math.dist(bounds.lower, bounds.upper) / 2 / math.sin(math.radians(FIELD_OF_VIEW / 2)) * 0.8
     return [look_at(centre + radius * direction, centre, up) for direction in sphere(VIEWS)]

@@ -1,4 +1,4 @@
-"""The views that a map is made from: those of a dataset, of a path to one, or views in memory."""
+"""The views that a map is built from: a dataset's, those at the path to one, or views in memory."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class ReadViews:
 
     views: list[View]
     source: str  # name of the dataset's folder; empty for views from memory
-    place: str  # path of the dataset, or words for views from memory
+    place: str  # path of the dataset, or a description for views in memory
     background: tuple[float, float, float]  # behind images with an alpha channel
     hidden: int = 0  # pixels that masks hide
     unit: LengthUnit = "units"  # of the poses
     gravity_up: tuple[float, float, float] | None = (
-        None  # upward direction (world), where the capture measured gravity
+        None  # upward direction (world), if the capture measured gravity
     )
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
 
@@ -57,15 +57,16 @@ def read_views(
     folder: Path | None = None,
     camera: Intrinsics | str | Path | None = None,
 ) -> ReadViews:
-    """Read the views of ``data``; ``split`` names those of a dataset, and "all" stands for those of all splits.
+    """Read the views of ``data``; ``split`` selects those of a dataset, and "all" stands for all splits.
 
-    Images of a dataset with more than ``largest`` pixels along the longer side are reduced to that, by default to what
-    ``useful_size`` says. They are held as bytes, and where they are many in a nameless file in ``folder``, see ``PixelStore``.
+    Images of a dataset with more than ``largest`` pixels along the longer side are downscaled to that, by
+    default to ``useful_size``. They are held as bytes, and if they are many in a nameless file in ``folder``,
+    see ``PixelStore``.
 
-    ``background`` is the colour behind images with an alpha channel, by default that of the dataset. Images without depth take
-    that of the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``. ``camera`` is for the path to a
-    dataset without a camera of its own. Raises ``InputError`` where there
-    are no views, and where they or the model are not usable.
+    ``background`` is the colour behind images with an alpha channel, by default the dataset's. Images without
+    depth take it from the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``.
+    ``camera`` is for the path to a dataset that stores no camera. Raises ``InputError`` if there are no
+    views, and if they or the model cannot be used.
     """
     stated: LengthUnit | None = None
     up: tuple[float, float, float] | None = None
@@ -74,11 +75,11 @@ def read_views(
         background = None
     if camera is not None:
         raise InputError(
-            "camera is given for images that have cameras; expected it for the path to images without"
+            "camera is given for images that have cameras; it is only for the path to images without"
         )
     if isinstance(data, Dataset):
         if background is not None and background_colour(background) != data.background:
-            raise InputError(f"{data.path}: was opened over background {data.background}, got {background!r}")
+            raise InputError(f"{data.path}: was opened with background {data.background}, got {background!r}")
         if isinstance(data, Georeferenced):
             stated, up = data.unit, data.up
         data = with_all(data, split)
@@ -86,9 +87,9 @@ def read_views(
             raise InputError(f"{data.path}: split {split!r} has no frames")
         views = _read(data, split, largest, folder, counter("reading", "images", progress, cancel))
         if left_out := len(data.frame_names(split)) - len(views):
-            log.info(f"{data.path}: {amount(left_out, 'image')} left out: hidden altogether; {INVERTED}")
+            log.info(f"{data.path}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
         if not views:
-            raise InputError(f"{data.path}: masks hide all of every image in split {split!r}; {INVERTED}")
+            raise InputError(f"{data.path}: masks hide every image in split {split!r} entirely; {INVERTED}")
         source, place, colour = data.path.resolve().name, str(data.path), data.background
     else:
         views, source, place = _checked(data), "", "views in memory"
@@ -112,10 +113,10 @@ def _hidden(views: Sequence[View], place: str) -> int:
 def _read(
     data: Dataset, split: str, largest: int | None, folder: Path | None, progress: ReadingProgress
 ) -> list[View]:
-    """Read the views of a split one after another, so that only one image is in memory at its own size."""
+    """Read the views of a split one after another, so that only one image is in memory at full size."""
     names = data.frame_names(split)
     views: list[View] = []
-    store, limit = PixelStore(0), 0  # the first image is read at its own size, which is reported
+    store, limit = PixelStore(0), 0  # the first image is read at full size, which is logged
     for place, name in enumerate(names):
         for view in _one(data, split, name, limit if views else None, largest is not None):
             if not views:
@@ -129,9 +130,9 @@ def _read(
 
 
 def _one(data: Dataset, split: str, name: str, limit: int | None, asked: bool) -> list[View]:
-    """Read a frame, at most ``limit`` pixels wide and high, which the user may have ``asked`` for.
+    """Read a frame, at most ``limit`` pixels wide and high, which the user may have requested (``asked``).
 
-    Returns none where a mask hides all of it, as when a whole split is read.
+    Returns none if a mask hides it entirely, as when a whole split is read.
     """
     try:
         with reading_at(limit, asked):
@@ -141,15 +142,17 @@ def _one(data: Dataset, split: str, name: str, limit: int | None, asked: bool) -
 
 
 USEFUL_SIDE, LEAST_SIDE = 1600, 800
-"""Pixels along the longer side: more are of little use to a map, whose keypoints are found at the latter; fewer harm it."""
+"""Pixels along the longer side: more are of little use to a map, whose keypoints are found at the latter;
+fewer harm it."""
 MOST_BYTES = 2_000_000_000
-"""Bytes that the images of a training take by default; on machines with little memory, a quarter of what is available."""
+"""Bytes that the images of a training run use by default; on machines with little memory, a quarter of what
+is available."""
 
 
 def useful_size(frame: Frame, count: int) -> int:
-    """Return the longer side (pixels) to which ``count`` images like that of ``frame`` are reduced by default.
+    """Return the longer side (pixels) to which ``count`` images like ``frame`` are downscaled by default.
 
-    It is ``USEFUL_SIDE``, or less where so many images would not fit into memory, but not less than ``LEAST_SIDE``.
+    It is ``USEFUL_SIDE``, or less if the images would not fit into memory, but not less than ``LEAST_SIDE``.
     """
     available = available_memory()
     most = MOST_BYTES if available is None else min(MOST_BYTES, available // 4)
@@ -169,7 +172,7 @@ def _say_size(place: str, frame: Frame, small: Frame, count: int) -> None:
 
 
 def _unit_of(views: Sequence[View]) -> LengthUnit:
-    """Return metres for views with dense measured depth: training refuses poses that contradict it."""
+    """Return metres for views with dense measured depth: training rejects poses that contradict it."""
     return "metres" if any(view.frame.has_dense_depth for view in views) else "units"
 
 
@@ -186,7 +189,7 @@ def _checked(views: Sequence[View]) -> list[View]:
 
 
 def _with_depth(views: list[View], model: Path, choice: SparseChoice, split: str) -> tuple[list[View], int]:
-    """Return the views with the depth of the model's points, and the number of pixels that have it."""
+    """Return the views with depth from the model's points, and the number of pixels that have it."""
     places = [(view.frame.name, view.T_ref_camera) for view in views]
     sparse = SparsePoints(model, places, choice, split)
     changed = [sparse.onto(view, split) for view in views]

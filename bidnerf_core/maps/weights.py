@@ -1,4 +1,4 @@
-"""Checking the weights of a map against the field that they are for."""
+"""Checking the weights of a map against its field."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField
 
 LARGEST_WEIGHT = 1e9
-"""Limit of a field's parameters, whose products would overflow in float32; trained ones stay far below it."""
+"""Limit of a field's parameters, beyond which products would overflow in float32; trained ones stay far below it."""
 
 
 def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """Return a field's tensors from a file, upgraded where an earlier version stored them, after checking them.
+    """Return a field's tensors from a file, checked, and upgraded if an earlier version stored them.
 
-    Their names, shapes and values are checked against the field here, since torch's own message would take many lines.
+    Their names, shapes and values are checked against the field here, since torch's own message would take
+    many lines.
     """
     if isinstance(field, UpgradingField):
         tensors = field.upgraded_state(tensors)
@@ -32,7 +33,7 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
             raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
         if tensors[name].is_floating_point() != value.is_floating_point():
             kinds = (str(kind).removeprefix("torch.") for kind in (tensors[name].dtype, value.dtype))
-            raise InputError(f"{path}: tensor {name!r} is of {next(kinds)}, expected {next(kinds)}")
+            raise InputError(f"{path}: tensor {name!r} has dtype {next(kinds)}, expected {next(kinds)}")
     surplus = sorted(tensors.keys() - expected.keys())
     if surplus:
         raise InputError(f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes")

@@ -1,4 +1,4 @@
-"""The answers to a run of images: as JSON, and as a file of poses."""
+"""The answers to a run of images: as JSON, and as a pose file."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ SEVERAL = 3
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The pose found for an image, and what is known of the image. The image itself is not kept."""
+    """The pose found for an image, and what is known about the image. The image itself is not kept."""
 
     name: str
     number: int  # index in the run or sequence, from 0
-    intrinsics: Intrinsics  # of the upright image, corrected ones where the localization took such
+    intrinsics: Intrinsics  # of the upright image; corrected ones if the localization used such
     found: Localization
     truth: SE3 | None = None  # T_world_camera
     time: float | None = None  # seconds
@@ -51,25 +51,25 @@ class Answer:
         frame: Frame, number: int, found: Localization, *, truth: SE3 | None = None, time: float | None = None,
         file: Path | None = None,
     ) -> Answer:  # fmt: skip
-        """Return the answer for a frame, without the intermediate poses, which take much memory in long sequences."""
+        """Build the answer for a frame, without the intermediate poses, which take much memory in long sequences."""
         intrinsics = found.frame_as_taken(frame).intrinsics
         found = replace(found, poses=found.poses[-1:])
         return Answer(frame.name, number, intrinsics, found, truth, time, file)
 
     @property
     def accepted(self) -> bool:
-        """Whether the localization converged, to a pose that is finite."""
+        """Whether the localization converged to a finite pose."""
         return self.found.converged and bool(self.found.T_world_camera.matrix().isfinite().all())
 
     @property
     def error(self) -> PoseError | None:
-        """The error of the pose found, or None where the true pose is not known."""
+        """The error of the pose found, or None if the true pose is unknown."""
         found = self.found
         return None if self.truth is None else pose_error(found.T_world_camera, self.truth, found.unit)
 
     @property
     def posed(self) -> PosedImage:
-        """The image as files of poses list it."""
+        """The image as listed in pose files."""
         found = self.found
         return PosedImage(
             self.name,
@@ -83,7 +83,7 @@ class Answer:
         )
 
     def plain(self, backend: str) -> dict[str, Any]:
-        """Return the object of JSON values that ``bidnerf localize --json`` prints."""
+        """Return the JSON object that ``bidnerf localize --json`` prints."""
         return {"frame": self.name} | plain_localization(self.found, backend, self.error)
 
 
@@ -105,7 +105,7 @@ class Failure:
 
 
 class Answers:
-    """The answers to the images of a run, in their order, for a map of a ``backend``."""
+    """The answers to the images of a run, in order, for a map with the given ``backend``."""
 
     def __init__(self, backend: str, unit: LengthUnit = "units") -> None:
         self.backend, self.unit = backend, unit
@@ -138,14 +138,17 @@ class Answers:
 
     @property
     def question(self) -> str:
-        """A question to append to a summary: empty unless there are several images and none shows the scene of the map."""
+        """A question to append to a summary: empty unless there are several images and none shows the scene
+        of the map.
+        """
         return question_about_scene([answer.found for answer in self.answers])
 
     def save(self, path: str | Path) -> None:
-        """Write the poses atomically, in the format that the ending of the file's name selects.
+        """Write the poses atomically, in the format selected by the file extension.
 
-        A ``.json`` file lists all answers with all details; files of other formats hold the accepted poses alone. Raises
-        ``UsageError`` for an unknown ending, and ``InputError`` for images that the format cannot describe.
+        A ``.json`` file lists all answers with all details; files in other formats contain only the accepted
+        poses. Raises ``UsageError`` for an unknown extension, and ``InputError`` for images that the format
+        cannot describe.
         """
         path = Path(path)
         if pose_format(path) == ".json":
@@ -164,19 +167,21 @@ class Answers:
 
 
 def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
-    """Return the JSON values of a localization, the backend of its map, and its error if that is known."""
+    """Return the JSON values of a localization, the backend of its map, and its error if known."""
     return found.plain() | {"backend": backend, "error": None if error is None else error.plain()}
 
 
 def question_about_scene(found: Collection[Localization]) -> str:
-    """Return a question to append to a summary: empty unless there are several images and none was recognised."""
+    """Return a question to append to a summary: empty unless there are several images and none was recognized."""
     if len(found) < SEVERAL or any(map(_shows_scene, found)):
         return ""
     return "; do they show the scene of this map?"
 
 
 def _shows_scene(found: Localization) -> bool:
-    """Return whether an image was recognised. An ambiguous one counts if far more landmarks fit its pose than by chance."""
+    """Return whether an image was recognized. An ambiguous one counts if far more landmarks fit its pose than
+    by chance.
+    """
     evidence = found.diagnostics
     if found.outcome is Outcome.AMBIGUOUS and isinstance(evidence, LandmarkDiagnostics):
         return evidence.inliers >= LandmarkThresholds().above_chance * evidence.chance
@@ -199,9 +204,10 @@ def localize_each(
 ) -> Answers:
     """Localize each query. One that cannot be read or localized does not stop the others; a single one raises its error.
 
-    ``start`` returns the start of a query, T_world_camera, which method ``auto`` does without. ``answers``: where the answers are
-    kept, by default new ones; they hold those so far if an error ends the run. ``each`` is called with each query's answer and
-    the query; for a failure the query has a name only. Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
+    ``start`` returns the start of a query, T_world_camera; method ``auto`` needs none. ``answers`` collects
+    the answers, by default a new object; it holds those so far if an error ends the run. ``each`` is called
+    with each query and its answer; for a failure the query has only a name. Raises ``InputError``, and
+    ``Cancelled`` once ``cancel`` returns True.
     """
     answers = (
         Answers(getattr(getattr(localizer.map, "info", None), "backend", ""), unit_of(localizer.map))
@@ -221,7 +227,7 @@ def localize_each(
         found = localizer(query.views, None if start is None else start(query), query.depth_rays, seed)
         if not bool(found.T_world_camera.matrix().isfinite().all()):
             raise InputError(
-                f"{query.name}: {found.method} came to a pose that is not finite, expected a sound map"
+                f"{query.name}: {found.method} diverged to a pose that is not finite; is the map valid?"
             )
         frame = replace(query.frame, name=query.name)
         return Answer.of(frame, number, found, truth=query.truth, file=query.file)
@@ -261,7 +267,7 @@ def answer_each(
 
 
 def _log_depth_noise(query: Query, localizer: Localizer) -> None:
-    """Compare the noise of a query's depth with that of the sensor that the settings name."""
+    """Compare the noise of a query's depth with that of the sensor named in the settings."""
     frame, sensor = query.frame, localizer.depth_sensor_name
     if sensor != "unknown" and frame.depth is not None and frame.has_depth:
         remark = noise_remark(frame.depth, frame.intrinsics, sensor)

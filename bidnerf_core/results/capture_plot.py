@@ -1,4 +1,6 @@
-"""A picture of a capture from above: its landmarks by the number of photos that show them, its cameras, and their problems."""
+"""A plot of a capture from above: its landmarks by the number of photos that show them, its cameras, and
+their problems.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,11 @@ LOOKS: dict[PhotoProblem, tuple[str, str]] = {
 """Colour and marker of each problem."""
 SOUND = COLOURS[2]
 MOST_POINTS = 20_000
-"""Maximum number of landmarks that are drawn."""
+"""Maximum number of landmarks drawn."""
 CAPTURE_MARGIN = 0.5
-"""Margin of the picture around the cameras, as a share of their extent; landmarks farther away are left out."""
+"""Margin of the plot around the cameras, relative to their extent; landmarks farther away are left out."""
 MOST_LABELS = 16
-"""Maximum number of photos with problems that are named in the picture."""
+"""Maximum number of photos with problems that are named in the plot."""
 
 
 def draw_capture(
@@ -40,7 +42,7 @@ def draw_capture(
 
     ``points`` (world, in ``unit``) are its landmarks, ``seen_by`` the number of photos that show each.
 
-    Raises ``InputError`` where matplotlib is not installed, or the file cannot be written.
+    Raises ``InputError`` if matplotlib is not installed, or the file cannot be written.
     """
     with styled():
         figure = new_figure(7.6, 7.0)
@@ -70,7 +72,7 @@ def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
 
 
 def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport, unit: LengthUnit) -> None:
-    """Set the part of the plane that is shown: the cameras, the centre if they look at it, and a margin."""
+    """Set the visible part of the plane: the cameras, the centre if they look at it, and a margin."""
     shown = cameras
     if report.coverage.arrangement in ("around", "one side"):
         shown = np.concatenate([cameras, np.zeros((1, 2))])
@@ -133,7 +135,7 @@ def _label(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport)
 
 
 def _draw_gap(panel: Any, gap: Gap, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
-    """Shade the directions from the centre in which there is no camera."""
+    """Shade the directions from the centre without any camera."""
     if report.coverage.arrangement not in ("around", "one side"):
         return
     from matplotlib.patches import Wedge

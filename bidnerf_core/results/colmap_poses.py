@@ -1,7 +1,8 @@
-"""Poses as a COLMAP text model: ``images.txt``, with ``cameras.txt`` and an empty ``points3D.txt`` beside it.
+"""Poses as a COLMAP text model: ``images.txt``, with ``cameras.txt`` and an empty ``points3D.txt`` next to
+it.
 
-See https://colmap.github.io/format.html. COLMAP's poses take the world to the camera, quaternions have the scalar first, and
-pixel centres lie at +0.5, as ours do.
+See https://colmap.github.io/format.html. COLMAP's poses are world to camera, quaternions have the scalar
+first, and pixel centres are at +0.5, like ours.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ RADIAL_TERMS = 4
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write ``path`` (images.txt), and the cameras.txt and points3D.txt without which COLMAP does not read it.
+    """Write ``path`` (images.txt), and the cameras.txt and points3D.txt that COLMAP requires with it.
 
-    Names of images are paths of their files relative to the folder that holds all of them. Raises ``InputError`` for a lens that
-    COLMAP cannot describe, and where another program's cameras.txt lies beside.
+    Image names are file paths relative to the folder that contains all of them. Raises ``InputError`` for a
+    lens that COLMAP cannot describe, and if another program's cameras.txt exists there.
     """
     require_finite(images)
     _check_beside(path)
@@ -54,21 +55,23 @@ def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def image_rows(number: int, T_world_camera: SE3, camera: int, name: str) -> str:
-    """Return the two rows of an image, of which the second lists no keypoints."""
+    """Return the two rows of an image; the second lists no keypoints."""
     T_camera_world = T_world_camera.to("cpu").inverse()
     numbers = (*T_camera_world.quaternion("wxyz").tolist(), *T_camera_world.translation.tolist())
     return f"{number} {' '.join(f'{x:.15g}' for x in numbers)} {camera} {name}\n\n"
 
 
 def camera_row(number: int, camera: Intrinsics) -> str:
-    """Return the row of a camera. Raises ``InputError`` for a lens that COLMAP has no model of."""
+    """Return the row of a camera. Raises ``InputError`` for a lens without a COLMAP model."""
     model, parameters = colmap_model(camera)
     numbers = " ".join(f"{x:.15g}" for x in parameters)
     return f"{number} {model} {camera.width} {camera.height} {numbers}\n"
 
 
 def file_names(images: Sequence[PosedImage]) -> list[str]:
-    """Return the paths of the images' files relative to the folder that holds all of them; the name of an image without file."""
+    """Return the paths of the images' files relative to the folder that contains all of them, or the name of
+    an image without a file.
+    """
     files = [image.file.resolve() for image in images if image.file is not None]
     parent = os.path.commonpath([file.parent for file in files]) if files else ""
     return [
@@ -78,7 +81,7 @@ def file_names(images: Sequence[PosedImage]) -> list[str]:
 
 
 def _check_beside(path: Path) -> None:
-    """Raise ``InputError`` where a camera file that this module did not write would be replaced."""
+    """Raise ``InputError`` if a camera file that this module did not write would be replaced."""
     beside = path.with_name("cameras.txt")
     if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
         raise InputError(

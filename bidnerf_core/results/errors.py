@@ -1,4 +1,4 @@
-"""Errors of poses (``T_world_camera``), and the criteria by which they count as success."""
+"""Errors of poses (``T_world_camera``), and criteria for success."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bidnerf_core.geometry.units import LengthUnit, symbol
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """The translation and rotation error of one pose, or of a batch: of all steps of a run, for example."""
+    """The translation and rotation error of one pose or a batch, for example of all steps of a run."""
 
     translation: Float[Tensor, "*b"]  # between the camera centres, in ``unit``
     rotation_deg: Float[Tensor, "*b"]  # geodesic angle, degrees, 0 to 180
@@ -39,15 +39,15 @@ class PoseError:
         )
 
     def plain(self) -> dict[str, float] | None:
-        """Return the error of one pose as JSON values, or None where it is not finite."""
+        """Return the error of one pose as JSON values, or None if it is not finite."""
         values = {"translation": float(self.translation), "rotation_deg": float(self.rotation_deg)}
         return values if all(map(math.isfinite, values.values())) else None
 
 
 def pose_error(found: SE3, true: SE3, unit: LengthUnit = "units") -> PoseError:
-    """Return the error of ``found`` in float64; batches broadcast. It is not finite where a pose is not.
+    """Return the error of ``found`` in float64; batches broadcast. It is not finite if a pose is not.
 
-    ``unit`` is that of the poses, which serves to print the error.
+    ``unit`` is that of the poses, for printing the error.
     """
     found, true = found.to(dtype=torch.float64), true.to(dtype=torch.float64)
     distance = torch.linalg.vector_norm(found.translation - true.translation, dim=-1)
@@ -59,9 +59,9 @@ def normalized_error_squared(
 ) -> Float[Tensor, "*b"]:
     """Return ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
 
-    It follows a chi-squared distribution with 6 degrees of freedom if the covariance C is consistent (Bar-Shalom et al. 2001,
-    "Estimation with applications to tracking and navigation", 5.4.2). It is infinite or NaN where the covariance has no
-    inverse.
+    It follows a chi-squared distribution with 6 degrees of freedom if the covariance C is consistent
+    (Bar-Shalom et al. 2001, "Estimation with applications to tracking and navigation", 5.4.2). It is infinite
+    or NaN if the covariance has no inverse.
     """
     xi = (found.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
     solved, _ = torch.linalg.solve_ex(covariance.double(), xi[..., None])
@@ -69,7 +69,7 @@ def normalized_error_squared(
 
 
 def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]:
-    """Return the standard deviations of the position (metres) and of the rotation (radians) that a covariance gives."""
+    """Return the standard deviations of the position (metres) and of the rotation (radians) implied by a covariance."""
     position, rotation = (float(part.sum().clamp(min=0).sqrt()) for part in covariance.diagonal().split(3))
     return position, rotation
 
@@ -77,10 +77,10 @@ def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]
 def within(
     found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95
 ) -> Bool[Tensor, "*b"]:
-    """Return whether the error of ``found`` lies within the bound that its covariance gives for a probability.
+    """Return whether the error of ``found`` lies within its covariance's bound for a probability.
 
-    The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. A consistent covariance
-    has that share of its errors within. False where the covariance has no inverse.
+    The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. With
+    a consistent covariance, that fraction of errors lies within. False if the covariance has no inverse.
     """
     return normalized_error_squared(found, true, covariance) <= chi_squared_quantile(probability, 6)
 
@@ -102,7 +102,7 @@ class Criterion(Protocol):
 
 @dataclass(frozen=True)
 class Reduced:
-    """The criterion of a translation error of at most ``fraction`` of the start's (BID-NeRF, section IV)."""
+    """Success if the translation error is at most ``fraction`` of the start's (BID-NeRF, section IV)."""
 
     fraction: float
 
@@ -112,7 +112,7 @@ class Reduced:
 
 @dataclass(frozen=True)
 class Within:
-    """The criterion of a rotation and a translation error below fixed thresholds, wherever the start was."""
+    """Success if the rotation and translation errors are below fixed thresholds, regardless of the start."""
 
     rotation_deg: float
     translation: float  # metres
@@ -126,7 +126,7 @@ CRITERIA: dict[str, Criterion] = {
     "5deg 0.05": Within(5.0, 0.05),
     "1deg 0.02": Within(1.0, 0.02),
 }
-"""The criteria that are reported side by side: that of the paper, a common one and a strict one."""
+"""The criteria reported side by side: the paper's, a common one and a strict one."""
 
 
 def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
@@ -146,13 +146,13 @@ def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
 
 @dataclass(frozen=True)
 class Rate:
-    """A share of successes and the ends of its Wilson interval, which counts repeated trials of a frame as what they are."""
+    """A success rate with the ends of its Wilson interval, which accounts for repeated trials of a frame."""
 
     successes: int
     trials: int
     low: float
     high: float
-    frames: int | None = None  # number of distinct frames, where some were tried several times
+    frames: int | None = None  # number of distinct frames, if some were tried several times
 
     @property
     def rate(self) -> float:
@@ -165,7 +165,7 @@ class Rate:
 
 
 def success_rate(successes: int, trials: int, confidence: float = 0.95) -> Rate:
-    """Return the share of successes of independent trials with Wilson's interval (Wilson 1927)."""
+    """Return the success rate of independent trials with Wilson's interval (Wilson 1927)."""
     if not (trials >= 1 and 0 <= successes <= trials):
         raise InputError(f"success rate: {successes} of {trials}, expected 0 to n of at least one trial")
     low, high = wilson_interval(successes / trials, trials, confidence)
@@ -175,12 +175,13 @@ def success_rate(successes: int, trials: int, confidence: float = 0.95) -> Rate:
 def success_rate_by_frame(
     outcomes: Sequence[bool], frames: Sequence[Hashable], confidence: float = 0.95
 ) -> Rate:
-    """Return the share of successes of trials some of which are of the same frame, with an interval that allows for it.
+    """Return the success rate of trials that repeat some frames, with an interval that accounts for it.
 
-    Trials of one frame share its difficulty. Wilson's interval is that of the effective number of trials: the number of
-    independent ones whose share would vary as much as this share does from frame to frame (Korn and Graubard 1998, "Confidence
-    intervals for proportions with small expected number of positive counts estimated from survey data"; Dean and Pagano 2015).
-    Where all trials end alike nothing shows how alike those of one frame are, and each frame counts once.
+    Trials of one frame share its difficulty. Wilson's interval is that of the effective number of trials: the
+    number of independent ones whose rate would vary as much as this rate does from frame to frame (Korn and
+    Graubard 1998, "Confidence intervals for proportions with small expected number of positive counts
+    estimated from survey data"; Dean and Pagano 2015). If all trials have the same outcome, nothing shows how
+    similar those of one frame are, and each frame counts once.
     """
     trials, successes = len(outcomes), sum(map(bool, outcomes))
     grouped: dict[Hashable, list[bool]] = {}
@@ -192,7 +193,7 @@ def success_rate_by_frame(
     share = successes / trials
     effective = float(count)
     if count > 1 and 0 < successes < trials:
-        from scipy.stats import t  # here, because its import takes longer than any help page should
+        from scipy.stats import t  # imported here, because it takes longer than any help page should
 
         squares = sum((sum(own) - share * len(own)) ** 2 for own in grouped.values())
         variance = count / (count - 1) * squares / trials**2
@@ -205,7 +206,7 @@ def success_rate_by_frame(
 
 
 def wilson_interval(share: float, trials: float, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the ends of Wilson's interval of a share of ``trials``, which need not be a whole number."""
+    """Return the ends of Wilson's interval for a rate of ``trials``, which need not be an integer."""
     z = NormalDist().inv_cdf(0.5 + confidence / 2)
     middle = (share + z * z / (2 * trials)) / (1 + z * z / trials)
     half = z / (1 + z * z / trials) * math.sqrt(share * (1 - share) / trials + (z / (2 * trials)) ** 2)

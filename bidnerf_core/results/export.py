@@ -1,4 +1,6 @@
-"""A map for other software: its surface, landmarks and cameras as point clouds, as a COLMAP model, or as ``transforms.json``."""
+"""Export of a map for other software: surface, landmarks and cameras as point clouds, a COLMAP model, or
+``transforms.json``.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ from bidnerf_core.results.pose_files import PosedImage, frame_of, transforms_jso
 GREY = 0.5
 """Colour of landmarks in a map without a surface."""
 FRUSTUM = 0.03
-"""Length of the drawn frustum of a camera, as a share of the scene."""
+"""Length of the drawn frustum of a camera, relative to the scene."""
 
 Exporter: TypeAlias = Callable[[Map, Path], Sequence[Path]]
 """A function that writes a map, whose surface and landmarks are on the CPU, into an existing folder and returns the files.
@@ -47,11 +49,11 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
       each) and cameras.ply (a pyramid for each camera);
     - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks, without tracks;
-    - ``"transforms.json"``: the cameras as nerfstudio reads them, and landmarks.ply as its sparse points;
+    - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians``.
 
-    All are in the frame and the unit of the map, which their heads name. Images are named as the map knows them, without the endings
-    of their files. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
+    All use the frame and unit of the map, which their headers state. Images are named as in the map, without file
+    extensions. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
     export, and for a folder that is not empty unless ``overwrite`` is set.
     """
     if to not in EXPORTERS:
@@ -128,7 +130,7 @@ def _write_landmarks(scene: Map, images: list[PosedImage], out: Path) -> Path:
 def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | None = None) -> bytes:
     """Return a binary PLY of points; keys of ``columns`` name the properties of each row.
 
-    Colours in [0, 1] are written as bytes, whole numbers as 32 bits, and others in single precision.
+    Colours in [0, 1] are written as bytes, integers with 32 bits, and others in single precision.
     """
     kinds, values = [], []
     for names, column in columns.items():

@@ -1,4 +1,4 @@
-"""Pictures of a localization: the photo beside the map as rendered from the pose found, as 8-bit images."""
+"""Pictures of a localization: the photo next to the map rendered from the pose found, as 8-bit images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bidnerf_core.localization import Localization, SceneMap
 from bidnerf_core.localization.localizer import Start, checked_map, start_pose
 
 PICTURE_SIDE = 240
-"""Maximum pixels on the longer side; larger photos are reduced, since each rendered pixel takes time."""
+"""Maximum pixels on the longer side; larger photos are downscaled, since each rendered pixel takes time."""
 TILE = 240  # pixels: smaller images are enlarged to about this, so that captions fit
 CAPTION, GAP = 22, 6  # pixels
 INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
@@ -40,11 +40,12 @@ TURBO = (
 def overlay(
     scene: SceneMap, frame: Frame, found: Localization | Start, start: Start | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return one picture of a photo, the map as rendered from a pose, and both blended with the edges of each.
+    """Return one picture of a photo, the map rendered from a pose, and both blended with the edges of each.
 
-    ``found`` is the answer for the photo, whose corrected intrinsics are used if it has any, or a pose ``T_world_camera``.
-    With a ``start``, the picture also shows the rendering from there. The photo is reduced to at most 240 pixels a side.
-    Raises ``InputError`` for what is no map, frame or pose.
+    ``found`` is the answer for the photo, whose corrected intrinsics are used if it has any, or a pose
+    ``T_world_camera``. With a ``start``, the picture also shows the rendering from there. The photo is
+    downscaled to at most 240 pixels a side. Raises ``InputError`` for arguments that are not a map, a frame
+    or a pose.
     """
     scene = checked_map(scene, "overlay")
     if not isinstance(frame, Frame):
@@ -120,7 +121,7 @@ def comparison(
 
 
 def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarray, "h w 3"]:
-    """Return an image (h w 3) or (h w) of floats in [0, 1] as 8 bits, clipped; NaN becomes black."""
+    """Convert an image (h w 3) or (h w) of floats in [0, 1] to 8 bits, clipped; NaN becomes black."""
     array = as_array(image)
     if array.ndim == 2:
         array = np.repeat(array[..., None], 3, axis=-1)
@@ -135,9 +136,11 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
 def depth_to_rgb(
     depth: ArrayLike | Tensor, near: float | None = None, far: float | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return depth (h w, metres) in colours from red (near) to blue (far), dark where none was measured (0 or not finite).
+    """Colour depth (h w, metres) from red (near) to blue (far), dark where none was measured (0 or not
+    finite).
 
-    ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of the measured depth.
+    ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of the
+    measured depth.
     """
     array = as_array(depth).astype(np.float64)
     if array.ndim != 2 or array.size == 0:
@@ -207,16 +210,16 @@ def require_same_size(images: Sequence[np.ndarray], names: Sequence[str]) -> Non
     for image, name in zip(images, names, strict=True):
         if image.shape != images[0].shape:
             found, expected = (f"{x.shape[1]}x{x.shape[0]}" for x in (image, images[0]))
-            raise InputError(f"{name} is {found} pixels, {names[0]} is {expected}: expected the same")
+            raise InputError(f"{name} is {found} pixels, but {names[0]} is {expected}: expected the same")
 
 
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
-    """Write an endless animation of images (h w 3) of the same size."""
+    """Write a looping animation of images (h w 3) of the same size."""
     if not (math.isfinite(fps) and fps > 0):
         raise InputError(f"{path}: {fps} frames a second, expected a positive number")
     pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
     if not pictures:
-        raise InputError(f"{path}: an animation of no frames")
+        raise InputError(f"{path}: the animation has no frames")
     require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     import imageio.v3 as iio  # imported here, since few commands draw

@@ -1,4 +1,4 @@
-"""The answers to a run of images in several maps, of which each image shows one."""
+"""The answers to a run of images in several maps, each image showing one of them."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class PlacedAnswer(Answer):
     def placed(
         frame: Frame, number: int, placement: Placement, backend: str, file: Path | None
     ) -> PlacedAnswer:
-        """Return the answer for a frame, without what takes much memory."""
+        """Build the answer for a frame, without the parts that take much memory."""
         found = Answer.of(frame, number, placement.found, file=file)
         return PlacedAnswer(
             found.name, number, found.intrinsics, found.found, None, None, file, placement, backend
         )
 
     def plain(self, backend: str) -> dict[str, Any]:
-        """Return the object of ``localize --json``, with the map and the runner-up."""
+        """Return the JSON object of ``localize --json``, with the map and the runner-up."""
         placement = self.placement
         assert placement is not None
         second = placement.runner_up
@@ -74,7 +74,8 @@ def place_each(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Placements:
-    """Find the map and the pose of each query, as ``localize_each`` finds poses in one map; queries of several views are refused.
+    """Find the map and pose of each query, as ``localize_each`` does in one map; queries with several views
+    are rejected.
 
     Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
     """
@@ -82,7 +83,7 @@ def place_each(
     def place(query: Query, number: int) -> PlacedAnswer:
         if len(query.views) != 1 or query.depth_rays is not None:
             raise InputError(
-                f"{query.name}: is a rig or has points of a sensor, expected single images in several maps"
+                f"{query.name}: is a rig or has points from a sensor, expected single images for several maps"
             )
         placement = maps(query.views[0].frame, seed)
         backend = getattr(getattr(maps.localizer(placement.map).map, "info", None), "backend", "")

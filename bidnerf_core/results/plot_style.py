@@ -18,7 +18,7 @@ STYLE: dict[str, Any] = {
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.edgecolor": "#555",
     "xtick.color": "#333", "ytick.color": "#333", "xtick.major.width": 0.7, "ytick.major.width": 0.7,
     "grid.color": "#ddd", "grid.linewidth": 0.6, "legend.frameon": False, "legend.fontsize": 8.5,
-    "svg.hashsalt": "bidnerf", "text.parse_math": False,  # names may hold dollar signs
+    "svg.hashsalt": "bidnerf", "text.parse_math": False,  # names may contain dollar signs
 }  # fmt: skip
 
 LONGEST_LINE = 200
@@ -37,7 +37,7 @@ SHORT_CRITERION_NAMES = {
 
 
 def require_matplotlib() -> Any:
-    """Return matplotlib. Raises ``InputError`` where this optional dependency is not installed."""
+    """Return matplotlib. Raises ``InputError`` if this optional dependency is not installed."""
     try:
         import matplotlib
     except ImportError as error:
@@ -70,9 +70,10 @@ def save_figure(figure: Any, folder: Path, name: str) -> Path:
 
 
 def write_figure(figure: Any, path: Path, **options: Any) -> None:
-    """Write a figure in the format of the path's suffix, whole or not at all.
+    """Write a figure atomically in the format of the path's suffix.
 
-    Its text, which holds the names of files, frames and settings, is made printable and cut to a length that can be drawn.
+    Its text, which includes names of files, frames and settings, is made printable and truncated to a
+    drawable length.
     """
     require_matplotlib()
     from matplotlib.text import Text
@@ -88,7 +89,7 @@ def write_figure(figure: Any, path: Path, **options: Any) -> None:
 
 
 def _make_labels_drawable(formatter: Any) -> None:
-    """Change a formatter of given labels, which are set anew whenever a figure is drawn."""
+    """Modify a formatter of given labels, which are set again whenever a figure is drawn."""
     from matplotlib.ticker import FuncFormatter
 
     if isinstance(formatter, FuncFormatter):

@@ -39,7 +39,7 @@ class PosedImage:
     """An image with its camera and an estimated pose."""
 
     name: str
-    number: int  # index in the run or sequence, from 0; it serves as the timestamp where names are not times
+    number: int  # index in the run or sequence, from 0; serves as the timestamp if names are not times
     intrinsics: Intrinsics  # of the upright image
     T_world_camera: SE3  # OpenCV axes
     file: Path | None = None
@@ -50,18 +50,18 @@ class PosedImage:
 
 
 def frame_of(images: Sequence[PosedImage]) -> str:
-    """Return what the head of a file says about its poses: which way they go, the axes, and the unit of lengths."""
+    """Return a file header's statement on its poses: their direction, the axes, and the unit of lengths."""
     units = {image.unit for image in images}
-    lengths = "metres" if units == {"metres"} else "units of the map (not metres, as far as is known)"
+    lengths = "metres" if units == {"metres"} else "units of the map (not known to be metres)"
     return f"camera to world, {OPENCV_AXES}, lengths in {lengths}"
 
 
 def tum_trajectory(images: Sequence[PosedImage]) -> str:
     """Return rows ``timestamp tx ty tz qx qy qz qw`` (unit quaternions with the scalar last).
 
-    The timestamp is the image's time if all have one, else its name if all names are numbers, as in the TUM RGB-D datasets,
-    else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats). Where it is a number, a comment
-    before the row names the image, since other programs skip comments.
+    The timestamp is the image's time if all have one, else its name if all names are numbers, as in the TUM
+    RGB-D datasets, else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
+    In the last case, a comment before the row names the image, since other programs skip comments.
     """
     require_finite(images)
     stamps, named = _timestamps(images)
@@ -81,7 +81,7 @@ def require_finite(images: Sequence[PosedImage]) -> None:
 
 
 def _timestamps(images: Sequence[PosedImage]) -> tuple[list[str], bool]:
-    """Return the time stamps of a TUM file, and whether images are to be named beside them."""
+    """Return the time stamps of a TUM file, and whether images should be named next to them."""
     times = [image.time for image in images if image.time is not None]
     if len(times) == len(images):
         return [f"{time:.6f}" for time in times], False
@@ -101,10 +101,11 @@ def _tum_row(timestamp: str, T_world_camera: SE3) -> str:
 
 
 def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
-    """Return a ``transforms.json`` for ``folder``: poses with OpenGL axes, one camera each, ``file_path`` relative to it.
+    """Return a ``transforms.json`` for ``folder``: poses with OpenGL axes, one camera per image,
+    ``file_path`` relative to it.
 
-    It describes the image files as they are stored, so the poses and cameras of photos with an EXIF orientation are rotated.
-    Raises ``InputError`` for a photo that is stored mirrored, for which no rigid pose exists.
+    It describes the image files as stored, so the poses and cameras of photos with an EXIF orientation are
+    rotated. Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
     """
     require_finite(images)
     frames = [_transforms_entry(image, folder) for image in images]
@@ -123,8 +124,8 @@ def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
 def poses_json(images: Sequence[PosedImage]) -> str:
     """Return a JSON list of ``{"frame", "time", "T_world_camera", "covariance", "unit"}``, one per line; poses have OpenCV axes.
 
-    ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in ``unit``, then rotation in rad, at the camera) are
-    null where they are not known, and every matrix is null where it is not finite.
+    ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in ``unit``, then rotation in rad, at
+    the camera) are null if unknown, and every matrix is null if it is not finite.
     """
     objects = [
         {
@@ -144,7 +145,7 @@ def _rows(matrix: Float[Tensor, "r c"]) -> list[list[float]] | None:
 
 
 def as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, SE3]:
-    """Return the camera and the pose (float64) of the image as its file stores it."""
+    """Return the camera and pose (float64) of the image as its file stores it."""
     pose = image.T_world_camera.to("cpu", torch.float64)
     if orientation == UPRIGHT:
         return image.intrinsics, pose
@@ -153,7 +154,7 @@ def as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, 
     axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if orientation.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
     turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
     if float(torch.linalg.det(turn)) < 0:
-        raise InputError(f"{image.file}: is stored as a mirror image, which no transforms.json can describe")
+        raise InputError(f"{image.file}: is stored mirrored, which transforms.json cannot describe")
     inverse = Orientation(orientation.mirrors_columns, orientation.mirrors_rows)
     if orientation.transposes:
         inverse = Orientation(orientation.mirrors_rows, orientation.mirrors_columns, True)
@@ -171,7 +172,7 @@ def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_pose_transforms(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a transforms.json as nerfstudio reads it: poses with OpenGL axes, and cameras."""
+    """Write a transforms.json in nerfstudio's format: poses with OpenGL axes, and cameras."""
     write_file(path, transforms_json(images, path.parent).encode())
 
 
@@ -180,18 +181,20 @@ def _defects(writer: Any) -> Iterator[str]:
 
 
 PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
-"""A function that writes poses to a file, whole or not at all."""
+"""A function that writes poses to a file atomically."""
 
 POSE_WRITERS: Plugins[PoseWriter] = Plugins(
     "writers",
     _defects,
     first=("transforms.json", "images.txt", ".json", ".txt", ".tum", ".kitti.txt", ".euroc.csv"),
 )
-"""Writers by the ending of the file's name; where several match, the longest ending is used."""
+"""Writers by file-name ending; if several match, the longest ending is used."""
 
 
 def pose_format(path: Path) -> str:
-    """Return the ending that selects the format of a file of poses. Raises ``UsageError`` for a name without any of them."""
+    """Return the file-name ending that selects the format of a pose file. Raises ``UsageError`` for a name
+    without any of them.
+    """
     found = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
     if found is None:
         raise UsageError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")
@@ -199,7 +202,7 @@ def pose_format(path: Path) -> str:
 
 
 def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
-    """Write poses in the format that the ending of the file's name selects.
+    """Write poses in the format selected by the file-name ending.
 
     Raises ``InputError`` for an unknown ending, and for images that are not ``PosedImage``.
     """
@@ -218,10 +221,10 @@ def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
 
 
 def read_pose(path: str | Path) -> SE3:
-    """Read a 4x4 camera-to-world matrix, alone or under "T_world_camera", as ``localize --json`` prints it.
+    """Read a 4x4 camera-to-world matrix, alone or under "T_world_camera", as printed by ``localize --json``.
 
-    A list of one such object is accepted as well. Raises ``InputError`` where the file does not hold the rows of a rigid
-    transform.
+    A list with one such object is accepted as well. Raises ``InputError`` unless the file holds the rows of a
+    rigid transform.
     """
     found = read_poses(path)
     if len(found) != 1:
@@ -230,10 +233,12 @@ def read_pose(path: str | Path) -> SE3:
 
 
 def read_poses(path: str | Path) -> dict[str, SE3]:
-    """Read poses T_world_camera by the names of their frames, as ``localize`` writes them with ``--out`` or prints with ``--json``.
+    """Read poses T_world_camera by frame name, as ``localize`` writes them with ``--out`` or prints them with
+    ``--json``.
 
-    That is one object, a list of objects, or one object a line; objects whose pose is null are left out. A single pose may be
-    without a name, which then is empty. Raises ``InputError`` where a matrix is not a rigid transform, or a name occurs twice.
+    The file holds one object, a list of objects, or one object per line; objects with a null pose are left
+    out. A single pose may be unnamed; its name is then empty. Raises ``InputError`` if a matrix is not a
+    rigid transform, or a name occurs twice.
     """
     path = Path(path)
     entries = pose_entries(path, read_file(path, "a pose file"))
@@ -252,7 +257,7 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
         try:
             matrix = torch.tensor(rows, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise InputError(f"{path}: no matrix of numbers in it, expected {EXPECTED_POSE}") from error
+            raise InputError(f"{path}: contains no matrix of numbers, expected {EXPECTED_POSE}") from error
         found[name] = pose_from_matrix(matrix, f"{path}: T_world_camera")
     if not found:
         raise InputError(f"{path}: holds no pose, expected {EXPECTED_POSE}")
@@ -260,9 +265,9 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
 
 
 def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
-    """Return the pose of an image among those of a file; a single one serves every image.
+    """Return the pose of an image among those of a file; a single one applies to every image.
 
-    Raises ``InputError`` where the file has several poses and none under that name.
+    Raises ``InputError`` if the file has several poses but none under that name.
     """
     if len(poses) == 1:
         return next(iter(poses.values()))
@@ -272,7 +277,7 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
 
 
 def pose_entries(path: Path, content: bytes) -> list[Any]:
-    """Return the objects of a file of poses, or its matrix."""
+    """Return the objects of a pose file, or its matrix."""
     try:
         found = parse_json(content, str(path), EXPECTED_POSE)
     except InputError:

@@ -1,4 +1,4 @@
-"""Tracking of a whole sequence, and the path that results: its file of poses, its errors, its plot."""
+"""Tracking a whole sequence, and the resulting path: its pose file, its errors, its plot."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ from bidnerf_core.results.trajectory_plot import PlottedPath, plot_path
 log = logging.getLogger("bidnerf")
 
 TRIED = 3
-"""Number of unreadable frames at the beginning of a sequence after which it is given up: probably none can be read."""
+"""Number of unreadable frames at the beginning of a sequence after which tracking is given up: probably none
+can be read."""
 SAME_POSE = 1e-4
-"""Difference of two poses' matrices (metres) that rounding in files may cause."""
+"""Difference between the matrices of two poses (metres) that rounding in files may cause."""
 
 
 def track(
@@ -55,14 +56,15 @@ def track(
 ) -> TrackedPath:
     """Find the poses of a sequence's frames in a map, in chronological order.
 
-    ``scene``: a map, or a localizer with settings of its own. ``sequence``: one that ``open_sequence`` opened, or the path of a
-    dataset, of a folder of images or of a video, whose images have the camera of the map's if they have none of their own.
-    ``start``: a guess at the first T_world_camera. ``depth``: whether measured depth is used. ``every``: take every n-th frame.
-    ``path``: where the answers are kept, by default a new path; it holds those so far if an error ends the tracking. ``each`` is
-    called with each frame and its answer, ``progress`` after each frame.
+    ``scene``: a map, or a localizer with its own settings. ``sequence``: the result of ``open_sequence``, or
+    the path of a dataset, a folder of images or a video, whose images use the map's cameras if they have none
+    of their own. ``start``: an estimate of the first T_world_camera. ``depth``: whether measured depth is
+    used. ``every``: use only every n-th frame. ``path``: collects the answers, by default a new path; it
+    holds those so far if an error ends the tracking. ``each`` is called with each frame and its answer,
+    ``progress`` after each frame.
 
-    A frame whose files cannot be read is left out with an ``InputWarning`` and counted in ``unread``. Raises ``InputError`` where
-    none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.
+    A frame whose files cannot be read is left out with an ``InputWarning`` and counted in ``unread``. Raises
+    ``InputError`` if none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.
     """
     if every < 1:
         raise InputError(f"every is {every}, expected 1 or more")
@@ -95,7 +97,7 @@ def opened_for(scene: SceneMap, path: str | Path, **options: Any) -> FrameSequen
 
 
 def _every(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
-    """Yield every n-th frame; where each has files of its own, an unreadable one is yielded as an error."""
+    """Yield every n-th frame; if each has its own files, an unreadable one is yielded as an error."""
     if not isinstance(frames, FileSequence):
         yield from islice(frames, 0, None, every)
         return
@@ -107,10 +109,10 @@ def _every(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputErro
 
 
 class TrackedPath(Answers):
-    """The answers to the frames of a sequence, in the order of time."""
+    """The answers to the frames of a sequence, in chronological order."""
 
     def __init__(self, info: MapInfo | None = None) -> None:
-        """Begin the path in a map that ``info`` describes."""
+        """Start an empty path in the map that ``info`` describes."""
         super().__init__("" if info is None else info.backend, "units" if info is None else info.unit)
         self.unread = 0  # frames whose files could not be read
         cameras = () if info is None else as_given(info.cameras)
@@ -131,10 +133,10 @@ class TrackedPath(Answers):
         truth: SE3 | None = None,
         number: int | None = None,
     ) -> Answer:
-        """Keep the answer to a frame, and return it. Where the tracker gets lost and has recovered, the log says so.
+        """Add the answer to a frame, and return it. Tracking losses and recoveries are logged.
 
-        ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in seconds, ``truth`` is
-        the true T_world_camera.
+        ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in
+        seconds, ``truth`` is the true T_world_camera.
         """
         if number is None:
             number = self.answers[-1].number + 1 if self.given else 0
@@ -175,7 +177,9 @@ class TrackedPath(Answers):
         return TrajectoryErrors.of(SE3.stack([found for found, _ in known]), SE3.stack([t for _, t in known]))
 
     def consistency(self) -> float | None:
-        """Return the share of accepted poses whose error lies within the 95 % bound of their covariance, or None if unknown."""
+        """Return the fraction of accepted poses whose error lies within the 95 % bound of their covariance,
+        or None if unknown.
+        """
         inside = [
             bool(within(answer.found.T_world_camera, answer.truth, answer.found.covariance))
             for answer in self.accepted
@@ -184,15 +188,16 @@ class TrackedPath(Answers):
         return sum(inside) / len(inside) if inside else None
 
     def trained_on(self) -> int:
-        """Return the number of frames that are images of the map's training, by their names and true poses."""
+        """Return the number of frames that are training images of the map, judging by names and true poses."""
         return sum(map(self._is_of_training, self.answers))
 
     def plot(
         self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None
     ) -> None:
-        """Draw the path over the surface of its map, as PNG or SVG by the ending of the file's name.
+        """Draw the path over the surface of its map, as PNG or SVG by file extension.
 
-        ``up`` is the upward direction of the scene (``Map.up``), by default the one that the surface and the cameras give.
+        ``up`` is the upward direction of the scene (``Map.up``), by default estimated from the surface and
+        the cameras.
 
         Raises ``InputError`` without matplotlib or without any finite pose.
         """
@@ -231,7 +236,7 @@ class TrackedPath(Answers):
         if (share := self.consistency()) is not None:
             rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
         if seen := self.trained_on():
-            no_test = "errors of frames that trained the map are no test"
+            no_test = "errors on training frames of the map are no test"
             rows.append(("trained on", f"{amount(seen, 'frame')}; {no_test}"))
         return [(name, text) for name, text in rows if text]
 

@@ -1,4 +1,4 @@
-"""The video of a tracked sequence: the camera's images next to the map as rendered from the poses found."""
+"""The video of a tracked sequence: the camera's images next to the map rendered from the poses found."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ RATES = 1.0, 60.0
 USUAL_RATE = 30.0
 """Frames per second of sequences without time stamps."""
 QUALITY = "20"
-"""Constant rate factor of the encoder, which is nearly without visible loss."""
+"""Constant rate factor of the encoder, almost without visible loss."""
 WHITE_DEPTH = 5.0
-"""Depth (metres) that is drawn white, where only depth was recorded."""
+"""Depth (metres) drawn in white if only depth was recorded."""
 
 
 def check_video(file: Path) -> None:
-    """Raise ``InputError``, before any work is done, where a video cannot be written."""
+    """Raise ``InputError``, before any work is done, if a video cannot be written."""
     try:
         import av  # noqa: F401
     except ImportError as error:
@@ -40,7 +40,7 @@ def check_video(file: Path) -> None:
         ) from error
     if file.suffix.lower() not in WRITTEN_SUFFIXES or not file.parent.is_dir():
         endings = ", ".join(WRITTEN_SUFFIXES)
-        raise InputError(f"{file}: expected a name that ends with {endings}, in a folder that exists")
+        raise InputError(f"{file}: expected a name that ends with {endings}, in an existing folder")
 
 
 class TrackingVideo:
@@ -84,7 +84,7 @@ class TrackingVideo:
         self._write(picture)
 
     def _open(self, first: UInt8[np.ndarray, "h w 3"], rate: float) -> None:
-        """Open the file for pictures of the size of the first one, which is written."""
+        """Open the file for pictures of the size of the first one, and write that."""
         import av
 
         codec = "libvpx-vp9" if self._file.suffix.lower() == ".webm" else "libx264"
@@ -113,7 +113,7 @@ class TrackingVideo:
 
 
 def _observed(frame: Frame, reduced: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Return a frame's colours, or its depth as grey values where no colours were recorded."""
+    """Return a frame's colours, or its depth as grey values if no colours were recorded."""
     if frame.has_colour or frame.depth is None:
         return reduced
     grey = (frame.depth.cpu() / WHITE_DEPTH).clamp(0, 1)

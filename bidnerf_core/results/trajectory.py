@@ -1,7 +1,7 @@
 """Errors of trajectories: raw, after alignment (ATE), and of the motion between frames (RPE).
 
-The measures are those of Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems". Poses in a map need no
-alignment, so their raw error is what counts; the others make them comparable with odometry.
+The measures follow Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems". Poses in a map
+need no alignment, so their raw error is what counts; the others make them comparable with odometry.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bidnerf_core.geometry.similarity import fit_similarity
 from bidnerf_core.results.errors import PoseError, pose_error
 
 LEAST_POSES = 3
-"""Minimum number of poses from which an alignment is determined."""
+"""Minimum number of poses that determine an alignment."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class ErrorSummary:
     def of(errors: PoseError) -> ErrorSummary:
         """Return the summary of a batch of errors. Raises ``InputError`` for an empty one."""
         if not errors.translation.numel():
-            raise InputError("no errors to summarise, expected those of at least one pose")
+            raise InputError("no errors to summarize, expected those of at least one pose")
         return ErrorSummary(*_three(errors.translation), *_three(errors.rotation_deg))
 
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """The errors of a trajectory; a measure is None where there are too few poses for it."""
+    """The errors of a trajectory; a measure is None if there are too few poses for it."""
 
     poses: int
     raw: ErrorSummary
@@ -52,7 +52,7 @@ class TrajectoryErrors:
 
     @staticmethod
     def of(found: SE3, true: SE3) -> TrajectoryErrors:
-        """Compare poses ``T_world_camera`` (n), in chronological order. Raises ``InputError`` where there are none."""
+        """Compare poses ``T_world_camera`` (n), in chronological order. Raises ``InputError`` if there are none."""
         count = len(found.translation)
         distances = alignment_errors(found, true) if count >= LEAST_POSES else None
         return TrajectoryErrors(
@@ -64,9 +64,10 @@ class TrajectoryErrors:
 
 
 def rigid_alignment(found: SE3, true: SE3) -> SE3:
-    """Return the T_true_found that brings the camera centres of ``found`` (n) nearest to those of ``true``, without scaling.
+    """Return the T_true_found that brings the camera centres of ``found`` (n) nearest to those of ``true``,
+    without scaling.
 
-    Raises ``InputError`` where all centres coincide.
+    Raises ``InputError`` if all centres coincide.
     """
     source, target = found.translation.double(), true.translation.double()
     rotation = fit_similarity(source, target).T_target_source.rotation
@@ -76,7 +77,7 @@ def rigid_alignment(found: SE3, true: SE3) -> SE3:
 def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
     """Return the absolute trajectory error of each pose: its distance (metres) from the truth after a rigid alignment.
 
-    Returns None where the camera did not move, so that the rotation is undetermined.
+    Returns None if the camera did not move, since the rotation is then undetermined.
     """
     try:
         T_true_found = rigid_alignment(found, true)
@@ -87,9 +88,10 @@ def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
 
 
 def relative_errors(found: SE3, true: SE3, apart: int = 1) -> PoseError:
-    """Return the relative pose errors (n - apart), those of the motion from each pose to the one ``apart`` places later.
+    """Return the relative pose errors (n - apart) of the motion from each pose to the one ``apart`` places
+    later.
 
-    Sturm et al. 2012, eq. 2. Raises ``InputError`` where the trajectory is too short.
+    Sturm et al. 2012, eq. 2. Raises ``InputError`` if the trajectory is too short.
     """
     if not 1 <= apart < len(found.translation):
         raise InputError(f"relative errors of {len(found.translation)} poses that are {apart} apart")

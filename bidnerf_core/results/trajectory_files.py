@@ -1,4 +1,4 @@
-"""Files of poses for tools of robotics: KITTI's matrices and EuRoC's comma-separated values. evo reads both."""
+"""Pose files for robotics tools: KITTI's matrices and EuRoC's comma-separated values. evo reads both."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ NANOSECONDS = 10**9
 
 
 def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write KITTI's poses: a row of the twelve numbers of a 3x4 camera-to-world matrix per image, without times."""
+    """Write KITTI poses: per image, a row with the twelve numbers of a 3x4 camera-to-world matrix, without times."""
     numbers = [image.number for image in images]
     if numbers != list(range(len(numbers))):
         skipped = next(place for place, number in enumerate(numbers) if place != number)
         warnings.warn(
-            f"{path}: image {skipped} has no pose; rows of KITTI's format do not say which image they belong to, so those that"
-            " follow are shifted (.tum and .euroc.csv have times)",
+            f"{path}: image {skipped} has no pose; KITTI rows do not state their image, so the following"
+            " rows are shifted (.tum and .euroc.csv have times)",
             InputWarning,
             stacklevel=2,
         )
@@ -35,7 +35,8 @@ def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write EuRoC's poses: rows of nanoseconds, position and quaternion (w, x, y, z), of the camera and not of a body.
+    """Write EuRoC poses: rows of nanoseconds, position and quaternion (w, x, y, z), of the camera, not of a
+    body.
 
     The time of an image without one is its number, in seconds.
     """

@@ -1,4 +1,4 @@
-"""A plot of a trajectory over the map's surface, from above and from the side, coloured by its uncertainty."""
+"""A plot of a trajectory over the map's surface, from above and from the side, coloured by uncertainty."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.results.plot_style import new_figure, styled, write_figure
 
 SURFELS = 12_000
-"""Maximum number of surfels that are drawn."""
+"""Maximum number of surfels drawn."""
 PATH_MARGIN = 1.5
 """Extent of the drawn surface around the path, in multiples of the path's size; at least half of the scene's extent."""
 
@@ -31,7 +31,7 @@ class PlottedPath:
 
     poses: SE3  # (n) T_world_camera
     accepted: Bool[Tensor, "n"]
-    deviations: Float[Tensor, "n"]  # standard deviation of the position; not a number where unknown
+    deviations: Float[Tensor, "n"]  # standard deviation of the position; NaN if unknown
     truth: Sequence[SE3 | None] = ()
     unit: LengthUnit = "units"  # of the poses
 
@@ -39,9 +39,9 @@ class PlottedPath:
 def plot_path(
     path: PlottedPath, surface: SurfaceMap | None, file: Path, up: UpDirection | None = None
 ) -> None:
-    """Draw a path as PNG or SVG, by the ending of the file's name. Raises ``InputError`` without matplotlib.
+    """Draw a path as PNG or SVG, by file extension. Raises ``InputError`` without matplotlib.
 
-    ``up`` is the upward direction, by default the one that the surface and the cameras give.
+    ``up`` is the upward direction, by default estimated from the surface and the cameras.
     """
     if up is None:
         normals = None if surface is None else surface.surfels.normals
@@ -81,7 +81,7 @@ def _axes(poses: SE3, up: Float[Tensor, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _fine(path: PlottedPath) -> tuple[float, str]:
-    """Return the factor and the unit in which deviations are drawn."""
+    """Return the factor and unit in which deviations are drawn."""
     return (1000.0, "mm") if path.unit == "metres" else (1.0, "units")
 
 

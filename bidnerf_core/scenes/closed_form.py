@@ -25,9 +25,9 @@ from bidnerf_core.scenes.primitives import Primitive
 class Hits:
     """The first surface on each ray."""
 
-    distance: Float[Tensor, "*r"]  # metres along the ray; inf where nothing is met
-    rgb: Float[Tensor, "*r 3"]  # lit; the background's where nothing is met
-    normal: Float[Tensor, "*r 3"]  # unit, world, on the ray's side of the surface; 0 where nothing is met
+    distance: Float[Tensor, "*r"]  # metres along the ray; inf if nothing is hit
+    rgb: Float[Tensor, "*r 3"]  # lit; the background's if nothing is hit
+    normal: Float[Tensor, "*r 3"]  # unit, world, on the ray's side of the surface; 0 if nothing is hit
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,9 @@ def views(scene: ClosedFormScene, intrinsics: Intrinsics, poses: Sequence[SE3]) 
 
 
 def _may_meet(primitive: Primitive, origins: Float[Tensor, "3 #n"], rays: Float[Tensor, "3 n"]) -> Tensor:
-    """Return the indices of the rays that may meet the primitive: from one origin, those in the cone around its ball."""
+    """Return the indices of the rays that may hit the primitive: from a single origin, those in the cone
+    around its ball.
+    """
     towards = primitive.T_world_shape.translation.to(rays) - origins[:, 0]
     beyond = float(towards @ towards) - (primitive.shape.reach * 1.01 + 1e-3) ** 2
     if origins.shape[1] > 1 or beyond <= 0:

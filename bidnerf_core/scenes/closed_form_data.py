@@ -1,8 +1,8 @@
 """Closed-form scenes as maps and datasets, so that an evaluation needs no files.
 
-``demo:blobs`` is both a dataset and a map: coloured clouds whose field is known exactly, with images rendered from it.
-``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes`` with exact depth, as datasets
-to train maps on and to localize in them.
+``demo:blobs`` is both a dataset and a map: coloured clouds whose field is known exactly, with images rendered
+from it. ``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes`` with
+exact depth, as datasets for training maps and localizing in them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 FRAMES, TRAINING_FRAMES = 24, 40
 BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 FRAME_NAME = re.compile(r"(?P<place>\d{4})(?:@(?P<angle>-?\d+(?:\.\d+)?))?")
-"""A frame's name: its number and, in a sequence, the angle in degrees by which it is turned."""
+"""A frame's name: its number and, in a sequence, the angle in degrees by which it is rotated."""
 
 Scene = TypeVar("Scene")
 Render = Callable[[SE3, str], Frame]
@@ -43,9 +43,9 @@ Render = Callable[[SE3, str], Frame]
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormData:
-    """A ``Dataset`` with split "test", and split "train" where ``training`` has poses.
+    """A ``Dataset`` with split "test", and split "train" if ``training`` has poses.
 
-    Frame "0003@15" is frame 0003 turned by 15 degrees about the middle.
+    Frame "0003@15" is frame 0003 rotated by 15 degrees about the middle.
     """
 
     name: str
@@ -87,14 +87,16 @@ class ClosedFormData:
         return views
 
     def sequence(self, name: str, count: int, angle: float) -> tuple[str, ...]:
-        """Return the names of ``count`` frames, ``angle`` degrees apart, that end with frame ``name``."""
+        """Return the names of ``count`` frames, ``angle`` degrees apart, ending with frame ``name``."""
         return (*(f"{name}@{k * angle:g}" for k in range(count - 1, 0, -1)), name)
 
     def _pose(self, name: str, split: str) -> SE3:
         found, poses = FRAME_NAME.fullmatch(name), self._poses(split)
         if found is None or int(found["place"]) >= len(poses):
             last = len(poses) - 1
-            raise InputError(f"{self.path}: no frame {name!r}, expected 0000 to {last:04d} or one as 0000@15")
+            raise InputError(
+                f"{self.path}: no frame {name!r}, expected 0000 to {last:04d} or a name such as 0000@15"
+            )
         pose, up = poses[int(found["place"])], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         return turned_about(
             pose, torch.tensor(self.middle, dtype=torch.float64), up, float(found["angle"] or 0)
@@ -102,7 +104,7 @@ class ClosedFormData:
 
 
 def is_closed_form(name: str) -> bool:
-    """Return whether a name is that of a closed-form scene and not of a folder."""
+    """Return whether a name is that of a closed-form scene rather than a folder."""
     return name.startswith(PREFIX)
 
 
@@ -122,7 +124,7 @@ def _found(name: str, known: dict[str, Callable[[], Scene]], what: str) -> Calla
         return known[own]
     listed = " or ".join(PREFIX + one for one in known)
     if own in DATA:
-        raise InputError(f"{name}: has no map; train one with 'bidnerf demo', or take {listed}")
+        raise InputError(f"{name}: has no map; train one with 'bidnerf demo', or use {listed}")
     near = difflib.get_close_matches(own, known, n=1)
     raise InputError(f"no closed-form {what} {name!r}, expected {PREFIX + near[0] if near else listed}")
 

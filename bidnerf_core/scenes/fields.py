@@ -49,7 +49,7 @@ class GaussianBlobs:
         return FieldValues(clouds.sum(-1), 0.5 + 0.45 * torch.sin(local @ self.waves.to(local).T + 0.7))
 
     def moved(self, T_new_world: SE3) -> GaussianBlobs:
-        """Return the field that has at ``T_new_world.apply(p)`` the values that this one has at ``p``."""
+        """Return the field whose values at ``T_new_world.apply(p)`` are those of this field at ``p``."""
         return replace(self, T_world_field=T_new_world.to(self.T_world_field.rotation) @ self.T_world_field)
 
 

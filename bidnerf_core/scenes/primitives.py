@@ -1,7 +1,8 @@
 """Solids with closed-form ray intersections.
 
-Every shape is convex and centred on the origin of its own frame, so a line meets it in one interval. Rays are arrays of
-shape (3 n), with x, y and z each contiguous: for the few operations here that is several times as fast as (n 3).
+Every shape is convex and centred on the origin of its own frame, so a line meets it in one interval. Rays are
+arrays of shape (3 n), with x, y and z each contiguous: for the few operations here, that layout is several
+times as fast as (n 3).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.scenes.textures import Texture, dominant_axis
 
 PARALLEL_BELOW = 1e-12
-"""Components of a direction below this are set to it, to avoid division by zero; the change of the ray is negligible."""
+"""Direction components below this are replaced by it, to avoid division by zero; the change of the ray is negligible."""
 
 
 @runtime_checkable
@@ -33,7 +34,9 @@ class Shape(Protocol):
     def interval(
         self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Return where lines enter and leave (metres along ``directions``, possibly negative); leave < enter on a miss."""
+        """Return where lines enter and leave (metres along ``directions``, possibly negative); leave < enter
+        means a miss.
+        """
         ...
 
     def normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -138,7 +141,8 @@ class Primitive:
     def distance(
         self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
     ) -> Float[Tensor, " n"]:
-        """Return the distance to the first crossing ahead of the origin (metres; world, unit directions); inf: none.
+        """Return the distance to the first crossing in front of the origin (metres; world, unit directions);
+        inf: none.
 
         From inside a solid, this is where the ray leaves it: a box seen from inside is a room.
         """

@@ -1,7 +1,7 @@
 """Textures for closed-form scenes: smooth functions of position, rich enough to distinguish one place from another.
 
-All are practically band-limited, as they are plane waves with softened edges: an image of 100 to 200 pixels from a typical
-distance shows them without aliasing.
+All are practically band-limited, being plane waves with softened edges: an image of 100 to 200 pixels from a
+typical distance shows them without aliasing.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Blotches(Waves):
 
 @dataclass(frozen=True)
 class Faces:
-    """A texture for each side (+x, -x, +y, -y, +z, -z); a point gets that of the axis nearest to its normal."""
+    """A texture for each side (+x, -x, +y, -y, +z, -z); a point gets the texture of the axis nearest to its normal."""
 
     sides: tuple[Texture, Texture, Texture, Texture, Texture, Texture]
 
@@ -73,7 +73,9 @@ class Faces:
 
 
 def checker(first: Colour, second: Colour, period: float | Vector, phase: float = 0.7) -> Waves:
-    """Return soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes or for each."""
+    """Return soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes
+    or per axis.
+    """
     px, py, pz = period if isinstance(period, tuple) else (period,) * 3
     waves = ((2 * math.pi / px, 0.0, 0.0), (0.0, 2 * math.pi / py, 0.0), (0.0, 0.0, 2 * math.pi / pz))
     return Waves(first, second, waves, (phase, phase + 0.5, phase + 0.9), hardness=5.0)
@@ -97,7 +99,7 @@ def blotches(first: Colour, second: Colour, period: float, seed: int) -> Blotche
 
 
 def dominant_axis(vectors: Float[Tensor, "n 3"]) -> Bool[Tensor, "n 3"]:
-    """Return a mask of the component of largest magnitude, the first of equals; ten times as fast as ``argmax``."""
+    """Return a mask of the component of largest magnitude, the first of equal ones; ten times as fast as ``argmax``."""
     x, y, z = vectors.abs().unbind(-1)
     first = (x >= y) & (x >= z)
     second = ~first & (y >= z)

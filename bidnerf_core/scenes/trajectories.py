@@ -39,9 +39,11 @@ def orbit(
 
 
 def look_around(bounds: SceneBounds, count: int, seed: int = 0, spread: float = 0.5) -> list[SE3]:
-    """Return poses (``T_world_camera``) in a room, at head height, in all compass directions, tilted up or down a little.
+    """Return poses (``T_world_camera``) in a room, at head height, in all compass directions, tilted slightly
+    up or down.
 
-    Each camera stands about ``spread`` of the way from the middle of the room to the wall behind it, to see much of the room.
+    Each camera stands about ``spread`` of the way from the middle of the room to the wall behind it, to see
+    much of the room.
     """
     generator = torch.Generator().manual_seed(seed)
     lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (bounds.lower, bounds.upper))

@@ -1,5 +1,6 @@
-"""The HTTP service: photos in, poses out, from maps that several worker processes share.
+"""The HTTP service: photos in, poses out, from maps shared by several worker processes.
 
-The process that listens decodes nothing and does not import torch. It hands each request to a worker, a fork of the one process
-that loaded the maps, so that a photo can only ever end its own worker, and memory holds every map once.
+The listening process decodes nothing and does not import torch. It hands each request to a worker, a fork of
+the one process that loaded the maps, so that a photo can only ever crash its own worker, and every map is in
+memory only once.
 """

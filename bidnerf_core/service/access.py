@@ -1,4 +1,4 @@
-"""Who may ask the service: whoever has its token or, without one, programs on this machine."""
+"""Access control: the service answers clients with its token or, without a token, programs on this machine."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 OPEN = "/health"
-"""The path that needs no token: load balancers ask it, and it says nothing about the maps."""
+"""The path that needs no token: load balancers poll it, and it reveals nothing about the maps."""
 
 
 class Access:
-    """Lets requests through that carry the token, or that are addressed to this machine by a program on it.
+    """Passes on requests that carry the token, or that a program on this machine addresses to it.
 
-    A page that a browser shows may send requests to the loopback interface; they are told by their ``Origin`` or, where a name of
-    another site leads to this machine, by their ``Host``. ``refused`` is called with the scope and the status of each refusal.
+    A web page in a browser may send requests to the loopback interface; these are detected by their
+    ``Origin`` or, if another site's name resolves to this machine, by their ``Host``. ``refused`` is called
+    with the scope and status of each rejected request.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Access:
             return 403, "without a token the service answers requests to localhost only"
         origin = headers.get("origin")
         if origin is not None and not is_loopback(_host_of(origin)):
-            return 403, "requests by pages of other sites are refused"
+            return 403, "requests from pages of other sites are rejected"
         return None
 
 
@@ -73,7 +74,7 @@ def _host_of(address: str) -> str | None:
 
 
 def is_loopback(host: str | None) -> bool:
-    """Return whether a name or an address is that of this machine for itself."""
+    """Return whether a name or address is a loopback one."""
     if host is None:
         return False
     try:

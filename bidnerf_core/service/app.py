@@ -1,4 +1,4 @@
-"""The service as an ASGI application: its paths, its answers, its log."""
+"""The service as an ASGI application: its paths, responses and log."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ log = logging.getLogger("bidnerf.service")
 PROBLEM = "application/problem+json"
 OSCP = "application/vnd.oscp+json"
 CLIENT_GONE = 499
-"""The status in the log and the metrics for a client that left before the answer; nobody receives it."""
+"""The status in the log and the metrics for a client that disconnected before the response; nobody receives it."""
 SAFE = {
     "X-Content-Type-Options": "nosniff",
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Cache-Control": "no-store",
 }
-"""Headers of every answer: names in it are text, whatever a browser would like to make of them."""
+"""Headers of every response: names in it are text, whatever a browser might make of them."""
 TITLES = {
     400: "bad request", 401: "no valid token", 403: "not allowed", 404: "not found", 405: "method not allowed",
     408: "upload too slow", 413: "too large", 422: "not localized", 429: "too many requests", 500: "internal error",
@@ -51,9 +51,9 @@ Handler = Callable[[Request], Awaitable[Response]]
 def application(
     maps: Mapping[str, Path], config: ServiceConfig, token: str | None, method: ChosenMethod
 ) -> Starlette:
-    """Return the service of the maps in some folders, by their names; it runs between the startup and shutdown of ASGI.
+    """Build the service for the maps in some folders, by name; it runs between ASGI startup and shutdown.
 
-    Raises ``InputError`` from its startup where a map cannot be served.
+    Its startup raises ``InputError`` if a map cannot be served.
     """
 
     @contextlib.asynccontextmanager
@@ -88,7 +88,7 @@ def application(
 
 
 def _logged(handler: Handler) -> Handler:
-    """Turn refusals into answers, count the request, and write one line of JSON about it to the log."""
+    """Convert errors to responses, count the request, and write one line of JSON about it to the log."""
 
     async def handle(request: Request) -> Response:
         began = time.perf_counter()
@@ -97,7 +97,7 @@ def _logged(handler: Handler) -> Handler:
             response = await handler(request)
         except Refused as error:
             response = problem(error.status, error.detail, error.headers)
-        except Exception as error:  # a fault of ours: whoever runs the service has to see where it happened
+        except Exception as error:  # an internal error: the operator has to see where it happened
             log.exception("%s", json.dumps({"fault": f"{type(error).__name__}: {error}"}))
             response = problem(500, "internal error")
         seconds = time.perf_counter() - began
@@ -114,7 +114,7 @@ def _logged(handler: Handler) -> Handler:
 
 
 def _refused(scope: Scope, status: int) -> None:
-    """Count a request without the right to ask, and log it. Its path is not one of the description's, but anything."""
+    """Count and log an unauthorized request. Its path may be anything, not only a documented one."""
     scope["app"].state.pool.metrics.requests["refused", status] += 1
     _log(scope, status, 0.0, {})
 
@@ -128,7 +128,7 @@ def _log(scope: Scope, status: int, seconds: float, facts: Mapping[str, Any]) ->
 
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any) -> Response:
-    """Return an error as RFC 9457 has it."""
+    """Return an error response in the format of RFC 9457."""
     body = {"title": TITLES.get(status, "error"), "status": status, "detail": detail, **more}
     return Response(json.dumps(body), status, {**SAFE, **(headers or {})}, PROBLEM)
 
@@ -153,7 +153,7 @@ async def _health(request: Request) -> Response:
     pool: Pool = request.app.state.pool
     alive = len(pool.alive)
     if not alive:
-        return problem(503, "no worker is alive at the moment", {"Retry-After": "1"})
+        return problem(503, "no worker is currently alive", {"Retry-After": "1"})
     return _json({"status": "ok", "workers": alive, "waiting": int(pool.metrics.gauges["queue_length"][1]())})
 
 
@@ -178,7 +178,7 @@ async def _map(request: Request) -> Response:
 
 
 async def _localize(request: Request) -> Response:
-    """Answer with the JSON of ``bidnerf localize``."""
+    """Respond with the JSON of ``bidnerf localize``."""
     pool: Pool = request.app.state.pool
     with _place(pool):
         content = await body_of(request, pool.config)
@@ -190,7 +190,7 @@ async def _localize(request: Request) -> Response:
 
 
 async def _geopose(request: Request) -> Response:
-    """Answer a request of the GeoPose Protocol; a GET asks whether the service runs."""
+    """Respond to a request of the GeoPose Protocol; a GET checks that the service runs."""
     pool: Pool = request.app.state.pool
     if request.method != "POST":
         return _json({"status": "running"})
@@ -223,14 +223,14 @@ def _chosen(request: Request, asked: str | None) -> str:
     if asked is None:
         raise Refused(400, f"several maps are served, expected map as one of {', '.join(names)}")
     if asked not in names:
-        raise Refused(404, f"no map of that name, expected one of {', '.join(names)}")
+        raise Refused(404, f"no map with that name, expected one of {', '.join(names)}")
     return str(asked)
 
 
 async def _answer(
     request: Request, pool: Pool, kind: str, name: str, query: Query, body: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """Return a worker's answer; stop the work if the client leaves. Raises ``Refused``."""
+    """Return a worker's answer; stop the work if the client disconnects. Raises ``Refused``."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + pool.config.timeout
     job = Job(kind, name, query.parameters, query.blocks, deadline, loop.create_future(), body)
@@ -245,7 +245,7 @@ async def _answer(
     except TimedOut as error:
         raise Refused(504, f"no answer within {pool.config.timeout:g} s") from error
     except Lost as error:
-        raise Refused(422, "the request ended every worker that took it") from error
+        raise Refused(422, "the request crashed every worker that took it") from error
     finally:
         for task in (answering, leaving):
             task.cancel()

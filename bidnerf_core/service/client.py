@@ -1,4 +1,4 @@
-"""A client of the service that needs nothing but Python: copy this file to where bidnerf is not installed."""
+"""A client for the service that needs only Python: copy this file to where bidnerf is not installed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 
 class ServiceError(Exception):
-    """The service did not answer with a result; ``status`` is that of HTTP, 0 without a connection."""
+    """The service did not respond with a result; ``status`` is the HTTP status, 0 without a connection."""
 
     def __init__(self, status: int, detail: str) -> None:
         super().__init__(detail)
@@ -20,7 +20,9 @@ class ServiceError(Exception):
 
 
 class ServiceClient:
-    """Asks a service of ``bidnerf serve`` at ``url`` for poses. A busy service is asked again until ``timeout`` seconds."""
+    """Requests poses from a ``bidnerf serve`` service at ``url``. A busy service is retried for up to
+    ``timeout`` seconds.
+    """
 
     def __init__(
         self, url: str = "http://127.0.0.1:8000", token: str | None = None, timeout: float = 120.0
@@ -28,10 +30,11 @@ class ServiceClient:
         self.url, self.token, self.timeout = url.rstrip("/"), token, timeout
 
     def localize(self, photo: str | Path | bytes, **given: Any) -> dict[str, Any]:
-        """Return the JSON of ``bidnerf localize`` for a photo, a file or its bytes.
+        """Return the JSON of ``bidnerf localize`` for a photo, given as a file or its bytes.
 
-        ``given``: ``map`` and ``name``; ``depth``, a file or its bytes, with ``depth_unit``; ``focal``, ``hfov``, or ``camera``,
-        a path or what such a file holds as bytes; ``start``, 4x4 rows of T_world_camera; ``seed``. Raises ``ServiceError``.
+        ``given``: ``map`` and ``name``; ``depth``, a file or its bytes, with ``depth_unit``; ``focal``,
+        ``hfov``, or ``camera``, a path or such a file's content as bytes; ``start``, 4x4 rows of
+        T_world_camera; ``seed``. Raises ``ServiceError``.
         """
         edge, start = uuid.uuid4().hex, given.pop("start", None)
         fields = given | {"photo": photo} | ({} if start is None else {"start": json.dumps(start).encode()})
@@ -42,7 +45,7 @@ class ServiceClient:
         return found
 
     def ask(self, path: str, body: bytes | None = None, kind: str = "application/json") -> Any:
-        """Return the JSON at a path such as /maps, or the answer to ``body``. Raises ``ServiceError``."""
+        """Return the JSON at a path such as /maps, or the response to ``body``. Raises ``ServiceError``."""
         headers = {"Content-Type": kind} | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
         request, until = (
             urllib.request.Request(self.url + path, body, headers),
@@ -68,7 +71,7 @@ class ServiceClient:
 
 
 def _part(edge: str, name: str, value: Any, is_file: bool) -> bytes:
-    """Return a field of a form; the name of a photo's file, without its ending, is its name in the answer."""
+    """Return a form field; the stem of a photo's file name becomes its name in the answer."""
     content = (
         value if isinstance(value, bytes) else Path(value).read_bytes() if is_file else str(value).encode()
     )

@@ -13,21 +13,21 @@ from bidnerf_core.settings import LARGEST_SEED
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}
 MATRIX = {"type": "array", "items": {"type": "array", "items": NUMBER}}
 ERRORS = {
-    400: "The request is malformed: the detail says what was found and what is expected.",
+    400: "The request is malformed: the detail states what was found and what is expected.",
     401: "The service has a token, and the request does not carry it.",
-    403: "Without a token, only programs on the service's own machine may ask.",
+    403: "Without a token, only programs on the service's own machine may send requests.",
     404: "There is no such map.",
     408: "The request did not arrive in time.",
     413: "The request is too large.",
     422: "The photo cannot be read or localized at all.",
-    429: "All places are taken; Retry-After says when to try again.",
-    503: "No worker is alive at the moment.",
+    429: "The service is full; Retry-After states when to try again.",
+    503: "No worker is currently alive.",
     504: "The answer took too long.",
 }
 
 
 def description(maps: Sequence[str], config: ServiceConfig) -> dict[str, Any]:
-    """Return the description of a service of some maps."""
+    """Return the OpenAPI description of a service with these maps."""
     return {
         "openapi": "3.1.0",
         "info": {
@@ -38,13 +38,13 @@ def description(maps: Sequence[str], config: ServiceConfig) -> dict[str, Any]:
             " megapixels.",
         },
         "paths": {
-            "/health": {"get": _get("Whether the service works; needs no token.", {"type": "object"}, open=True, also=(503,))},
-            "/metrics": {"get": _get("Counts and times for Prometheus.", TEXT, "text/plain")},
-            "/maps": {"get": _get("The maps by name, and what is known about them.", {"type": "object"})},
+            "/health": {"get": _get("Whether the service is up; needs no token.", {"type": "object"}, open=True, also=(503,))},
+            "/metrics": {"get": _get("Counters and times for Prometheus.", TEXT, "text/plain")},
+            "/maps": {"get": _get("The maps by name, with information about each.", {"type": "object"})},
             "/maps/{map}": {"parameters": [_in_path(maps)], "get": _get("A map.", {"type": "object"}, also=(404,))},
             "/localize": {"post": _localize(maps)},
             "/maps/{map}/localize": {"parameters": [_in_path(maps)], "post": _localize(None)},
-            "/geopose": {"post": _geopose(maps), "get": _get("Whether the endpoint works.", {"type": "object"})},
+            "/geopose": {"post": _geopose(maps), "get": _get("Whether the endpoint is up.", {"type": "object"})},
             "/maps/{map}/geopose": {"parameters": [_in_path(maps)], "post": _geopose(None)},
         },
         "components": {
@@ -95,13 +95,13 @@ def _fields() -> dict[str, Any]:
             **NUMBER,
             "minimum": 1e-9,
             "maximum": 1e9,
-            "description": "metres of one step of the depth image",
+            "description": "metres per step of the depth image",
         },
         "seed": {
             "type": "integer",
             "minimum": 0,
             "maximum": LARGEST_SEED,
-            "description": "of every random choice",
+            "description": "seed of every random choice",
         },
         "camera": {
             **TEXT,
@@ -133,7 +133,8 @@ def _localize(maps: Sequence[str] | None) -> Any:
     answer = {"application/json": {"schema": {"$ref": "#/components/schemas/Localization"}}}
     return {
         "summary": "Find the pose of a photo.",
-        "description": "The answer is that of 'bidnerf localize --json'. Never use a pose whose 'converged' is false.",
+        "description": "The response is that of 'bidnerf localize --json'. Never use a pose whose 'converged' is"
+                " false.",
         "parameters": _query(maps),
         "requestBody": {
             "required": True,
@@ -173,8 +174,9 @@ def _geopose(maps: Sequence[str] | None) -> Any:
     answered = {"application/json": schema, "application/vnd.oscp+json;version=2.0": schema}
     return {
         "summary": "Find the pose of a photo on the earth (OSCP GeoPose Protocol, version 2).",
-        "description": "A map without an anchor answers with localpose, in the map's frame, in place of geopose. The quaternion"
-        " rotates from x forward, y left, z up at the camera. A pose that is not trusted is answered with 422.",
+        "description": "A map without an anchor responds with localpose, in the map's frame, instead of"
+        " geopose. The quaternion rotates from x forward, y left, z up at the camera. An"
+        " untrusted pose results in status 422.",
         "parameters": [p for p in _query(maps) if p["name"] == "map"],
         "requestBody": {"required": True, "content": {"application/json": {"schema": request}}},
         "responses": {"200": {"description": "The pose and its accuracy.", "content": answered}}
@@ -219,7 +221,7 @@ def _geopose_answer() -> Any:
         "properties": dict.fromkeys(("lon", "lat", "h"), NUMBER),
     }
     accuracy = {
-        "type": ["object", "null"], "description": "standard deviations: metres along an axis, degrees about one",
+        "type": ["object", "null"], "description": "standard deviations: metres along each axis, degrees about each",
         "properties": {"position": NUMBER, "orientation": NUMBER},
     }  # fmt: skip
     return {

@@ -1,8 +1,9 @@
 """The GeoPose Protocol of the Open AR Cloud, version 2: a request with a camera reading, and the answer with a geopose.
 
-https://github.com/OpenArCloud/oscp-geopose-protocol. The quaternion rotates from the camera to east, north and up at the camera;
-as in OGC GeoPose 1.0, where a pose without rotation looks east with its left side north, the camera's axes are x forward, y left
-and z up. ``accuracy`` comes from the covariance of the pose and that of the anchor.
+https://github.com/OpenArCloud/oscp-geopose-protocol. The quaternion rotates from the camera to east, north
+and up at the camera; as in OGC GeoPose 1.0, where a pose without rotation looks east with its left side
+north, the camera's axes are x forward, y left and z up. ``accuracy`` is derived from the covariances of the
+pose and the anchor.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from bidnerf_core.service.upload import Upload
 R_CAMERA_BODY = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
 """Rotation from body axes (x forward, y left, z up) to OpenCV's camera axes."""
 RAW_CHANNELS = {"RGBA32": 4, "RGB24": 3, "GRAY8": 1}
-"""Formats without a header, and their bytes in a pixel."""
+"""Formats without a header, and their bytes per pixel."""
 NOT_LOCALIZED = 422
 
 
@@ -52,10 +53,11 @@ class _Reading:
 def answer(
     anchor: Anchor | None, body: dict[str, Any], localize: Callable[[Upload], tuple[Answer, dict[str, Any]]]
 ) -> dict[str, Any]:
-    """Return the status and the body of the answer to a request of the protocol.
+    """Return the status and body of the response to a request of the protocol.
 
-    A map without an anchor answers with a ``localpose`` in place of a ``geopose``: position and quaternion in the map's frame. A
-    pose that was not accepted is never passed on as one. Raises ``InputError`` for a request that cannot be used.
+    A map without an anchor responds with a ``localpose`` instead of a ``geopose``: position and quaternion in
+    the map's frame. A pose that was not accepted is never returned. Raises ``InputError`` for an invalid
+    request.
     """
     request = Record("request", body)
     reading = _reading(request)
@@ -82,9 +84,11 @@ def answer(
 
 
 def accuracy(found: Localization, anchor: Anchor | None) -> dict[str, float] | None:
-    """Return standard deviations: metres along an axis, degrees about one, each the root mean square of the three axes.
+    """Return standard deviations: metres along an axis, degrees about one, each the root mean square of the
+    three axes.
 
-    None where the covariance is not known: no number would be true. Without an anchor, metres are units of the map.
+    None if the covariance is unknown, since any number would be wrong. Without an anchor, metres are units of
+    the map.
     """
     if found.covariance is None or not bool(found.covariance.isfinite().all()):
         return None
@@ -113,7 +117,7 @@ def _local(found: Localization) -> dict[str, Any]:
 
 
 def _quaternion(R_frame_camera: Float[Tensor, "3 3"]) -> dict[str, float]:
-    """Return the unit quaternion that rotates from the body's axes (x forward, y left, z up) to the frame, with w >= 0."""
+    """Return the unit quaternion that rotates from body axes (x forward, y left, z up) to the frame, with w >= 0."""
     R_frame_body = R_frame_camera.double() @ R_CAMERA_BODY
     numbers = SE3(R_frame_body, R_frame_body.new_zeros(3)).quaternion("xyzw").tolist()
     return dict(zip("xyzw", numbers, strict=True))
@@ -129,11 +133,11 @@ def _reading(request: Record) -> _Reading:
     orientation = _object(record, "imageOrientation")
     if orientation.value("mirrored") or orientation.number("rotation"):
         raise record.error(
-            "imageOrientation is not that of the image, expected an upright image that is not mirrored"
+            "imageOrientation does not match the image, expected an upright image that is not mirrored"
         )
     text = record.text("imageBytes")
     if not text:
-        raise record.error("no imageBytes, expected an image in base64")
+        raise record.error("no imageBytes, expected a base64 image")
     try:
         content = base64.b64decode(
             text.partition("base64,")[2] if text.startswith("data:") else text, validate=True
@@ -145,7 +149,7 @@ def _reading(request: Record) -> _Reading:
 
 
 def _object(record: Record, key: str) -> Record:
-    """Return an object inside another one; an empty one where it is missing."""
+    """Return an object inside another one; an empty one if it is missing."""
     found = record.value(key)
     if found is not None and not isinstance(found, dict):
         raise record.error(f"{key} is a {type(found).__name__}, expected an object")
@@ -169,13 +173,13 @@ def _encoded(record: Record, content: bytes, size: tuple[int, int] | None) -> by
     """Return an image file: ``content`` itself, or raw pixels as PNG."""
     kind = (record.text("imageFormat") or "").upper()
     if kind == "DEPTH":
-        raise record.error("imageFormat is DEPTH, expected a colour image; /localize takes depth as well")
+        raise record.error("imageFormat is DEPTH, expected a colour image; /localize accepts depth as well")
     if kind not in RAW_CHANNELS:
         return content
     channels = RAW_CHANNELS[kind]
     if size is None or len(content) != size[0] * size[1] * channels:
         if content[:2] == b"\xff\xd8" or content[:4] == b"\x89PNG":
-            return content  # the format of the pixels in a file
+            return content  # the pixel format within a file
         raise record.error(
             f"{len(content)} bytes of {kind}, expected size and width x height x {channels} bytes"
         )
@@ -184,7 +188,7 @@ def _encoded(record: Record, content: bytes, size: tuple[int, int] | None) -> by
 
 
 def _camera(reading: _Reading) -> dict[str, bytes]:
-    """Return the camera as a line of COLMAP's ``cameras.txt``, whose models the protocol has."""
+    """Return the camera as a line of COLMAP's ``cameras.txt``, whose models the protocol uses."""
     params = _object(reading.record, "params")
     model, numbers = params.text("model") or "UNKNOWN_CAMERA", _numbers(params, "modelParams")
     if model == "UNKNOWN_CAMERA" or not numbers:
@@ -192,13 +196,15 @@ def _camera(reading: _Reading) -> dict[str, bytes]:
     if model not in MODELS:
         raise params.error(f"model is {model!r}, expected one of {', '.join(MODELS)}")
     if reading.size is None:
-        raise reading.record.error("a camera model without size, expected width and height of its image")
+        raise reading.record.error(
+            "a camera model without a size, expected the width and height of its image"
+        )
     width, height = reading.size
     return {"camera": f"1 {model} {width} {height} {' '.join(map(repr, numbers))}\n".encode()}
 
 
 def _prior(anchor: Anchor | None, request: Record) -> dict[str, bytes]:
-    """Return the last of the prior poses as a start. Without an anchor, geoposes say nothing about the map."""
+    """Return the last of the prior poses as a start. Without an anchor, geoposes cannot be related to the map."""
     priors = [prior for prior in request.items("priorPoses") or [] if isinstance(prior, dict)]
     if anchor is None or not priors:
         return {}
@@ -208,7 +214,7 @@ def _prior(anchor: Anchor | None, request: Record) -> dict[str, bytes]:
     q = torch.tensor([_required(quaternion, key) for key in "xyzw"], dtype=torch.float64)
     length = float(torch.linalg.vector_norm(q))
     if not 0.9 < length < 1.1:
-        raise quaternion.error(f"has the length {length:.3g}, expected 1")
+        raise quaternion.error(f"has length {length:.3g}, expected 1")
     rotation = SE3.from_quaternion(q, q.new_zeros(3), "xyzw").rotation @ R_CAMERA_BODY.mT
     T_world_camera = anchor.T_world_camera(GeographicPose(Geodetic(lat, lon, h), rotation))
     return {"start": _matrix(T_world_camera)}

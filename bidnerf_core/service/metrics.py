@@ -1,4 +1,4 @@
-"""Counts and times of the service, as Prometheus reads them (text format 0.0.4)."""
+"""Counters and times of the service in Prometheus' text format 0.0.4."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ TEXT = "text/plain; version=0.0.4; charset=utf-8"
 SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 """Upper bounds of the buckets of times."""
 PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
-"""Bytes of a page, in which ``/proc/PID/statm`` counts."""
+"""Bytes per page, the unit of ``/proc/PID/statm``."""
 
 
 class Histogram:
-    """How often values fell into each bucket."""
+    """Counts of values per bucket."""
 
     def __init__(self) -> None:
         self.counts, self.total = [0] * (len(SECONDS) + 1), 0.0
@@ -30,10 +30,10 @@ class Histogram:
 
 
 class Metrics:
-    """All that the service counts."""
+    """Everything that the service counts."""
 
     def __init__(self) -> None:
-        self.requests = Counter[tuple[str, int]]()  # by path of the description and status
+        self.requests = Counter[tuple[str, int]]()  # by documented path and status
         self.outcomes = Counter[tuple[str, str]]()  # by map and outcome
         self.restarts = Counter[str]()  # of workers, by reason
         self.seconds, self.waited = Histogram(), Histogram()
@@ -60,14 +60,14 @@ class Metrics:
             yield from _head(name, "gauge", description)
             yield _line(name, value())
         yield from _head(
-            "resident_bytes", "gauge", "Resident memory; pages that processes share count for each."
+            "resident_bytes", "gauge", "Resident memory; pages shared by processes count for each."
         )
         for kind, numbers in self.processes().items():
             yield _line("resident_bytes", sum(map(resident_bytes, numbers)), process=kind)
 
 
 def resident_bytes(process: int) -> int:
-    """Return the resident memory of a process; 0 where the system does not say."""
+    """Return the resident memory of a process; 0 if the system does not report it."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * PAGE
     return 0

@@ -1,7 +1,8 @@
 """The process that loads the maps once and forks the workers, which share its memory.
 
-It has a single thread, so that forks are sound, and it never touches a request: a worker that fails or is stopped is replaced
-within milliseconds, with the maps as they were loaded. It ends, with all its workers, when the service that started it ends.
+It has a single thread, so that forks are safe, and it never handles a request: a worker that fails or is
+stopped is replaced within milliseconds, with the maps as they were loaded. It ends, with all its workers,
+when the service that started it ends.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def main() -> None:
     """Serve the socket whose descriptor is the program's argument."""
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system then forgets workers that end
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system then reaps workers that end
     request = wire.receive(control)
     if request is None:
         return
@@ -54,7 +55,7 @@ def _prepared(control: socket.socket, order: dict[str, Any]) -> Worker | None:
         wire.send(control, {"error": str(error) or type(error).__name__})
         return None
     gc.collect()
-    gc.freeze()  # a collection in a worker would otherwise write to, and so copy, every page with an object
+    gc.freeze()  # otherwise a collection in a worker would write to, and so copy, every page with an object
     wire.send(control, {"maps": worker.described})
     return worker
 
@@ -64,7 +65,7 @@ def _fork_on_demand(control: socket.socket, worker: Worker) -> None:
         asked, descriptors, _, _ = socket.recv_fds(control, len(wire.ANOTHER), 1)
         if not asked:
             with contextlib.suppress(OSError):
-                os.killpg(0, signal.SIGKILL)  # also those that are at work
+                os.killpg(0, signal.SIGKILL)  # including those at work
             return
         if os.fork() == 0:
             control.close()

@@ -1,7 +1,9 @@
-"""The workers of the service: a bounded queue in front of processes that may be stopped or killed at any time.
+"""The workers of the service: a bounded queue in front of processes that may be stopped or killed at any
+time.
 
-A request whose worker dies is given to another one. One that takes too long, or whose client has left, costs its worker, which is
-replaced by a fork within milliseconds: no computation goes on that nobody waits for.
+A request whose worker dies is given to another one. If a request takes too long, or its client disconnects,
+its worker is killed and replaced by a fork within milliseconds, so no computation continues that nobody waits
+for.
 """
 
 from __future__ import annotations
@@ -29,15 +31,15 @@ from bidnerf_core.service.metrics import Metrics
 from bidnerf_core.service.settings import MEBIBYTE, ChosenMethod, ServiceConfig
 
 ATTEMPTS = 3
-"""Workers that a request may cost by their death before it is answered with an error."""
+"""Number of workers that a request may crash before it is answered with an error."""
 FORK_SECONDS = 60.0
 """Time for a new worker to report; on an accelerator it copies the maps first."""
 PAUSE = 1.0
-"""Seconds between two attempts to load the maps again after the process that holds them was killed."""
+"""Seconds between two attempts to reload the maps after the process that holds them was killed."""
 
 
 class Full(Exception):
-    """There are as many requests as the service takes."""
+    """The service already has as many requests as it accepts."""
 
 
 class TimedOut(Exception):
@@ -50,23 +52,23 @@ class Lost(Exception):
 
 @dataclass(eq=False)
 class Job:
-    """A request that waits for a worker, or is at work."""
+    """A request that waits for a worker, or is being processed."""
 
     kind: str  # "localize" or "geopose"
     map: str
     parameters: Mapping[str, Any]
     blocks: Mapping[str, bytes]
-    deadline: float  # by the clock of the event loop
+    deadline: float  # in the event loop's clock
     answer: asyncio.Future[dict[str, Any]]
-    body: Mapping[str, Any] | None = None  # of a request of the GeoPose Protocol
+    body: Mapping[str, Any] | None = None  # of a GeoPose Protocol request
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
     began: float = field(default_factory=time.perf_counter)
-    waited: float | None = None  # seconds, once it is at work
+    waited: float | None = None  # seconds, once processing has begun
     attempts: int = 0
 
     @property
     def head(self) -> dict[str, Any]:
-        """What a worker is sent besides the blocks."""
+        """Content sent to a worker in addition to the blocks."""
         return {
             "id": self.id,
             "kind": self.kind,
@@ -77,7 +79,7 @@ class Job:
 
 
 class WorkerProcess:
-    """A running worker, seen from the service."""
+    """A running worker, as seen by the service."""
 
     def __init__(self, pid: int, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.pid, self._reader, self._writer = pid, reader, writer
@@ -88,22 +90,22 @@ class WorkerProcess:
         return self._reader.at_eof() or self._writer.is_closing()
 
     async def ask(self, job: Job) -> dict[str, Any]:
-        """Return a worker's answer. Raises ``EOFError`` or ``OSError`` where the worker ends before it."""
+        """Return a worker's answer. Raises ``EOFError`` or ``OSError`` if the worker ends before answering."""
         for part in wire.packed(job.head, job.blocks):
             self._writer.write(part)
             await self._writer.drain()
         return await wire.read(self._reader)
 
     def stop(self) -> None:
-        """End the process at once."""
-        if not self.ended:  # its number may belong to another process otherwise
+        """End the process immediately."""
+        if not self.ended:  # otherwise its number may belong to another process
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
         self._writer.close()
 
 
 class Pool:
-    """The worker processes and their queue. All methods belong to one event loop."""
+    """The worker processes and their queue. All methods must run in the same event loop."""
 
     def __init__(self, maps: Mapping[str, Path], config: ServiceConfig, method: ChosenMethod) -> None:
         self.config, self.metrics = config, Metrics()
@@ -135,7 +137,7 @@ class Pool:
         return [worker for worker in self._workers.values() if not worker.ended]
 
     async def start(self) -> None:
-        """Load the maps and fork the workers. Raises ``InputError`` where the maps cannot be served."""
+        """Load the maps and fork the workers. Raises ``InputError`` if the maps cannot be served."""
         self._folder = tempfile.TemporaryDirectory(prefix="bidnerf-serve-", ignore_cleanup_errors=True)
         try:
             await self._load()
@@ -143,14 +145,12 @@ class Pool:
         except BaseException as error:
             await self.close()
             if isinstance(error, OSError | EOFError):
-                raise InputError(
-                    "the process that loads the maps ended, perhaps for want of memory"
-                ) from error
+                raise InputError("the process that loads the maps died; was memory short?") from error
             raise
         self._tasks = [asyncio.create_task(self._work(number)) for number in range(self.config.processes)]
 
     async def close(self) -> None:
-        """End all processes and remove what they left behind."""
+        """End all processes and remove their leftovers."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -164,7 +164,7 @@ class Pool:
 
     @contextlib.contextmanager
     def place(self) -> Iterator[None]:
-        """Hold one of the places that the service has for requests. Raises ``Full`` where none is left."""
+        """Hold one of the service's places for requests. Raises ``Full`` if none is left."""
         if self._taken >= self.config.places:
             raise Full
         self._taken += 1
@@ -183,7 +183,7 @@ class Pool:
     async def answer(self, job: Job) -> dict[str, Any]:
         """Return a worker's answer to a request; cancelling the call stops the work.
 
-        Raises ``TimedOut``, and ``Lost`` where the request keeps ending its workers.
+        Raises ``TimedOut``, and ``Lost`` if the request keeps crashing its workers.
         """
         async with self._changed:
             self._waiting.append(job)
@@ -213,7 +213,7 @@ class Pool:
                 worker = None
 
     async def _next(self, worker: WorkerProcess) -> Job | None:
-        """Return the next request, or None once the worker was found to have ended."""
+        """Return the next request, or None if the worker has ended."""
         async with self._changed:
             while not worker.ended:
                 while self._waiting:
@@ -221,13 +221,13 @@ class Pool:
                     if not job.answer.done():
                         return job
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(
-                        self._changed.wait(), PAUSE
-                    )  # also to see a worker that was killed
+                    await asyncio.wait_for(self._changed.wait(), PAUSE)  # also to notice a killed worker
         return None
 
     async def _answered(self, job: Job, worker: WorkerProcess) -> bool:
-        """Let a worker answer; return whether it goes on or was stopped. A request whose worker died waits for another one."""
+        """Let a worker answer; return whether it continues or was stopped. A request whose worker died waits
+        for another one.
+        """
         job.attempts += 1
         if job.waited is None:
             job.waited = time.perf_counter() - job.began
@@ -244,10 +244,10 @@ class Pool:
                 asking.cancel()
             await asyncio.wait({asking})  # raises nothing but a cancellation of this task itself
             if not asking.cancelled():
-                asking.exception()  # has been seen, or it would be reported as forgotten
-        worker.stop()  # before its files are removed, or it would write others
+                asking.exception()  # mark as retrieved, or it would be reported as never retrieved
+        worker.stop()  # before its files are removed, or it would write more
         self._forget_files(job)
-        if job.answer.done():  # timed out, or its client has left
+        if job.answer.done():  # timed out, or its client disconnected
             late = not job.answer.cancelled()
             self.metrics.restarts["timeout" if late else "cancelled"] += 1
             return False
@@ -265,7 +265,7 @@ class Pool:
             shutil.rmtree(Path(self._folder.name) / job.id, ignore_errors=True)
 
     async def _forked(self) -> WorkerProcess:
-        """Return a new worker. Where the process that holds the maps has ended, they are loaded again first."""
+        """Return a new worker. If the process that holds the maps has ended, they are reloaded first."""
         while True:
             try:
                 return await asyncio.wait_for(self._fork(), FORK_SECONDS)
@@ -299,7 +299,7 @@ class Pool:
         return WorkerProcess(hello["pid"], reader, writer)
 
     async def _load(self) -> None:
-        """Start the process that loads the maps. Raises ``InputError`` where it cannot serve them."""
+        """Start the process that loads the maps. Raises ``InputError`` if it cannot serve them."""
         self._end_loading(group=False)
         assert self._folder is not None
         ours, theirs = socket.socketpair()
@@ -308,22 +308,22 @@ class Pool:
                 [sys.executable, "-m", "bidnerf_core.service.nursery", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C reaches this process alone, which then ends the others
+                start_new_session=True,  # Ctrl-C reaches only this process, which then ends the others
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
             )
         self._control = ours
         order = {**self._order, "max_pixels": self.config.max_megapixels * 1e6, "folder": self._folder.name}
         reply = await asyncio.to_thread(_ordered, ours, order)
         if reply is None:
-            raise InputError("the process that loads the maps ended, perhaps for want of memory")
+            raise InputError("the process that loads the maps died; was memory short?")
         if "error" in reply:
             raise InputError(reply["error"])
         self.described = reply["maps"]
 
     def _end_loading(self, group: bool) -> None:
-        """End the process that holds the maps; ``group``: and the workers that it forked."""
+        """End the process that holds the maps and, with ``group``, the workers that it forked."""
         if self._control is not None:
-            self._control.close()  # upon which it ends all workers, if it lives
+            self._control.close()  # it then ends all workers, if it is alive
             self._control = None
         if self._nursery is not None:
             with contextlib.suppress(ProcessLookupError, PermissionError):

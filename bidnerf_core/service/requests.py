@@ -1,4 +1,4 @@
-"""Requests over HTTP: read within limits, and taken apart into a photo and what is known about it."""
+"""HTTP requests: read within limits, and parsed into a photo and what is known about it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from bidnerf_core.settings import LARGEST_SEED
 LONGEST_NAME = 200
 """Characters of a name in an answer."""
 FIELDS = 16
-"""Parts of a form."""
+"""Largest number of parts of a form."""
 FILES = ("photo", "depth", "camera", "start")
-"""The parts of a form that are contents of files. ``camera`` and ``start`` may be query parameters as well."""
+"""The parts of a form that contain files. ``camera`` and ``start`` may be query parameters as well."""
 MULTIPART, JSON = "multipart/form-data", "application/json"
 
 
@@ -45,7 +45,7 @@ class Query:
 
 
 def number(low: float, high: float) -> Callable[[str, str], float]:
-    """Return a parser of a number in a range."""
+    """Return a parser for a number in a range."""
 
     def parse(name: str, text: str) -> float:
         try:
@@ -79,11 +79,11 @@ PARAMETERS: dict[str, Callable[[str, str], Any]] = {
     "map": _same, "name": _name, "focal": number(1e-3, 1e9), "hfov": number(1e-3, 179.999),
     "depth_unit": number(1e-9, 1e9), "seed": _seed, "camera": _same, "start": _same,
 }  # fmt: skip
-"""Parsers of the query parameters, which may be fields of a form as well."""
+"""Parsers of the query parameters, which may be form fields as well."""
 
 
 async def body_of(request: Request, config: ServiceConfig) -> bytes:
-    """Return the body of a request. Raises ``Refused`` for one that is too large or that does not arrive in time."""
+    """Read the body of a request. Raises ``Refused`` for one that is too large or does not arrive in time."""
     close = {"Connection": "close"}  # the rest of the body is not read
     announced = request.headers.get("content-length", "0")
     most = f"expected at most {config.max_megabytes:g} MiB"
@@ -102,12 +102,12 @@ async def body_of(request: Request, config: ServiceConfig) -> bytes:
         late = f"the request did not arrive within {config.upload_timeout:g} s"
         raise Refused(408, late, close) from error
     except ClientDisconnect as error:
-        raise Refused(499, "the client has left") from error
+        raise Refused(499, "the client disconnected") from error
     return bytes(content)
 
 
 async def query_of(request: Request, content: bytes) -> Query:
-    """Take a request apart: a form, or the bytes of a photo with query parameters. Raises ``Refused``."""
+    """Parse a request: a form, or the bytes of a photo with query parameters. Raises ``Refused``."""
     query = Query()
     for name, text in request.query_params.multi_items():
         _add(query, name, text)
@@ -134,11 +134,11 @@ def _add(query: Query, name: str, text: str) -> None:
 
 
 def _known() -> str:
-    return f", expected some of {', '.join(PARAMETERS)}, and the files photo and depth"
+    return f", expected any of {', '.join(PARAMETERS)}, and the files photo and depth"
 
 
 class _InMemory(MultiPartParser):
-    """A parser that keeps files in memory, whose size is limited already, rather than on disk."""
+    """A parser that keeps files in memory, since their size is already limited, rather than on disk."""
 
     spool_max_size = 2**40
 
@@ -151,8 +151,8 @@ async def _add_form(query: Query, headers: Headers, content: bytes) -> None:
         parser = _InMemory(headers, once(), max_files=FIELDS, max_fields=FIELDS, max_part_size=MEBIBYTE)
         form = await parser.parse()
     except (MultiPartException, KeyError, ValueError, LookupError) as error:
-        reason = getattr(error, "message", None) or "no boundary, or not as RFC 7578 has it"
-        raise Refused(400, f"not a form that can be read: {reason}") from error
+        reason = getattr(error, "message", None) or "no boundary, or a violation of RFC 7578"
+        raise Refused(400, f"not a readable form: {reason}") from error
     try:
         for name, value in form.multi_items():
             if isinstance(value, UploadFile):
@@ -162,7 +162,7 @@ async def _add_form(query: Query, headers: Headers, content: bytes) -> None:
         photo = form.get("photo")
         if isinstance(photo, UploadFile) and photo.filename:
             stem = PurePosixPath(photo.filename.replace("\\", "/")).stem[:LONGEST_NAME]
-            if stem:  # text in the answer, never the name of a file; a given name takes precedence
+            if stem:  # text in the answer, never a file name; a given name takes precedence
                 query.parameters.setdefault("name", stem)
     finally:
         await form.close()

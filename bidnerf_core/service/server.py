@@ -1,4 +1,4 @@
-"""The service on a port: ``serve``, which runs until it is stopped."""
+"""The service on a port: ``serve`` runs until it is stopped."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 PORT = 8000
 LOOPBACK = "127.0.0.1"
 HEAD_SECONDS = 10.0
-"""Time in which the head of a request must have arrived, since the connection was made or may be idle no longer."""
+"""Time for the head of a request to arrive, counted from the connection or from the end of its idle time."""
 IDLE_SECONDS = 15
 """Time for which a connection may be idle between two requests."""
 CONNECTIONS = 256
 """Open connections; a further one is closed at once."""
 GRACE = 10
-"""Seconds for requests at work when the service is told to end."""
+"""Seconds for running requests when the service shuts down."""
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 NAME = re.compile(r"[\w.-]{1,100}")
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
 Maps = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
-"""The folders of maps, by their own names or by given ones."""
+"""The folders of maps, named by themselves or explicitly."""
 
 
 def service_app(
@@ -47,13 +47,13 @@ def service_app(
     settings: Mapping[str, Any] | None = None,
     device: str = "cpu",
 ) -> Starlette:
-    """Return the service of the maps in some folders as an ASGI application, for a server of your own.
+    """Return the service for the maps in some folders as an ASGI application, for your own server.
 
-    ``method``, with ``settings`` of it by name, finds the poses on ``device``.
+    ``method``, with its ``settings`` by name, finds the poses on ``device``.
 
-    Its workers are processes of one thread each, started at the startup of ASGI's lifespan and ended at its shutdown. Without a
-    ``token`` it answers only requests that are addressed to localhost. Raises ``InputError`` for names and settings that cannot
-    be served, and without the extra ``serve``; a map that cannot be loaded raises it from the startup.
+    Its workers are single-threaded processes, started at ASGI startup and ended at shutdown. Without a
+    ``token`` it answers only requests addressed to localhost. Raises ``InputError`` for invalid names and
+    settings, and without the extra ``serve``; a map that cannot be loaded raises it at startup.
     """
     try:
         from bidnerf_core.service.app import application
@@ -79,10 +79,11 @@ def serve(
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
-    ``maps``: folders of maps, a list of them, or folders by the names under which clients ask for them. Only programs on this
-    machine are answered, unless a ``host``, such as 0.0.0.0, is named: clients then need the ``token``, which is made up where
-    none is given. ``port`` 0 takes a free one. ``ready`` is called with the address and the token once requests are answered.
-    Raises ``InputError`` for maps and settings that cannot be served, and for a port that is taken.
+    ``maps``: folders of maps, a list of them, or folders by the names under which clients ask for them. Only
+    programs on this machine are answered, unless a ``host``, such as 0.0.0.0, is given: clients then need the
+    ``token``, which is generated if none is given. ``port`` 0 picks a free one. ``ready`` is called with the
+    address and the token once requests are answered. Raises ``InputError`` for maps and settings that cannot
+    be served, and for a port that is taken.
     """
     try:
         import uvicorn  # noqa: F401 (tried before the maps are read)
@@ -90,7 +91,7 @@ def serve(
         raise InputError(NEEDS) from error
     if not hasattr(os, "fork"):
         raise InputError(
-            "this system has no fork, expected Linux or macOS, where workers share the memory of the maps"
+            "this system has no fork, but workers share the maps' memory by forking; use Linux or macOS"
         )
     from bidnerf_core.service.access import is_loopback
 
@@ -122,7 +123,7 @@ def run_app(
 
 
 def named(maps: Maps) -> dict[str, Path]:
-    """Return the folders of maps by name, by default their own names. Raises ``InputError`` for names that cannot be served."""
+    """Return the folders of maps by name, by default their own names. Raises ``InputError`` for invalid names."""
     if isinstance(maps, str | Path):
         maps = [maps]
     pairs = [*maps.items()] if isinstance(maps, Mapping) else [(Path(m).resolve().name, m) for m in maps]
@@ -131,11 +132,12 @@ def named(maps: Maps) -> dict[str, Path]:
     for name, folder in pairs:
         if not NAME.fullmatch(name) or name in (".", ".."):
             raise InputError(
-                f"{folder}: its name is {name!r}, expected letters, digits, '.', '-' and '_'; give it one: NAME=MAP"
+                f"{folder}: its name is {name!r}, expected letters, digits, '.', '-' and '_'; give it a"
+                " name: NAME=MAP"
             )
         if [other for other, _ in pairs].count(name) > 1:
             raise InputError(
-                f"{folder}: another map is named {name!r} as well; give it a name of its own: NAME=MAP"
+                f"{folder}: another map is also named {name!r}; give it a different name: NAME=MAP"
             )
     return {name: Path(folder) for name, folder in pairs}
 
@@ -152,7 +154,7 @@ def _bound(host: str, port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         bound.close()
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{host}:{port}: cannot be listened on ({reason}); choose another port") from error
+        raise InputError(f"{host}:{port}: cannot listen there ({reason}); choose another port") from error
     return bound
 
 
@@ -180,7 +182,9 @@ async def _run(
 
 @contextlib.asynccontextmanager
 async def _signals_end(server: Any) -> AsyncIterator[None]:
-    """Let the signals that ask a program to stop end the service, which is its normal end; the second one ends it at once."""
+    """Let the signals that ask a program to stop end the service, which is its normal end; a second one ends
+    it immediately.
+    """
 
     def end() -> None:
         server.force_exit = server.should_exit
@@ -201,7 +205,7 @@ async def _signals_end(server: Any) -> AsyncIterator[None]:
 
 
 def _patient() -> type[Any]:
-    """Return uvicorn's protocol with limits that it lacks: on the time of a request's head, and on connections."""
+    """Return uvicorn's protocol with additional limits: on the time of a request's head, and on connections."""
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     class Limited(H11Protocol):
@@ -213,12 +217,12 @@ def _patient() -> type[Any]:
             self.loop.call_later(HEAD_SECONDS, self._close_if_silent, None)
 
         def on_response_complete(self) -> None:
-            answered = self.cycle  # before the next request, which may have come already
+            answered = self.cycle  # before the next request, which may have arrived already
             super().on_response_complete()
             self.loop.call_later(IDLE_SECONDS + HEAD_SECONDS, self._close_if_silent, answered)
 
         def _close_if_silent(self, last: Any) -> None:
-            """Close the connection if no request has come since ``last``, whatever bytes did."""
+            """Close the connection if no request has arrived since ``last``, even if bytes have."""
             asked: Any = self.cycle  # None until the first request
             if asked is last:
                 self.transport.close()

@@ -1,4 +1,4 @@
-"""The settings of the service: what it serves, and the limits that it holds requests to."""
+"""The settings of the service: what it serves, and the limits on requests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bidnerf_core.errors import InputError
 
 MEBIBYTE = 2**20
 LEAST_TOKEN = 16
-"""Characters of a token, below which it could be guessed."""
+"""Minimum length of a token; shorter ones could be guessed."""
 
 
 def usual_workers() -> int:
@@ -24,13 +24,13 @@ def usual_workers() -> int:
 class ServiceConfig:
     """How many requests are served at a time, and the limits of each.
 
-    A request counts from the moment when its head has arrived: ``queue`` bounds the memory of uploads as well.
+    A request counts from the moment its head has arrived: ``queue`` bounds the memory of uploads as well.
     """
 
-    workers: int = 0  # processes that localize, each with one thread; 0: one for each core
-    queue: int = 16  # requests that may upload or wait beside those at work; others are answered with 429
-    timeout: float = 60.0  # seconds from a whole request to its answer; its worker is then stopped
-    upload_timeout: float = 20.0  # seconds in which a whole request must have arrived
+    workers: int = 0  # processes that localize, each with one thread; 0: one per core
+    queue: int = 16  # requests that may upload or wait besides those being processed; others get status 429
+    timeout: float = 60.0  # seconds from a complete request to its answer; its worker is then stopped
+    upload_timeout: float = 20.0  # seconds within which a complete request must arrive
     max_megabytes: float = 32.0  # size of a request (2^20 bytes)
     max_megapixels: float = 50.0  # size of an image, from its header, before it is decoded
 
@@ -50,7 +50,7 @@ class ServiceConfig:
 
     @property
     def places(self) -> int:
-        """The number of requests that may be uploading, waiting or at work at a time."""
+        """The number of requests that may be uploading, waiting or in progress at a time."""
         return self.processes + self.queue
 
     @property
@@ -61,10 +61,10 @@ class ServiceConfig:
 
 @dataclass(frozen=True)
 class ChosenMethod:
-    """How poses are found, and where."""
+    """How poses are found, and on which device."""
 
     name: str = "auto"
-    settings: Mapping[str, Any] | None = None  # of the method, by name; the others have their defaults
+    settings: Mapping[str, Any] | None = None  # of the method, by name; the others keep their defaults
     device: str = "cpu"
 
 
@@ -72,6 +72,7 @@ def checked_token(token: str | None) -> str | None:
     """Return a token. Raises ``InputError`` for one that is short or that a header cannot hold."""
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
         raise InputError(
-            f"the token has {len(token)} characters, expected {LEAST_TOKEN} or more of printable ASCII"
+            f"the token has {len(token)} characters, expected at least {LEAST_TOKEN} printable ASCII"
+            " characters"
         )
     return token

@@ -21,7 +21,7 @@ NUMPY, HEIF_BRANDS = b"\x93NUMPY", (b"heic", b"heix", b"hevc", b"mif1", b"msf1",
 
 @dataclass(frozen=True)
 class Upload:
-    """A photo and what is known about it, as they came with a request: no value is ever the name of a file."""
+    """A photo and what is known about it, as sent with a request: no value is ever used as a file name."""
 
     parameters: Mapping[str, Any]
     blocks: Mapping[str, bytes]
@@ -65,7 +65,7 @@ class Upload:
 
 
 def _written(folder: Path, name: str, content: bytes) -> Path:
-    """Write an image under a name whose ending the readers go by."""
+    """Write an image under a name with the extension that readers expect."""
     ending = ".npy" if content.startswith(NUMPY) else ""
     if content[4:8] == b"ftyp" and content[8:12] in HEIF_BRANDS:
         ending = ".heic"

@@ -14,11 +14,11 @@ Message: TypeAlias = tuple[dict[str, Any], dict[str, bytes]]
 LENGTH = struct.Struct(">Q")
 SIZES = "sizes"
 ANOTHER = b"w"
-"""The byte that asks for a worker; the socket that the worker is to serve comes with it."""
+"""The byte that requests a worker; it comes with the socket that the worker will serve."""
 
 
 def packed(head: Mapping[str, Any], blocks: Mapping[str, bytes] | None = None) -> list[bytes]:
-    """Return the parts of a message as they are sent one after another."""
+    """Return the parts of a message in sending order."""
     blocks = blocks or {}
     sizes = {name: len(block) for name, block in blocks.items()}
     text = json.dumps({**head, SIZES: sizes}).encode()
@@ -32,7 +32,7 @@ def send(connection: socket.socket, head: Mapping[str, Any]) -> None:
 
 
 def receive(connection: socket.socket) -> Message | None:
-    """Wait for a message; return None where the other process has closed the connection."""
+    """Wait for a message; return None if the other process has closed the connection."""
     prefix = _exactly(connection, LENGTH.size)
     if prefix is None:
         return None
@@ -50,7 +50,7 @@ def receive(connection: socket.socket) -> Message | None:
 
 
 def _exactly(connection: socket.socket, count: int) -> bytes | None:
-    """Return the next ``count`` bytes, or None where the connection ends before them."""
+    """Return the next ``count`` bytes, or None if the connection ends before them."""
     found, view = bytearray(count), 0
     while view < count:
         try:
@@ -64,7 +64,7 @@ def _exactly(connection: socket.socket, count: int) -> bytes | None:
 
 
 async def read(reader: asyncio.StreamReader) -> dict[str, Any]:
-    """Read a message without blocks. Raises ``EOFError`` or ``ConnectionError`` where the connection ends."""
+    """Read a message without blocks. Raises ``EOFError`` or ``ConnectionError`` if the connection ends."""
     (length,) = LENGTH.unpack(await reader.readexactly(LENGTH.size))
     head: dict[str, Any] = json.loads(await reader.readexactly(length))
     head.pop(SIZES)

@@ -1,4 +1,6 @@
-"""A worker: reads a photo from the bytes of a request, localizes it in a map, and returns the JSON of ``bidnerf localize``."""
+"""A worker: reads a photo from the bytes of a request, localizes it in a map, and returns the JSON of
+``bidnerf localize``.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ from bidnerf_core.service.upload import Upload
 
 OK, UNUSABLE, FAULT = 200, 422, 500
 TOLD = ("backend", "cameras", "landmarks", "surfels", "distances", "bounds", "complete", "bidnerf")
-"""The facts about a map that clients may know. The others name photos and folders."""
+"""The facts about a map that clients may see. The others name photos and folders."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Served:
 
     @property
     def described(self) -> dict[str, Any]:
-        """What clients may know of the map."""
+        """Facts about the map that clients may see."""
         facts = self.scene.describe().plain()
         return {key: facts[key] for key in TOLD} | {
             "anchor": None if self.scene.anchor is None else self.scene.anchor.plain()
@@ -41,18 +43,18 @@ class Served:
 
 @dataclass(frozen=True)
 class Worker:
-    """All that is needed to answer requests, loaded before workers are forked."""
+    """Everything needed to answer requests, loaded before workers are forked."""
 
     maps: Mapping[str, Served]
     max_pixels: float
-    folder: Path  # where the files of requests lie, each request's in a folder of its own
+    folder: Path  # where request files are stored, each request in its own folder
     device: str
 
     @staticmethod
     def load(maps: Mapping[str, Path], method: ChosenMethod, max_pixels: float, folder: Path) -> Worker:
-        """Load maps by name. Raises ``InputError`` where one cannot be served.
+        """Load maps by name. Raises ``InputError`` if one cannot be served.
 
-        On another device than the CPU, a localizer is made by each worker for itself: no accelerator survives a fork.
+        On devices other than the CPU, each worker creates its own localizer: no accelerator survives a fork.
         """
         config = settings_of(method.name, dict(method.settings or {}), "settings")
         served = dict[str, Served]()
@@ -88,7 +90,7 @@ class Worker:
         return Worker(moved, self.max_pixels, self.folder, self.device)
 
     def answer(self, request: dict[str, Any], blocks: Mapping[str, bytes]) -> dict[str, Any]:
-        """Return the status and the body of the answer to a request."""
+        """Return the status and body of the response to a request."""
         folder = self.folder / request["id"]
         try:
             folder.mkdir(mode=0o700)
@@ -101,13 +103,15 @@ class Worker:
             return {"status": OK, "body": plain, "outcome": str(answer.found.outcome)}
         except InputError as error:
             return {"status": UNUSABLE, "detail": str(error).replace(f"{folder}{os.sep}", "")}
-        except Exception as error:  # a fault of ours: the worker lives on, and the log says what happened
+        except (
+            Exception
+        ) as error:  # an internal error: the worker continues, and the log states what happened
             return {"status": FAULT, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _localize(self, served: Served, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
-        """Localize a photo; return the answer, and its JSON values as ``bidnerf localize --json`` prints them."""
+        """Localize a photo; return the answer, and its JSON values as printed by ``bidnerf localize --json``."""
         photos, start = upload.read(served.localizer, folder, self.max_pixels)
         seed = int(upload.parameters.get("seed") or 0)
         answers = localize_each(served.localizer, photos, start=lambda _: start, seed=seed)

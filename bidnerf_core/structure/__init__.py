@@ -1,1 +1,1 @@
-"""Structure from motion: the cameras and poses of photos and videos that come without any, by COLMAP (extra ``sfm``)."""
+"""Structure from motion: cameras and poses for photos and videos without any, using COLMAP (extra ``sfm``)."""

@@ -1,7 +1,7 @@
 """Keypoints of photos in COLMAP's database, with the cameras that probably took the photos.
 
-Photos of one size whose EXIF states the same lens share a camera. Its focal length begins as EXIF states it, or as that of a
-usual lens, and is estimated with the poses. A camera that is given stays as it is.
+Photos of the same size whose EXIF states the same lens share a camera. Its initial focal length is that of
+EXIF, or a typical one, and is estimated with the poses. A given camera is kept fixed.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from bidnerf_core.structure.library import to_colmap
 from bidnerf_core.structure.sources import SourceImage
 
 LARGEST = 1600
-"""Pixels along the longer side to which photos are reduced: more give somewhat more accurate poses, but take far longer."""
+"""Pixels along the longer side to which photos are downscaled: more give slightly more accurate poses, but
+take far longer."""
 DETECTOR = Sift(count=4096, largest=LARGEST)
 USUAL_FOCAL = 1.2
-"""Focal length, in longer sides of the image, of a camera of which nothing is known (COLMAP's default)."""
+"""Focal length, relative to the image's longer side, of an unknown camera (COLMAP's default)."""
 HALF = 0.5
 """Opacity below which a pixel shows the background."""
 
 
 @dataclass(frozen=True)
 class ListedPhoto:
-    """A photo that can be read: its size as stored, that at which its keypoints are found, and its number of a camera."""
+    """A readable photo: its size as stored, the size at which its keypoints are found, and the number of its camera."""
 
     image: SourceImage
     number: int  # in the database, from 1
@@ -51,7 +52,7 @@ class ListedPhoto:
 
 @dataclass(frozen=True)
 class Described:
-    """The photos that can be read, and why the others cannot."""
+    """The readable photos, and why the others cannot be read."""
 
     photos: list[ListedPhoto]
     cameras: dict[int, Intrinsics]  # of reduced photos, by number
@@ -60,7 +61,9 @@ class Described:
 
 
 def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> Described:
-    """Read the headers of photos, and group the photos by camera. Raises ``InputError`` for a ``given`` camera that does not fit."""
+    """Read the headers of photos, and group the photos by camera. Raises ``InputError`` for a ``given``
+    camera that does not fit.
+    """
     photos, unusable = list[ListedPhoto](), dict[str, str]()
     for number, image in enumerate(images, start=1):
         try:
@@ -95,12 +98,12 @@ def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> t
 
 
 def key(number: int) -> str:
-    """Return the name of a photo in the database; its own may hold blanks, which COLMAP's lists of pairs do not allow."""
+    """Return the name of a photo in the database; its own may contain blanks, which COLMAP's pair lists do not allow."""
     return f"{number:06d}"
 
 
 def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -> None:
-    """Write cameras and photos to an empty database. The lens of a camera that is not ``fixed`` has one radial coefficient."""
+    """Write cameras and photos to an empty database. A camera that is not ``fixed`` has one radial coefficient."""
     with pycolmap.DatabaseTransaction(database):
         for number, intrinsics in found.cameras.items():
             camera = (
@@ -129,9 +132,10 @@ def _unknown(guess: Intrinsics, number: int, pycolmap: Any) -> Any:
 def write_keypoints(
     database: Any, found: Described, pycolmap: Any, count: Callable[[int, int], None]
 ) -> dict[str, str]:
-    """Find the keypoints that the database lacks, and return why photos could not be decoded, by name.
+    """Find the keypoints missing from the database, and return by name why photos could not be decoded.
 
-    ``count`` receives the number of photos that are done, and may raise to stop; what was found until then is stored.
+    ``count`` receives the number of photos done, and may raise to stop; keypoints found until then are
+    stored.
     """
     missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
     done, total = len(found.photos) - len(missing), len(found.photos)
@@ -156,7 +160,7 @@ def _detected(photos: Sequence[ListedPhoto]) -> Iterator[tuple[ListedPhoto, Keyp
 
 
 def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
-    """Return the keypoints of the reduced photo, without those on its background."""
+    """Return the keypoints of the downscaled photo, without those on its background."""
     try:
         rgb, alpha = read_image(photo.image.file, size=photo.reduced)
     except InputError as error:
@@ -176,5 +180,5 @@ def _write(database: Any, number: int, found: Keypoints, pycolmap: Any) -> None:
 
 
 def _without_file(error: InputError, image: SourceImage) -> str:
-    """Return a message without the file's path in front, which stands beside it anyway."""
+    """Return a message without the leading file path, which is shown next to it anyway."""
     return str(error).removeprefix(f"{image.file}: ")

@@ -9,11 +9,11 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 
 NEWEST_NEEDED = "CancellationToken"
-"""A name that pycolmap has from version 4.2 on, which is the oldest that serves."""
+"""A name that exists in pycolmap from 4.2 on, the oldest supported version."""
 
 
 def pycolmap_for(what: str) -> Any:
-    """Return the module pycolmap, silenced. Raises ``InputError``, which begins with ``what``, where it is not installed."""
+    """Import pycolmap, silenced. Raises ``InputError``, whose message begins with ``what``, if it is not installed."""
     try:
         import pycolmap
     except ImportError as error:
@@ -29,9 +29,9 @@ def pycolmap_for(what: str) -> Any:
 
 
 def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
-    """Return a camera for pycolmap, whose pixel coordinates follow the same convention as ``Intrinsics``.
+    """Convert to a pycolmap camera, whose pixel coordinates follow the same convention as ``Intrinsics``.
 
-    Raises ``InputError`` for a lens that COLMAP has no model of.
+    Raises ``InputError`` for a lens without a COLMAP model.
     """
     model, parameters = colmap_model(intrinsics)
     return pycolmap.Camera(
@@ -40,7 +40,7 @@ def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
 
 
 def from_colmap(camera: Any) -> Intrinsics:
-    """Return the intrinsics of one of pycolmap's cameras with a perspective lens."""
+    """Return the intrinsics of a pycolmap camera with a perspective lens."""
     found = colmap_camera("COLMAP", camera.model.name, camera.width, camera.height, list(camera.params))
     if not isinstance(found, Intrinsics):
         raise InputError(f"COLMAP: camera model {camera.model.name}, expected one of a perspective lens")

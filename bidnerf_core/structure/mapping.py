@@ -1,4 +1,4 @@
-"""Placing photos: COLMAP's incremental mapper, and the model that is kept."""
+"""Placing photos: COLMAP's incremental mapper, and the choice of the model that is kept."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from bidnerf_core.structure.keypoints import Described, ListedPhoto
 from bidnerf_core.structure.matching import Overlaps
 
 LEAST_PHOTOS = 3
-"""Photos of the smallest model: two have one baseline, from which no camera can be checked."""
+"""Photos in the smallest model: two have a single baseline, which allows no check."""
 LEAST_POINTS = 15
-"""Triangulated points that a placed photo must show. COLMAP also places photos by matches without depth, which it finds in
-photos from one place.
+"""Triangulated points that a placed photo must show. COLMAP also places photos by matches without depth,
+which occur between photos from one place.
 """
 FEW_KEYPOINTS = 100
-"""Number of keypoints below which a photo that is left out shows too little."""
+"""Number of keypoints below which an unplaced photo is reported as showing too little."""
 MOST_MODELS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """The reconstructions of the photos, the largest first; parts of the photos that share nothing have one each."""
+    """The reconstructions of the photos, largest first; parts without overlap have one each."""
 
     all: list[Any]
 
@@ -47,9 +47,10 @@ def reconstructed(
     database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any,
     count: Callable[[int, int], None],
 ) -> Models:  # fmt: skip
-    """Place the photos of a database, with the cameras as they are if they are ``fixed``; models are written to ``folder``.
+    """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to
+    ``folder``.
 
-    ``count`` receives the number of photos that are placed, and may raise to stop. There may be no model at all.
+    ``count`` receives the number of photos placed, and may raise to stop. There may be no model at all.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,
@@ -87,7 +88,7 @@ def reconstructed(
 
 
 def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -> None:
-    """Turn the world of a model so that z points up, and move its origin to the middle of the cameras."""
+    """Rotate the world of a model so that z points up, and move its origin to the middle of the cameras."""
     rotations, centres = [], []
     for number in model.reg_image_ids():
         image = model.image(number)
@@ -103,7 +104,7 @@ def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -
 
 
 def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
-    """Return the axes to the right and up of the upright photo, in the camera of the photo as stored (x right, y down)."""
+    """Return the right and up axes of the upright photo, in the camera of the photo as stored (x right, y down)."""
     turned = photo.orientation
     x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
     if turned.transposes:
@@ -112,7 +113,7 @@ def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation that takes a unit vector to the z axis."""
+    """Return the smallest rotation that maps a unit vector to the z axis."""
     x, y, z = direction
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
@@ -122,7 +123,7 @@ def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
 
 
 def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
-    """Scale the cameras and keypoints of a model from reduced photos to photos as stored."""
+    """Scale the cameras and keypoints of a model from downscaled photos to photos as stored."""
     sizes = {photo.camera: photo for photo in photos.values()}
     for number, photo in sizes.items():
         if model.exists_camera(number):
@@ -138,7 +139,7 @@ def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
 def left_out(
     found: Described, models: Models, overlaps: Overlaps, keypoints: Mapping[int, int]
 ) -> dict[str, str]:
-    """Return why photos are in no model or not in the largest, by name; ``keypoints`` are numbers of them."""
+    """Return by name why photos are in no model, or not in the largest; ``keypoints`` are their numbers of keypoints."""
     of_model = {
         number: place
         for place, model in reversed(list(enumerate(models.all)))
@@ -157,9 +158,11 @@ def left_out(
 def _reason(photo: ListedPhoto, model: int | None, overlaps: Overlaps, keypoints: Mapping[int, int]) -> str:
     count, partners = keypoints.get(photo.number, 0), overlaps.partners[photo.number]
     if model is not None:
-        return f"belongs to another model, of {amount(model, 'photo')}, that the largest has no connection to"
+        return (
+            f"belongs to another model, with {amount(model, 'photo')}, that has no connection to the largest"
+        )
     if not partners and count < FEW_KEYPOINTS:
-        return f"has {amount(count, 'keypoint')}: a plain surface, blurred, or dark"
+        return f"has only {amount(count, 'keypoint')}: a plain surface, blurred, or dark"
     if not partners:
-        return "shows the same as no other photo, by its keypoints"
-    return f"shows the same as {amount(partners, 'other photo')}, but too little of what the placed ones show"
+        return "overlaps with no other photo, judging by its keypoints"
+    return f"overlaps with {amount(partners, 'other photo')}, but too little with the placed ones"

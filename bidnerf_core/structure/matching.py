@@ -1,4 +1,4 @@
-"""Matching the keypoints of pairs of photos, and checking the matches by the geometry of two views, by COLMAP."""
+"""Matching the keypoints of pairs of photos, and verifying the matches by two-view geometry, using COLMAP."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from bidnerf_core.structure.keypoints import key
 from bidnerf_core.structure.pairs import Pairs
 
 FIRST_BATCH, BATCH_SECONDS = 32, 2.0
-"""Pairs that are matched at first without an interruption, and how long later batches take."""
+"""Number of pairs in the first uninterruptible batch, and duration (seconds) of later batches."""
 FROM_ONE_PLACE = ("PANORAMIC", "PLANAR_OR_PANORAMIC")
-"""Configurations of pairs that show no parallax."""
+"""Configurations of pairs without parallax."""
 
 
 def match(
     database: Path, numbers: Sequence[int], pairs: Pairs, threads: int, pycolmap: Any,
     count: Callable[[int, int], None],
 ) -> None:  # fmt: skip
-    """Match those of the ``pairs`` of photos that the database lacks; ``numbers`` are those of the photos in the database.
+    """Match the ``pairs`` of photos that are missing from the database; ``numbers`` are the photos' numbers
+    there.
 
-    ``count`` receives the number of pairs that are done, and may raise to stop; what was found until then is stored.
+    ``count`` receives the number of pairs done, and may raise to stop; matches found until then are stored.
     """
     with pycolmap.Database.open(database) as stored:
         todo = [(i, j) for i, j in pairs if not stored.exists_two_view_geometry(numbers[i], numbers[j])]
@@ -48,10 +49,10 @@ def match(
 
 
 class Overlaps:
-    """What the matches of a database say about the photos."""
+    """Which photos overlap according to a database's matches."""
 
     def __init__(self, database: Any, pycolmap: Any) -> None:
-        self.partners: Counter[int] = Counter()  # photos that show the same as each, by number
+        self.partners: Counter[int] = Counter()  # number of photos that each overlaps with, by number
         self.pairs = self.from_one_place = 0
         still = [int(getattr(pycolmap.TwoViewGeometryConfiguration, name)) for name in FROM_ONE_PLACE]
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
@@ -63,5 +64,5 @@ class Overlaps:
 
     @property
     def without_parallax(self) -> bool:
-        """Whether most pairs look as if the camera was turned only."""
+        """Whether most pairs look as if the camera had only rotated."""
         return self.pairs > 0 and self.from_one_place > self.pairs / 2

@@ -1,8 +1,9 @@
-"""Which photos are matched with each other: all of few; of many, neighbours in their order and those that look alike.
+"""Which photos are matched with each other: all pairs of few photos; of many, neighbours in order and similar
+ones.
 
-Neighbours are likely to overlap as photos and frames are taken one after another. Photos that look alike close loops, and
-connect photos that are in no order. How alike two photos are is the product of their vectors of locally aggregated descriptors
-(VLAD, Jégou et al. 2010), whose words are found in the photos themselves.
+Neighbours are likely to overlap since photos and frames are taken one after another. Similar photos close
+loops, and connect photos in arbitrary order. The similarity of two photos is the product of their vectors of
+locally aggregated descriptors (VLAD, Jégou et al. 2010), whose words are found in the photos themselves.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ Pairs: TypeAlias = list[tuple[int, int]]
 """Pairs (i < j) of indices of photos."""
 
 ALL_OF_PHOTOS, ALL_OF_FRAMES = 150, 60
-"""Largest number of photos, and of a video's frames, of which all pairs are matched."""
+"""Largest number of photos, and of video frames, for which all pairs are matched."""
 NEIGHBOURS = 10
-"""Photos on either side in the order of the names, or of time, with which each is matched."""
+"""Number of photos on either side, in order of name or time, with which each is matched."""
 ALIKE = 20
-"""Photos that look most alike with which each is matched."""
+"""Number of most similar photos with which each is matched."""
 BLOCK = 1000
-"""Photos that are compared with all others at a time."""
+"""Number of photos compared with all others at a time."""
 
 
 def all_pairs(count: int) -> Pairs:
@@ -34,12 +35,12 @@ def all_pairs(count: int) -> Pairs:
 
 
 def few(count: int, ordered: bool) -> bool:
-    """Return whether all pairs of so many photos are matched; ``ordered`` are frames of a video."""
+    """Return whether all pairs of this many photos are matched; ``ordered`` are frames of a video."""
     return count <= (ALL_OF_FRAMES if ordered else ALL_OF_PHOTOS)
 
 
 def chosen_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
-    """Return the pairs of photos, given the descriptors (n, 128) of each, that are neighbours or look alike."""
+    """Return the pairs of photos that are neighbours or look similar, given the descriptors (n, 128) of each photo."""
     count = len(descriptors)
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
     vectors = _pooled(descriptors)
@@ -55,7 +56,7 @@ def chosen_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
 
 
 def _pooled(descriptors: Sequence[np.ndarray]) -> np.ndarray:
-    """Return one vector of unit length for the descriptors (n, d) of each photo; zero where there are none."""
+    """Return one unit vector for the descriptors (n, d) of each photo; zero if there are none."""
     found = [torch.from_numpy(own) for own in descriptors]
     vocabulary = Vocabulary.of([own for own in found if len(own)] or [torch.zeros((1, 1), dtype=torch.uint8)])
     zero = torch.zeros(vocabulary.words.numel())

@@ -1,4 +1,4 @@
-"""Finding the poses of photos that have none: from a folder of photos, or a video, to a dataset."""
+"""Finding poses for photos without any: from a folder of photos, or a video, to a dataset."""
 
 from __future__ import annotations
 
@@ -68,20 +68,22 @@ def find_poses(
     *,
     reuse: bool = False,
 ) -> FoundPoses:
-    """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset into ``out``.
+    """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset
+    into ``out``.
 
-    ``photos`` is a folder of photos, or a video, of which frames are chosen by motion and sharpness and written as images.
-    ``camera`` (intrinsics or a file of them) is kept as it is; without it, focal length and radial distortion are estimated,
-    beginning with EXIF. If the photos fall into several models, the largest is kept.
+    ``photos`` is a folder of photos, or a video, from which frames are chosen by motion and sharpness and
+    written as images. ``camera`` (intrinsics or a file of them) is kept fixed; without it, focal length and
+    radial distortion are estimated, starting from EXIF. If the photos fall into several models, the largest
+    is kept.
 
-    The dataset is a ``transforms.json`` that refers to the photos where they are; ``poses.json`` lists those that were left out
-    and why, and ``sparse/0`` is the model for COLMAP. The unit of length is arbitrary, and z points up. Work that was
-    interrupted in the same folder goes on; poses that were found there for the same photos are returned at once, unless
-    ``overwrite`` is set and ``reuse`` is not.
+    The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` lists those that
+    were left out and why, and ``sparse/0`` is the model for COLMAP. The unit of length is arbitrary, and z
+    points up. Interrupted work in the same folder is resumed; poses already found for the same photos are
+    returned immediately, unless ``overwrite`` is set and ``reuse`` is not.
 
-    ``progress`` receives each step; once ``cancel`` returns True, ``Cancelled`` is raised. Raises ``InputError`` where fewer than
-    three photos can be read or placed, where poses are known already, where the folder holds something else and
-    ``overwrite`` is not set, and where pycolmap is missing.
+    ``progress`` receives each step; once ``cancel`` returns True, ``Cancelled`` is raised. Raises
+    ``InputError`` if fewer than three photos can be read or placed, if poses are already known, if the folder
+    holds something else and ``overwrite`` is not set, and if pycolmap is missing.
     """
     source, folder = Path(photos), Path(out)
     pycolmap = pycolmap_for(str(source))
@@ -89,7 +91,7 @@ def find_poses(
     inputs = digest([image.file for image in images] or [_video(source)], camera)
     known = found_before(folder, inputs, overwrite) if reuse or not overwrite else None
     if known is not None:
-        log.info(f"{folder}: has the poses of these photos already")
+        log.info(f"{folder}: already has the poses of these photos")
         return known
     with _folder(folder, inputs, overwrite):
         if overwrite and not reuse:
@@ -98,7 +100,7 @@ def find_poses(
         try:
             return _Search(source, folder, work, inputs, camera, progress, cancel, pycolmap).run(images)
         except Cancelled as stopped:
-            raise Cancelled(f"{folder}: {stopped}; the same command goes on from there") from stopped
+            raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
             give_up(folder)
             raise
@@ -114,7 +116,7 @@ def found_before(folder: Path, inputs: str, overwrite: bool) -> FoundPoses | Non
     except InputError as error:
         if not overwrite:
             raise
-        log.info(f"{error}; the poses are found anew")
+        log.info(f"{error}; finding the poses again")
         return None
     return known if known is not None and known.inputs == inputs else None
 
@@ -127,7 +129,7 @@ def _video(path: Path) -> Path:
 
 @contextlib.contextmanager
 def _folder(out: Path, inputs: str, overwrite: bool) -> Iterator[None]:
-    """Hold the lock of the folder of the poses, which is empty, or holds interrupted work on the same photos."""
+    """Hold the lock of the pose folder, which is empty, or holds interrupted work on the same photos."""
     goes_on = begun_with(out) == inputs or gives_way(out)
 
     def describe(folder: Path) -> str | None:
@@ -140,7 +142,7 @@ def _folder(out: Path, inputs: str, overwrite: bool) -> Iterator[None]:
 
 
 class _Search:
-    """One search for the poses of some photos."""
+    """A single search for the poses of some photos."""
 
     def __init__(
         self, source: Path, folder: Path, work: Path, inputs: str, camera: Intrinsics | str | Path | None,
@@ -179,7 +181,7 @@ class _Search:
         return counter(stage, unit, self._progress, self._cancel)
 
     def _frames(self) -> list[SourceImage]:
-        """Return the chosen frames of a video, which are written as images unless they were before."""
+        """Return the chosen frames of a video, written as images unless that was done before."""
         listed = self._work / "frames.json"
         known = stored_rows(listed, tuple[str, str, float])
         if known is not None and all(Path(file).is_file() for _, file, _ in known):
@@ -204,8 +206,8 @@ class _Search:
         if self._camera is not None:
             focal = "as given"
         log.info(
-            f"{self._source}: no poses known; finding them for {amount(len(found.photos), 'photo')} of {size},"
-            f" {amount(len(found.cameras), 'camera')}, focal length {focal}"
+            f"{self._source}: no known poses; finding them for {amount(len(found.photos), 'photo')} of"
+            f" {size}, {amount(len(found.cameras), 'camera')}, focal length {focal}"
         )
         return found
 
@@ -251,7 +253,7 @@ class _Search:
         if pairs is None:
             with self._pycolmap.Database.open(self._database) as database:
                 pairs = chosen_pairs([database.read_descriptors(number).data for number in numbers])
-            log.info(f"{self._source}: {len(pairs)} pairs of neighbours and of photos that look alike")
+            log.info(f"{self._source}: {len(pairs)} pairs of neighbours and similar photos")
             write_file(stored, json.dumps(pairs).encode())
         return pairs
 
@@ -285,7 +287,7 @@ def _unplaced(found: Described, overlaps: Overlaps) -> str:
     """Return why no three photos could be placed."""
     of = f"no three of {amount(len(found.photos), 'photo')} could be placed"
     if not overlaps.pairs:
-        return f"{of}: no two show enough of the same"
+        return f"{of}: no two of them overlap enough"
     if overlaps.without_parallax:
-        return f"{of}: they look as if taken from one place, which shows no distances"
-    return f"{of}, though {amount(overlaps.pairs, 'pair')} show the same"
+        return f"{of}: they seem to be taken from one place, which does not determine distances"
+    return f"{of}, although {amount(overlaps.pairs, 'pair')} overlap"

@@ -1,7 +1,4 @@
-"""What was found of photos without poses, and the files of a folder of poses.
-
-``poses.json`` is written last: a folder that holds it is complete.
-"""
+"""The result for photos without poses, and the files of a pose folder."""
 
 from __future__ import annotations
 
@@ -34,41 +31,41 @@ log = logging.getLogger("bidnerf")
 Row = TypeVar("Row")
 RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
 DATABASE = "database.db"
-"""The file of keypoints and matches in the folder of the work."""
+"""The file of keypoints and matches in the work folder."""
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 FRAME_FILE = re.compile(r"\d{6,}\.jpg")
 LARGEST_NAMED = 5
-"""Photos that a remark names."""
+"""Number of photos named in a remark."""
 
 
 @dataclass(frozen=True)
 class LeftOut:
     """A photo without a pose."""
 
-    photo: str  # its name, as a frame of the dataset would be called
-    file: str  # relative to the folder of the poses
+    photo: str  # its name, as the dataset would name the frame
+    file: str  # relative to the pose folder
     reason: str
 
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """The poses that structure from motion found; the dataset beside this record holds them.
+    """Poses found by structure from motion; the dataset next to this record holds them.
 
-    The world has the unit of the first pair of photos, not metres, and z points up as far as the photos tell. ``str()`` of it
-    is a summary for people.
+    The unit of the world is that of the first pair of photos, not metres, and z points up as far as the
+    photos show. ``str()`` gives a human-readable summary.
     """
 
     source: str  # name of the folder of photos, or of the video
-    photos: int  # with those that cannot be read
+    photos: int  # including those that cannot be read
     placed: int  # photos with a pose
-    models: tuple[int, ...]  # photos of each model, the largest first; only this one is in the dataset
+    models: tuple[int, ...]  # number of photos of each model, largest first; only this one is in the dataset
     left_out: tuple[LeftOut, ...]
     points: int  # triangulated points of the largest model
-    reprojection_error: float  # mean, in pixels of photos of at most 1600 pixels
+    reprojection_error: float  # mean, in pixels of photos downscaled to at most 1600 pixels
     seconds: float  # of the run that finished
     inputs: str  # digest of the names, sizes and times of the files, and of the camera
     pycolmap: str  # its version
-    video: bool = False  # whether the photos are frames of a video, which were written beside this record
+    video: bool = False  # whether the photos are frames of a video, which were written next to this record
 
     def __str__(self) -> str:
         lines = [
@@ -78,7 +75,8 @@ class FoundPoses:
         if len(self.models) > 1:
             sizes = ", ".join(map(str, self.models))
             lines.append(
-                f"the photos fall into {len(self.models)} models without a connection, of {sizes} photos; the largest is kept"
+                f"the photos fall into {len(self.models)} unconnected models of {sizes} photos; the largest"
+                " is kept"
             )
         lines += [f"left out {left.photo}: {left.reason}" for left in self.left_out[:LARGEST_NAMED]]
         more = len(self.left_out) - LARGEST_NAMED
@@ -88,14 +86,14 @@ class FoundPoses:
 
 
 def digest(files: Sequence[Path], camera: Intrinsics | str | Path | None) -> str:
-    """Return what identifies the photos and the way in which their poses are sought."""
+    """Return a digest of the photos and of how their poses are sought."""
     facts = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
     given = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]
     return hashlib.blake2b(json.dumps([facts, given]).encode(), digest_size=16).hexdigest()
 
 
 def read_found(folder: Path) -> FoundPoses | None:
-    """Return the record in a folder of poses, or None where there is none. Raises ``InputError`` for a damaged one."""
+    """Load the record in a pose folder, or None if there is none. Raises ``InputError`` for a damaged one."""
     if not (folder / RECORD).is_file() or not (folder / TRANSFORMS).is_file():
         return None
     return from_plain(
@@ -104,17 +102,19 @@ def read_found(folder: Path) -> FoundPoses | None:
 
 
 def begun_with(folder: Path) -> str | None:
-    """Return the digest of the photos with which interrupted work in a folder was begun, or None where there is none."""
+    """Return the digest of the photos with which interrupted work in a folder began, or None if there is none."""
     return _begun(folder).get("inputs")
 
 
 def gives_way(folder: Path) -> bool:
-    """Return whether the work in a folder came to an end without poses, so that it may make room for that on other photos."""
+    """Return whether the work in a folder ended without poses, so that work on other photos may replace it."""
     return _begun(folder).get("failed") is True
 
 
 def give_up(folder: Path) -> None:
-    """Keep the keypoints and matches of photos without poses for another try with the same photos, or remove all if there are none."""
+    """Keep the keypoints and matches of photos without poses for another attempt with the same photos, or
+    remove everything if there are none.
+    """
     if not (folder / WORK / DATABASE).exists():
         clear(folder)
         return
@@ -123,7 +123,7 @@ def give_up(folder: Path) -> None:
 
 
 def without_damage(database: Path) -> Path:
-    """Return the path of a database, which is removed if it is damaged."""
+    """Return the path of a database; the database is removed if it is damaged."""
     if not database.exists():
         return database
     try:
@@ -132,20 +132,20 @@ def without_damage(database: Path) -> Path:
     except sqlite3.DatabaseError as error:
         found = str(error)
     if found != "ok":
-        log.info(f"{database}: damaged ({found}); its keypoints are found anew")
+        log.info(f"{database}: damaged ({found}); finding its keypoints again")
         for file in database.parent.glob(f"{database.name}*"):  # with SQLite's journals
             file.unlink()
     return database
 
 
 def stored_rows(file: Path, kind: type[Row]) -> list[Row] | None:
-    """Return what a file of the work lists; None where there is no such file, or a damaged one, which is to be made anew."""
+    """Return the rows in a work file; None if there is no such file, or a damaged one, which must be recreated."""
     if not file.exists():
         return None
     try:
         rows: list[Row] = converted(list[kind], read_json(file, "a list"), str(file))  # type: ignore[valid-type]
     except InputError as error:
-        log.info(f"{error}; it is made anew")
+        log.info(f"{error}; recreating it")
         return None
     return rows
 
@@ -159,16 +159,17 @@ def _begun(folder: Path) -> dict[str, Any]:
 
 
 def begin(folder: Path, inputs: str, video: bool) -> Path:
-    """Return the folder of the work, emptied unless it was begun with the same inputs.
+    """Return the work folder, emptied unless it was begun with the same inputs.
 
-    Raises ``InputError`` where the frames of a video would be written among images that are not such frames.
+    Raises ``InputError`` if the frames of a video would be written among other images.
     """
     work = folder / WORK
     if begun_with(folder) != inputs:
         clear(folder)
         if video and (folder / FRAMES).exists():
             raise InputError(
-                f"{folder / FRAMES}: exists already, and the frames of the video would be written into it; name another folder"
+                f"{folder / FRAMES}: exists already, and the video's frames would be written into it; name"
+                " another folder"
             )
         work.mkdir(parents=True, exist_ok=True)
     write_file(work / "begun.json", json.dumps({"inputs": inputs, "video": video}).encode())
@@ -176,14 +177,16 @@ def begin(folder: Path, inputs: str, video: bool) -> Path:
 
 
 def is_ours(file: Path) -> bool:
-    """Return whether a file or folder in a folder of poses is one that this module writes."""
+    """Return whether a file or folder in a pose folder was written by this module."""
     if file.name == FRAMES:
         return file.is_dir() and all(FRAME_FILE.fullmatch(each.name) for each in file.iterdir())
     return file.name in (RECORD, TRANSFORMS, WORK, MODEL.partition("/")[0])
 
 
 def clear(folder: Path) -> None:
-    """Remove all that this module wrote; other files stay, such as photos in a folder that is called as that of frames is."""
+    """Remove everything that this module wrote; other files stay, such as photos in a folder with the same
+    name as the frames folder.
+    """
     (folder / TRANSFORMS).unlink(missing_ok=True)  # first: without it, the record counts as incomplete
     if _has_frames(folder) and (folder / FRAMES).is_dir() and is_ours(folder / FRAMES):
         shutil.rmtree(folder / FRAMES)
@@ -194,7 +197,7 @@ def clear(folder: Path) -> None:
 
 
 def _has_frames(folder: Path) -> bool:
-    """Return whether frames of a video were written into a folder of poses."""
+    """Return whether video frames were written into a pose folder."""
     record: Any = {}
     with contextlib.suppress(InputError):
         record = read_json(folder / RECORD, "the record of found poses")
@@ -204,9 +207,9 @@ def _has_frames(folder: Path) -> bool:
 def write_dataset(
     folder: Path, photos: Mapping[int, ListedPhoto], model: Any, names: Mapping[int, str]
 ) -> None:
-    """Write a model, whose cameras are those of the photos as stored, and a ``transforms.json`` of it.
+    """Write a model, with cameras for the photos as stored, and its ``transforms.json``.
 
-    ``photos`` and ``names`` (for the model) are by the number of an image.
+    ``photos`` and ``names`` (for the model) are keyed by image number.
     """
     entries = []
     for number in sorted(model.reg_image_ids()):
@@ -231,7 +234,7 @@ def write_found(folder: Path, found: FoundPoses) -> None:
 
 
 def relative(file: Path, folder: Path) -> str:
-    """Return the path of a file from a folder; an absolute one where they are on different drives."""
+    """Return the path of a file relative to a folder; an absolute one if they are on different drives."""
     try:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
     except ValueError:

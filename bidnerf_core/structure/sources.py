@@ -1,4 +1,4 @@
-"""The photos whose poses are sought: those of a folder, or of the folders in it, and videos."""
+"""The photos whose poses are sought: those of a folder or its subfolders, and videos."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.photos import natural_order, photos_in
 
 NOT_PHOTOS = ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
-"""Names of folders whose images are no photos."""
+"""Names of folders whose images are not photos."""
 
 
 @dataclass(frozen=True)
 class SourceImage:
     """A photo, or a frame of a video that was written as an image."""
 
-    name: str  # unique among the images: the stem, with as many folders as make it so
+    name: str  # unique among the images: the stem, prefixed with as many folders as needed
     file: Path
     time: float | None = None  # seconds, of a frame of a video
 
 
 def lacks_poses(path: str | Path) -> bool:
-    """Return whether a path is a video, or a folder with photos, that no reader of datasets recognises."""
+    """Return whether a path is a video, or a folder of photos that no dataset reader recognizes."""
     place = Path(path)
     if find_reader(place) is not None:
         return False
@@ -35,10 +35,10 @@ def lacks_poses(path: str | Path) -> bool:
 
 
 def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
-    """Return the photos of a folder in the natural order of their names.
+    """Return the photos of a folder in natural name order.
 
-    Where the folder itself has none, those of the folders in it are taken, except for depth, masks and the like, and for
-    ``out``. Raises ``InputError`` where there is no such folder, where there are no photos, and where poses are known.
+    If the folder itself has none, those of its subfolders are used, except for depth, masks and the like, and
+    ``out``. Raises ``InputError`` if there is no such folder, if there are no photos, and if poses are known.
     """
     if not folder.exists():
         raise InputError(f"{folder}: no such file or folder, expected photos or a video")
@@ -49,12 +49,12 @@ def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
     reader = find_reader(folder)
     if reader is not None:
         raise InputError(
-            f"{folder}: is a dataset whose poses are known ({reader.expected}); train with it as it is, or give the folder of"
-            " the photos alone to find their poses anew"
+            f"{folder}: is a dataset whose poses are known ({reader.expected}); train with it directly, or"
+            " give only the folder of the photos to find their poses again"
         )
     files = _listed(folder, out)
     if not files:
-        raise InputError(f"{folder}: no photos in it, nor in the folders in it ({expected_files()})")
+        raise InputError(f"{folder}: contains no photos, and neither do its subfolders ({expected_files()})")
     names = unique_names([(*file.relative_to(folder).parts[:-1], file.stem) for file in files])
     return [SourceImage(name, file) for name, file in zip(names, files, strict=True)]
 
@@ -68,7 +68,7 @@ def _listed(folder: Path, out: Path | None) -> list[Path]:
 
 
 def _below(folder: Path, out: Path | None) -> Iterator[Path]:
-    """Yield the photos of the folders in ``folder`` at any depth, except those of datasets."""
+    """Yield the photos in subfolders of ``folder`` at any depth, except those of datasets."""
     for place, inside, _ in os.walk(folder):
         inside[:] = sorted(
             name

@@ -1,8 +1,10 @@
-"""The frames of a video that are worth placing: as many as the motion of the image asks for, the sharpest of their neighbours.
+"""The frames of a video that are worth placing: as many as the image motion requires, each the sharpest among
+its neighbours.
 
-The motion of the image is the displacement of tracked corners, accumulated along the video. A shaking camera does not add to
-it, since corners are followed from one anchor frame until they are a few percent of the image away. Frames are chosen at equal
-steps of the accumulated motion: none while the camera rests, many while it turns.
+The image motion is the displacement of tracked corners, accumulated along the video. A shaking camera does
+not add to it, since corners are tracked from one anchor frame until they have moved by a few percent of the
+image. Frames are chosen at equal steps of the accumulated motion: none while the camera rests, many while it
+turns.
 """
 
 from __future__ import annotations
@@ -21,19 +23,20 @@ from bidnerf_core.datasets.video import frame_count, pictures
 from bidnerf_core.structure.sources import SourceImage
 
 STEP = 0.04
-"""Motion of the image between chosen frames, in diagonals."""
+"""Image motion between chosen frames, in diagonals."""
 ANCHOR = 0.02
-"""Motion of the image, in diagonals, after which corners are found anew."""
+"""Image motion, in diagonals, after which corners are redetected."""
 MOST = 400
-"""Largest number of chosen frames: longer videos take longer steps."""
+"""Largest number of chosen frames: longer videos use longer steps."""
 WINDOW = 0.3
-"""Share of a step on either side within which the sharpest frame is chosen."""
+"""Fraction of a step on either side within which the sharpest frame is chosen."""
 LEAST_TRACKED = 0.5
-"""Share of the corners that must still be tracked."""
+"""Fraction of the corners that must still be tracked."""
 CORNERS, QUALITY, APART = 200, 0.01, 7
-"""Number of corners, their least quality relative to the best, and their least distance in pixels (Shi and Tomasi 1994)."""
+"""Number of corners, their minimum quality relative to the best, and their minimum distance in pixels (Shi
+and Tomasi 1994)."""
 WIDTH = 320
-"""Pixels along the longer side of the images that corners are tracked in."""
+"""Pixels along the longer side of the images in which corners are tracked."""
 JPEG_QUALITY = 95
 
 
@@ -47,7 +50,7 @@ class FrameMeasure:
 
 
 def measured(video: Path, count: Callable[[int, int], None]) -> list[FrameMeasure]:
-    """Measure each frame of a video; ``count`` receives the number of frames that are done, and may raise to stop."""
+    """Measure each frame of a video; ``count`` receives the number of frames done, and may raise to stop."""
     total = frame_count(video)
     path, found = _Motion(), list[FrameMeasure]()
     for time, pixels in pictures(video):
@@ -73,7 +76,7 @@ def chosen(frames: Sequence[FrameMeasure]) -> list[int]:
 def write_frames(
     video: Path, folder: Path, wanted: Sequence[int], count: Callable[[int, int], None]
 ) -> list[SourceImage]:
-    """Write the frames of the indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
+    """Write the frames with indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
     folder.mkdir(parents=True, exist_ok=True)
     asked, found = set(wanted), list[SourceImage]()
     for number, (time, pixels) in enumerate(pictures(video)):
@@ -88,7 +91,7 @@ def write_frames(
 
 
 class _Motion:
-    """The accumulated motion of the image, in diagonals."""
+    """The accumulated image motion, in diagonals."""
 
     def __init__(self) -> None:
         self._before: np.ndarray | None = None
@@ -98,10 +101,10 @@ class _Motion:
         self._until_anchor = self._total = 0.0
 
     def advance(self, grey: np.ndarray) -> float:
-        """Return the motion until the next frame."""
+        """Return the motion up to the next frame."""
         if self._before is None:
             self._anchor(grey)
-        elif not len(self._points):  # nothing to follow: unknown motion, which is assumed as large as a step
+        elif not len(self._points):  # nothing to track: unknown motion, assumed to be one step
             self._until_anchor = self._total = self._total + STEP
             self._anchor(grey)
         else:

@@ -1,4 +1,4 @@
-"""The contracts of what strangers register, as test classes for pytest.
+"""The contracts of third-party parts, as test classes for pytest.
 
 A plugin's whole test is::
 

@@ -21,9 +21,9 @@ from bidnerf_core.testing.subject import Subject, called, frozen, precise
 class BackendContract(Subject):
     """Tests of a backend: derive a class whose name begins with ``Test``, and set ``backend`` or ``name``.
 
-    ``backend`` is the object that the entry point names, ``name`` the entry point's name. ``config`` should be small: a few
-    dozen steps of milliseconds each, enough to learn something from 6 images of 24 x 24 pixels. Without it, the default
-    config is used with fewer steps.
+    ``backend`` is the object that the entry point names, ``name`` the entry point's name. ``config`` should
+    be small: a few dozen steps of a few milliseconds each, enough to learn something from 6 images of 24 x 24
+    pixels. By default, the default config is used with fewer steps.
     """
 
     # The object that the entry point names.
@@ -168,8 +168,9 @@ class BackendContract(Subject):
         )
         require_that(
             same,
-            f"{type(fresh).__name__}: saved, built anew and loaded, it renders otherwise than before, expected the same"
-            " bits; is some state not in state_dict (a plain attribute, a buffer with persistent=False)?",
+            f"{type(fresh).__name__}: saved, rebuilt and loaded, it renders differently than before,"
+            " expected the same bits; is some state not in state_dict (a plain attribute, a buffer with"
+            " persistent=False)?",
         )
 
     # Training.

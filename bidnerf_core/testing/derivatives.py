@@ -37,7 +37,9 @@ def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None
 
 
 def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
-    """Check the derivative with respect to direction, along a random great circle through each, as directions are unit."""
+    """Check the derivative with respect to direction, along a random great circle through each, since
+    directions are unit vectors.
+    """
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)
     along = torch.nn.functional.normalize(
@@ -79,7 +81,8 @@ DETACHED = "expected one: query must not detach positions or run under no_grad"
 def agreement(
     ask: Asked, moved: Callable[[float], Tensor], speed: Float[Tensor, "n 3"], dtype: torch.dtype
 ) -> Float[Tensor, ""]:
-    """Return the fraction of values whose derivative along a curve agrees with finite differences at the best step size.
+    """Return the fraction of values whose derivative along a curve agrees with finite differences at the best
+    step size.
 
     ``moved(t)`` are the points at ``t`` on their curves, ``speed`` (n 3) is its derivative at 0.
     """
@@ -96,7 +99,7 @@ def agreement(
 
 
 def _slopes(ask: Asked, at: Float[Tensor, "n 3"], speed: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-    """Return the derivative of each channel along ``speed``, in reverse mode; 0 where it does not depend on the argument."""
+    """Return the derivative of each channel along ``speed``, in reverse mode; 0 if it does not depend on the argument."""
     leaf = at.detach().requires_grad_()
     values = ask(leaf)
     slopes = torch.zeros_like(values)

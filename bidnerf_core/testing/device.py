@@ -1,4 +1,4 @@
-"""The check that the steps of a localization can stay on the field's device."""
+"""Check that the steps of a localization can stay on the field's device."""
 
 from __future__ import annotations
 
@@ -53,9 +53,11 @@ class _Scene:
 
 
 def check_steps(field: RadianceField) -> None:
-    """Check that steps at each level neither copy between devices nor wait for one, and reach the same pose as on the CPU.
+    """Check that steps at each level neither copy between devices nor wait for one, and reach the same pose
+    as on the CPU.
 
-    The device is simulated, see ``elsewhere``. Fields without parameters and buffers have no device and pass.
+    The device is simulated, see ``simulated_device``. Fields without parameters and buffers have no device
+    and pass.
     """
     for number in range(len(levels(field))):
         expected = _first_order(_problem(field), number, None)
@@ -78,7 +80,7 @@ def check_steps(field: RadianceField) -> None:
 
 @contextmanager
 def _naming(what: str) -> Iterator[None]:
-    """Turn a ``DeviceFault`` into a failure of the contract that names the place where it happened."""
+    """Turn a ``DeviceFault`` into a contract failure that names the place where it happened."""
     try:
         yield
     except DeviceFault as fault:

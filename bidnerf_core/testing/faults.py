@@ -1,4 +1,4 @@
-"""Failures of the contract, each in one sentence that states what was found and what was expected."""
+"""Contract failures, each in one sentence that states what was found and what was expected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def require_that(condition: bool, fault: str) -> None:
 
 @contextmanager
 def calling(doing: str) -> Iterator[None]:
-    """Turn an exception of the backend's code into a failure that names the call (``doing``)."""
+    """Turn an exception in the backend's code into a contract failure that names the call (``doing``)."""
     try:
         yield
     except AssertionError:

@@ -1,4 +1,4 @@
-"""``FeaturesContract`` and ``FaultContract``: the requirements on detectors of keypoints and on faults, one test for each."""
+"""``FeaturesContract`` and ``FaultContract``: the requirements on keypoint detectors and on faults, one test each."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ ROUNDING = 1e-3
 
 
 class FeaturesContract:
-    """Tests of a detector: derive a class whose name begins with ``Test``, and set ``name``, under which it is registered.
+    """Tests of a detector: derive a class whose name begins with ``Test``, and set ``name``, under which it
+    is registered.
 
-    ``repeated`` is the least share of the keypoints that must be found again, and be recognised by their descriptors, in an
-    image that is shifted by a few pixels.
+    ``repeated`` is the minimum repeatability: the fraction of keypoints that must be detected again, and
+    matched by their descriptors, in an image shifted by a few pixels.
     """
 
     name: ClassVar[str] = ""
@@ -110,7 +111,9 @@ class FeaturesContract:
 
 
 class FaultContract:
-    """Tests of a fault: derive a class whose name begins with ``Test``, and set ``name``, under which it is registered."""
+    """Tests of a fault: derive a class whose name begins with ``Test``, and set ``name``, under which it is
+    registered.
+    """
 
     name: ClassVar[str] = ""
 
@@ -225,7 +228,7 @@ def _generator() -> torch.Generator:
 
 
 def _close(a: Frame, b: Frame) -> bool:
-    """Return whether two images are equal to the rounding errors of resampling."""
+    """Return whether two images are equal up to the rounding errors of resampling."""
     if a.rgb.shape != b.rgb.shape or float((a.rgb - b.rgb).abs().max()) > ROUNDING:
         return False
     if a.depth is None or b.depth is None or a.depth.shape != b.depth.shape:

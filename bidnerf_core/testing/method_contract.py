@@ -29,9 +29,10 @@ START_OFF = (0.02, -0.015, 0.02, 0.01, -0.008, 0.012)
 class MethodContract:
     """Tests of a localization method: derive a class whose name begins with ``Test``, and set ``name``.
 
-    ``name`` is the name under which the method is registered, ``config`` a config for small images; without it, the default
-    config is used. The scene is a textured ground of 2.4 m, seen by a camera of 128 x 96 pixels, with depth. ``largest_error``
-    (metres and radians) is how far an accepted pose may be from the truth.
+    ``name`` is the name under which the method is registered, ``config`` a config for small images; without
+    it, the default config is used. The scene is a textured ground 2.4 m wide, seen by a camera of 128 x 96
+    pixels, with depth. ``largest_error`` (metres and radians) is the largest error allowed for an accepted
+    pose.
     """
 
     name: ClassVar[str] = ""

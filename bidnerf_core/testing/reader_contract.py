@@ -1,4 +1,4 @@
-"""``ReaderContract``: the requirements on every reader of datasets, one test for each."""
+"""``ReaderContract``: the requirements on every dataset reader, one test each."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
 from bidnerf_core.testing.faults import calling, require_that
 
 ENOUGH_POINTS = 30
-"""Least number of points that several images must agree on for their poses to be judged."""
+"""Smallest number of points that several images must agree on for their poses to be judged."""
 UNUSUAL_RATIO = 0.1
-"""Largest relative difference between measured depth and that of points seen from several places."""
+"""Largest relative difference between measured depth and triangulated depth."""
 MOST_VIEWS = 24
 """Largest number of images that are compared with each other."""
 
@@ -31,8 +31,9 @@ MOST_VIEWS = 24
 class ReaderContract:
     """Tests of a reader: derive a class whose name begins with ``Test``, and set ``name`` and ``folder``.
 
-    ``name`` is the name under which the reader is registered, ``folder`` a capture in its format: at least ten images of
-    something textured, taken from different places, as small as possible. ``options`` are those with which it is opened.
+    ``name`` is the name under which the reader is registered, ``folder`` a capture in its format: at least
+    ten images of something textured, taken from different places, as small as possible. It is opened with
+    ``options``.
     """
 
     name: ClassVar[str] = ""
@@ -171,7 +172,7 @@ class ReaderContract:
             return data.views(split, data.frame_names(split)[:MOST_VIEWS])
 
     def _tracked(self) -> TrackedViews:
-        """Return the keypoints of the images, joined into tracks; once for each test class."""
+        """Return the keypoints of the images, joined into tracks; computed once per test class."""
         kept = type(self).__dict__.get("_kept")
         if kept is None:
             kept = type(self)._kept = tracked_views(self._views())  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Checks of ``Backend.train``: it learns, reports, saves and stops on request, and resumes without a difference."""
+"""Checks of ``Backend.train``: it learns, reports, saves and stops on request, and resumes with an identical result."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from bidnerf_core.testing.scene import BOUNDS, DIMMED_BOUNDS, camera_rays, expos
 from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
 LEARNED = 0.8
-"""Factor by which the squared error of colour must have fallen."""
+"""Factor by which the squared colour error must have fallen."""
 EXPOSURE = 0.06
 """Logarithm of the factor by which the contract's images are brighter and darker than they should be."""
 EXPOSURE_STEPS = 100
-"""Training steps within which the exposures of the images can be learned."""
+"""Number of training steps within which the exposures of the images can be learned."""
 BAKED_IN = 0.06
-"""Share of the images' exposures that may be found in the field: above 0.1 where a recipe ignores exposure, 0.01 where
-it learns it."""
+"""Fraction of the images' exposures that may end up in the field: above 0.1 if a recipe ignores exposure,
+0.01 if it learns it."""
 
 
 class Recorder:
@@ -60,7 +60,7 @@ class Recorder:
 
 
 def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors as they are read back from a safetensors file."""
+    """Return the tensors as read back from a safetensors file."""
     with calling("writing the tensors of a state to safetensors"):
         packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         return tensors_from_bytes(tensors_to_bytes(packed))
@@ -69,7 +69,9 @@ def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 def check_learning(
     backend: Backend, make: Callable[[], RadianceField], config: Any, views: Sequence[View], kind: str
 ) -> RadianceField:
-    """Check that ``config.steps`` steps bring the rendered views nearer to the given ones, and return the trained field."""
+    """Check that ``config.steps`` steps bring the rendered views closer to the given ones, and return the
+    trained field.
+    """
     field = make()
     before = colour_error(field)
     _train(backend, field, views, config, Recorder(), f"on {kind} views")
@@ -84,10 +86,11 @@ def check_learning(
 
 
 def check_exposure(backend: Backend, config: Any) -> None:
-    """Check that images that are brighter or darker than the others do not make the field brighter or darker there.
+    """Check that images brighter or darker than the others do not make the field brighter or darker there.
 
-    A field is trained with alternately brighter and darker images, and another one with the exposures exchanged. Where the
-    two differ as the images do, exposure went into the field. A field that learns slowly shows little of either.
+    A field is trained with alternately brighter and darker images, and another one with the exposures
+    exchanged. If the two differ as the images do, exposure ended up in the field. A field that learns slowly
+    shows little of either.
     """
     config = replace(config, steps=max(config.steps, EXPOSURE_STEPS))
     fields = []
@@ -137,7 +140,9 @@ def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
 
 
 def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: Any) -> None:
-    """Check that a training that stops midway with ``TrainingStopped`` and is resumed ends with a bitwise identical result."""
+    """Check that a training run that stops midway with ``TrainingStopped`` and is resumed gives a bitwise
+    identical result.
+    """
     who, middle = f"{_name(backend)}.train", config.steps // 2
     first, second, third = make(), make(), make()
     beginning = stored(_state_of(first))
@@ -177,7 +182,7 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
 
 
 def colour_error(field: RadianceField) -> float:
-    """Return the mean squared error of colour over all pixels of the training views."""
+    """Return the mean squared colour error over all pixels of the training views."""
     found = [rendered(field, view, BOUNDS) for view in rgbd_views()]
     seen = torch.cat([view.frame.rgb.reshape(-1, 3) for view in rgbd_views()])
     return float((torch.cat(found) - seen).square().mean())

@@ -17,7 +17,9 @@ BACKGROUND = (0.1, 0.5, 0.9)
 
 
 def check_intervals(field: RadianceField) -> None:
-    """Check that valid samples are sorted, disjoint and in [near, far] and that rays that miss have none, even with 0 rays."""
+    """Check that valid samples are sorted, disjoint and in [near, far], and that rays that miss have none,
+    even with 0 rays.
+    """
     for of, rays in awkward_rays().items():
         for jitter, how in ((None, ""), (_generator(), " with jitter")):
             _check_order(field, rays, sample(field, rays, of + how, jitter), of + how)
@@ -68,7 +70,7 @@ def check_repeatable(field: RadianceField) -> None:
 
 
 def check_rays_alone(field: RadianceField) -> None:
-    """Check that the rendering of a ray does not depend on the other rays, nor on how they are arranged."""
+    """Check that the rendering of a ray depends neither on the other rays nor on their arrangement."""
     rays = joined(list(awkward_rays().values()))
     count = len(rays.near) // 4 * 4
     whole = seen(field, picked(rays, torch.arange(count)), "rays")
@@ -84,12 +86,12 @@ def check_rays_alone(field: RadianceField) -> None:
     )
     require_that(
         close(alone, whole[::7], 1e-3),
-        f"{who}: a ray alone sees something else than among others; {expected}",
+        f"{who}: a ray alone sees something different from when among others; {expected}",
     )
 
 
 def check_background(field: RadianceField) -> None:
-    """Check that a ray that misses the scene sees the background and nothing else."""
+    """Check that a ray that misses the scene sees only the background."""
     found = seen(field, awkward_rays()["rays that miss the scene"], "rays that miss the scene")
     require_that(
         close(found, torch.tensor([*BACKGROUND, 0.0, 0.0]).expand_as(found)),
@@ -99,7 +101,7 @@ def check_background(field: RadianceField) -> None:
 
 
 def check_levels(field: RadianceField) -> None:
-    """Check that each level is a field and that the last one renders as the field itself."""
+    """Check that each level is a field and that the last one renders like the field itself."""
     offered = tuple(getattr(field, "levels", None) or (field,))
     for number, level in enumerate(offered):
         require_that(
@@ -115,13 +117,13 @@ def check_levels(field: RadianceField) -> None:
 
 
 FINE_INTERVALS = 1024
-"""Intervals of a ray over which the density of a field with hits is summed."""
+"""Number of intervals per ray over which the density of a field with hits is summed."""
 SAME_OPACITY = 0.05
-"""Difference allowed between the opacity of a ray's hits and that by the field's density, on nine rays of ten."""
+"""Largest difference between the opacity of a ray's hits and that of the field's density, for nine rays out of ten."""
 
 
 def check_hits(field: RadianceField) -> None:
-    """Check the hits of a field that offers them: in range, in [near, far], and as opaque as its density."""
+    """Check the hits of a field that provides them: in range, in [near, far], and as opaque as its density."""
     if not isinstance(field, HitField):
         return
     for of, rays in awkward_rays().items():
@@ -163,7 +165,7 @@ def _check_hits(field: HitField, rays: Rays, of: str) -> None:
 
 
 def _check_density(field: HitField, rays: Rays) -> None:
-    """Check that the density of ``query``, summed along rays, stops as much light as the hits do."""
+    """Check that the density of ``query``, summed along rays, absorbs as much light as the hits do."""
     hits = _hits(field, rays, "rays")
     expected = 1 - torch.prod(1 - hits.alpha, dim=-1)
     samples = Stratified(FINE_INTERVALS)(rays)

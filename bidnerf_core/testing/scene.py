@@ -1,4 +1,4 @@
-"""Test inputs of the contract: views of a tiny closed-form scene, and awkward rays and points of all kinds."""
+"""Test inputs of the contract: views of a tiny closed-form scene, and edge cases of rays and points."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ DIMMED_BOUNDS = replace(BOUNDS, background=(DIMMED * _R, DIMMED * _G, DIMMED * _
 def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
     """Return six views of a toy with exact depth.
 
-    With ``coverage`` they have an alpha channel; without, they show the toy in front of white, as a sensor would see it.
+    With ``coverage`` they have an alpha channel; otherwise they show the toy in front of white, as a sensor
+    would see it.
     """
     seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
     return tuple(v if coverage else replace(v, frame=replace(v.frame, alpha=None)) for v in seen)

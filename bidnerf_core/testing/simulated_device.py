@@ -1,10 +1,10 @@
 """A simulated device, which proves on any machine that code neither copies between devices nor waits for one.
 
-Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is active they hold values, which are kept and
-computed on the CPU, so that code runs as it would on a GPU; but operations on tensors of both devices, which a GPU does not
-allow, raise ``DeviceFault``. Within ``strict``, so does whatever makes the host wait for the device: copies to and from the
-CPU, reading numbers from a tensor (``float``, ``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``,
-indexing by a mask).
+Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is active they have values,
+which are stored and computed on the CPU, so that code runs as it would on a GPU; but operations on tensors of
+both devices, which a GPU does not allow, raise ``DeviceFault``. Within ``strict``, so does anything that
+makes the host wait for the device: copies to and from the CPU, reading numbers from a tensor (``float``,
+``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class _There(torch.Tensor):
 
 
 class Elsewhere(TorchDispatchMode):
-    """Makes ``DEVICE`` usable. Outside of ``strict()``, tensors may be moved between devices and read, but not mixed."""
+    """Makes ``DEVICE`` usable. Outside ``strict()``, tensors may be moved between devices and read, but not mixed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -142,7 +142,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
 
 
 def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
-    """Return results as tensors on ``DEVICE``; a result that was written in place is the argument itself."""
+    """Return results as tensors on ``DEVICE``; a result written in place is the argument itself."""
     schema = func._schema
     aliases = [
         (args[place] if place < len(args) else kwargs.get(argument.name))
@@ -155,7 +155,7 @@ def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
 
 
 def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: torch.device | None) -> None:
-    """Raise ``DeviceFault`` for copies, and for operations on which the host would wait."""
+    """Raise ``DeviceFault`` for copies, and for operations that make the host wait."""
     name = func._schema.name.removeprefix("aten::")
     if there and name in READS:
         raise DeviceFault(f"{name} {READS[name]}: the host waits for the device")
@@ -178,7 +178,7 @@ def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: t
 def _check_mixing(func: Any, args: Any, flat: list[Any], there: bool) -> None:
     """Raise ``DeviceFault`` for tensors of both devices in one operation.
 
-    Excepted is what PyTorch moves by itself: numbers, and the indices of a tensor on the device.
+    Exempt is what PyTorch moves by itself: numbers, and the indices of a tensor on the device.
     """
     name = func._schema.name.removeprefix("aten::")
     if not there or name in ("_to_copy", "copy_"):

@@ -1,4 +1,4 @@
-"""The subject of the contract's tests: a backend, its config, and fields that are built and trained with them."""
+"""The subject of the contract's tests: a backend, its config, and fields built and trained with them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views
 
 SUBJECT_STEPS = 40
-"""Training steps where the test sets no ``config``."""
+"""Training steps if the test sets no ``config``."""
 
 
 class Subject:
@@ -54,7 +54,7 @@ class Subject:
             return self._backend().build(self._config() if config is None else config, BOUNDS)
 
     def _trained(self) -> Any:
-        """Return a field trained on RGB-D views and frozen like that of a loaded map; one for each test class."""
+        """Return a field trained on RGB-D views and frozen like that of a loaded map; trained once per test class."""
         kept = type(self).__dict__.get("_kept")
         if kept is None:
             kept = self._build()
@@ -79,14 +79,14 @@ def frozen(field: Any) -> Any:
 
 
 def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
-    """Return a copy in float64 where the field supports it, else the field itself, and the dtype."""
+    """Return a copy in float64 if the field supports it, else the field itself, and the dtype."""
     try:
         doubled = copy.deepcopy(field)
         _double(doubled)
         positions, directions = (x.double() for x in points(2))
         if query(doubled, positions, directions, "points").density.dtype == torch.float64:
             return doubled, torch.float64
-    except Exception:  # the test of dtypes reports it
+    except Exception:  # reported by the test of dtypes
         pass
     return field, torch.float32
 

@@ -1,4 +1,4 @@
-"""A textured hilly ground in closed form, whose images have keypoints, as a field, as views and as a map with all its parts."""
+"""A textured hilly ground in closed form, whose images have keypoints, as a field, as views and as a complete map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bidnerf_core.scenes.trajectories import orbit
 BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)
 CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)
 POSES = orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)
-"""Poses (T_world_camera) from which no training image was taken."""
+"""Poses (T_world_camera) that no training image has."""
 DENSITY = 120.0  # per metre, well below the ground
 SOFTNESS = 0.01  # metres over which the density rises
 
@@ -56,7 +56,7 @@ class TexturedGround:
 
 @dataclass(frozen=True, eq=False)
 class MapWithLandmarks:
-    """A field as a map with everything that is baked beside it."""
+    """A field as a map with all its baked parts."""
 
     field: RadianceField
     bounds: SceneBounds
@@ -77,7 +77,7 @@ def view(T: SE3, name: str = "", seed: int = 0) -> View:
 
 
 def seen(T: SE3, camera: Intrinsics, name: str = "", seed: int = 0) -> View:
-    """Return an image of the ground by any camera, with its depth."""
+    """Return an image of the ground from any camera, with its depth."""
     image = render_image(ground(seed), camera, T, BOUNDS)
     return View(Frame(name, image.rgb, camera, torch.where(image.opacity > 0.95, image.depth, 0)), T)
 
@@ -90,7 +90,7 @@ def training_views(count: int = 10) -> tuple[View, ...]:
 
 @functools.cache
 def unseen() -> View:
-    """Return an image that gave no landmark."""
+    """Return an image that no landmark was built from."""
     return view(POSES[1], "unseen")
 
 
@@ -118,12 +118,12 @@ class MovedField:
 
 QUARTER_TURN = SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi / 2], dtype=torch.float64))
 T_MOVED_WORLD = SE3(QUARTER_TURN.rotation, torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64))
-"""The ground's world in another one, in which its box still has sides along the axes."""
+"""The ground's world in another one in which its box is still axis-aligned."""
 
 
 @functools.cache
 def moved_map() -> MapWithLandmarks:
-    """Return the map of the same ground in a world that is moved by ``T_MOVED_WORLD``, made anew from the same images."""
+    """Return the map of the same ground in a world moved by ``T_MOVED_WORLD``, rebuilt from the same images."""
     moved = MovedField(ground(), T_MOVED_WORLD)
     corners = T_MOVED_WORLD.apply(torch.tensor([BOUNDS.lower, BOUNDS.upper], dtype=torch.float64))
     lower, upper = (tuple(side.tolist()) for side in (corners.amin(0), corners.amax(0)))

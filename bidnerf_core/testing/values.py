@@ -1,4 +1,4 @@
-"""Checks of ``RadianceField.query``: shapes, ranges, and that values depend on the query alone."""
+"""Checks of ``RadianceField.query``: shapes, ranges, and that values depend only on the query."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ THREADS, ROUNDS = 4, 8
 
 
 def check_shapes(field: RadianceField) -> None:
-    """Check any leading axes, including those without points, and that values do not depend on the points' arrangement."""
+    """Check any leading axes, including empty ones, and that values do not depend on the points' arrangement."""
     positions, directions = points(7)
     flat = stacked(query(field, positions, directions, "7 points"))
     for shape in SHAPES:
@@ -97,7 +97,7 @@ def stacked(values: FieldValues) -> Tensor:
 
 
 def close(found: Tensor, expected: Tensor, tolerance: float = 1e-4) -> bool:
-    """Return whether values are equal to rounding, relative to the largest value of each channel."""
+    """Return whether values are equal up to rounding, relative to the largest value of each channel."""
     if expected.numel() == 0:
         return found.shape == expected.shape
     scale = expected.abs().reshape(-1, expected.shape[-1]).amax(0).clamp(min=1e-6)

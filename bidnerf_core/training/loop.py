@@ -15,7 +15,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.training.report import Report, TrainingState, TrainingStep, TrainingStopped
 
 BESIDE = "beside."
-"""Prefix of the names under which a state holds parameters that are learned jointly with the field."""
+"""Prefix of the names under which a state holds parameters learned jointly with the field."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class StepOutcome:
     """The result of one step of a recipe."""
 
     loss: Float[Tensor, ""]
-    mse: float  # of colours, for display
+    mse: float  # of the colours, for display
     samples_per_ray: float = float("nan")
 
 
@@ -48,11 +48,12 @@ def fit(
 ) -> None:
     """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
 
-    ``beside`` holds parameters that are learned with the field but not kept with it; they are among the groups. Training
-    resumes from ``report.resume()``, saves when ``report.due`` returns True and, when ``report.stopping`` is set, saves and
-    raises ``TrainingStopped``. A resumed run computes what an uninterrupted one would have; on a GPU, where sums have no fixed
-    order, it does so up to rounding. The generator is on the CPU whatever the field's device, so that the same rays are drawn
-    everywhere. Raises ``InputError`` where the loss is not finite.
+    ``beside`` holds parameters that are learned with the field but not stored with it; they are among the
+    groups. Training resumes from ``report.resume()``, saves when ``report.due`` returns True and, when
+    ``report.stopping`` is set, saves and raises ``TrainingStopped``. A resumed run computes what an
+    uninterrupted one would have; on a GPU, where sums have no fixed order, it does so up to rounding. The
+    generator is on the CPU regardless of the field's device, so that the same rays are drawn everywhere.
+    Raises ``InputError`` if the loss is not finite.
     """
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
     rates = [group["lr"] for group in optimizer.param_groups]

@@ -1,4 +1,4 @@
-"""The supervised loss of colour, and of depth where a sensor measured it or a landmark gives it."""
+"""The supervised loss of colour, and of depth where a sensor measured it or a landmark provides it."""
 
 from __future__ import annotations
 
@@ -32,14 +32,15 @@ def supervised_loss(
 
 
 def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor, ""]:
-    """Return the mean distance (metres) of the rays' weight from their measured depth; 0 where no ray has a measurement.
+    """Return the mean distance (metres) of the rays' weight from their measured depth; 0 if no ray has a
+    measurement.
 
-    Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is smallest where all weight is at the measured depth; an
-    error of the mean depth could also be 0 with equal weight on both sides. Weight that a ray lacks counts as if it were at
-    the camera. Where the distance comes from a landmark, the mean is also taken over its normal distribution, so that weight
-    within its standard deviation is hardly moved.
+    Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is smallest if all weight is at the
+    measured depth; an error of the mean depth could also be 0 with equal weight on both sides. Weight that a
+    ray lacks counts as if it were at the camera. For distances from landmarks, the mean is also taken over
+    their normal distribution, so that weight within the standard deviation is hardly moved.
     """
-    # Where no sensor measured depth, few rays have a landmark.
+    # If no sensor measured depth, few rays have a landmark.
     index = batch.observed.measured.nonzero()[:, 0]
     distance, deviation = (part.index_select(0, index) for part in (batch.observed.distance, batch.deviation))
     weights, middles, opacity = (
@@ -52,7 +53,9 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
 
 
 def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]) -> Float[Tensor, "*p"]:
-    """Return the mean of ``|offset + e|`` over normal errors ``e`` of a standard deviation: the mean of a folded normal."""
+    """Return the mean of ``|offset + e|`` for normal errors ``e`` with a standard deviation of ``deviation``
+    (folded normal).
+    """
     sigma = deviation.clamp(min=torch.finfo(offset.dtype).tiny)
     ratio = (offset / sigma).clamp(-30, 30)
     mean = sigma * sqrt(2 / pi) * torch.exp(-ratio.square() / 2) + offset * torch.erf(ratio / sqrt(2))
@@ -60,9 +63,11 @@ def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p
 
 
 def distortion(rendering: Rendering, side: float) -> Float[Tensor, ""]:
-    """Return the mean distortion of the rays' weights (Barron et al. 2022, eq. 15), distances in units of ``side``.
+    """Return the mean distortion of the rays' weights (Barron et al. 2022, eq. 15), with distances in units
+    of ``side``.
 
-    It is smallest where a ray's weight is in one short interval. Sums over pairs are computed from cumulative sums.
+    It is smallest if a ray's weight is in one short interval. Sums over pairs are computed from cumulative
+    sums.
     """
     samples, weights = rendering.samples, rendering.weights
     middles, widths = samples.middles / side, (samples.ends - samples.starts) / side

@@ -1,4 +1,4 @@
-"""The rays of training views, and the batches that are drawn from them."""
+"""The rays of training views, and the batches drawn from them."""
 
 from __future__ import annotations
 
@@ -20,22 +20,24 @@ from bidnerf_core.frames.image_pixels import ImagePixels
 from bidnerf_core.geometry.se3 import SE3
 
 MEASURED_SHARE = 0.25
-"""Fraction of a batch's rays that are drawn from pixels with depth, if these are so few that hardly any would be drawn
+"""Fraction of a batch's rays drawn from pixels with depth, if these are so few that hardly any would be drawn
 otherwise (in DS-NeRF: half)."""
 REDRAWN = 64
-"""Rounds in which rays of hidden pixels are drawn anew, before the visible pixels are listed."""
+"""Number of attempts to redraw rays of hidden pixels before the visible pixels are listed."""
 LANDMARK_SHARE = 0.125
-"""Fraction of a batch's rays that are drawn from pixels that show a landmark."""
+"""Fraction of a batch's rays drawn from pixels that show a landmark."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingBatch:
-    """Rays of training views, the measurements along them, and the background over which their colours were composited."""
+    """Rays of training views, the measurements along them, and the background over which their colours were
+    composited.
+    """
 
     rays: Rays  # world
     observed: Observations  # of the same rays, in the world; all of them have a colour
     background: Float[Tensor, "r 3"]
-    image: Int[Tensor, "r"]  # number of the view that shows the ray
+    image: Int[Tensor, "r"]  # index of the view that contains the ray
     deviation: Float[Tensor, "r"]  # metres: of a landmark's distance; 0 where a sensor measured it
 
     def __len__(self) -> int:
@@ -45,9 +47,9 @@ class TrainingBatch:
 class RayBank:
     """All pixels of the training views, from which batches are drawn. Pixels stay in host memory; batches are on ``device``.
 
-    Where an image has an alpha channel, each batch replaces its background by random colours, so that a field cannot
-    explain the background by matter of one colour (as in the code of Mueller et al. 2022). The images are those of the views:
-    they are not copied where they lie in few blocks of memory, as in a ``PixelStore``.
+    If an image has an alpha channel, each batch replaces its background by random colours, so that a field
+    cannot explain the background by matter of one colour (as in the code of Mueller et al. 2022). The images
+    are those of the views: they are not copied if they lie in few blocks of memory, as in a ``PixelStore``.
     """
 
     def __init__(
@@ -73,9 +75,10 @@ class RayBank:
         self._motion = _motion_of(views)
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
-        """Return the rays of ``count`` pixels, drawn uniformly from those of all views that are not hidden.
+        """Return the rays of ``count`` pixels, drawn uniformly from all visible pixels of the views.
 
-        Where only few pixels have depth, a fixed share is drawn from these; another share is drawn from those with landmarks.
+        If only few pixels have depth, a fixed fraction is drawn from these; another fraction is drawn from
+        those with landmarks.
         """
         index = self._visible(torch.randint(self.count, (count,), generator=generator), generator)
         if len(self._few):
@@ -102,7 +105,7 @@ class RayBank:
         return moved(TrainingBatch(rays, observed, background, view, deviation), self.device)
 
     def _visible(self, index: Int[Tensor, "r"], generator: Generator) -> Int[Tensor, "r"]:
-        """Return the indices of pixels with those of hidden pixels drawn anew."""
+        """Redraw the indices of hidden pixels."""
         if self._visible_counts is None:
             return index
         for _ in range(REDRAWN):
@@ -129,7 +132,7 @@ class RayBank:
         return self._hidden.at(view, index - self.offsets[view])[:, 0] > 0
 
     def _poses(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> SE3:
-        """Return the poses of the cameras at the times at which pixels of the views were exposed."""
+        """Return the camera poses at the times at which pixels of the views were exposed."""
         T = SE3(self._rotation[view], self._origin[view])
         if self._motion is None:
             return T
@@ -161,11 +164,11 @@ class RayBank:
 
 
 MOST_RAYS = 2**24
-"""Number of pixels, over all different cameras, whose rays are computed once; with more, those of each batch are computed."""
+"""Number of pixels, over all different cameras, up to which rays are computed once; beyond that, per batch."""
 
 
 class _PixelRays:
-    """The rays of the pixels of many cameras, of which most are usually equal; pixels are numbered row by row."""
+    """The rays of the pixels of many cameras, usually mostly equal ones; pixels are numbered row by row."""
 
     def __init__(self, cameras: Sequence[Intrinsics]) -> None:
         number = {kind: place for place, kind in enumerate(dict.fromkeys(cameras))}
@@ -181,7 +184,7 @@ class _PixelRays:
             self._grid = torch.cat(grids)
 
     def rays(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r 3"]:
-        """Return the points on the plane z = 1 that pixels of the views' cameras show."""
+        """Return the points on the plane z = 1 shown by pixels of the views' cameras."""
         kind = self._kind[view]
         if self._grid is not None:
             return self._grid[self._start[kind] + pixel]
@@ -201,7 +204,7 @@ class _PixelRays:
 
 
 def _visible_pixels(frames: Sequence[Frame]) -> Float[Tensor, "v"] | None:
-    """Return how many pixels of each frame are not hidden; None if all are visible."""
+    """Return how many pixels of each frame are visible; None if all are."""
     if all(frame.hidden is None for frame in frames):
         return None
     counts = [
@@ -214,7 +217,7 @@ def _visible_pixels(frames: Sequence[Frame]) -> Float[Tensor, "v"] | None:
 
 
 def _motion_of(views: Sequence[View]) -> Float[Tensor, "v 6"] | None:
-    """Return the motions of the cameras while the rows of their images were exposed; None if none moved."""
+    """Return the motions of the cameras during the readout of their images; None if none moved."""
     if all(view.motion is None for view in views):
         return None
     return torch.stack([AT_REST if view.motion is None else view.motion for view in views]).float()
@@ -233,7 +236,7 @@ class _LandmarkPixels:
 
 
 def _landmark_pixels(views: Sequence[View], offsets: Int[Tensor, "v"]) -> _LandmarkPixels:
-    """Return the landmarks of the views without dense depth; where depth is dense, its measurements are better."""
+    """Return the landmarks of the views without dense depth, whose measurements are better."""
     parts: list[tuple[Tensor, Tensor, Tensor]] = [
         (torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))
     ]

@@ -34,7 +34,7 @@ class Report(Protocol):
     """Receives a recipe's progress and keeps its state."""
 
     def resume(self) -> TrainingState | None:
-        """Return the state to resume from, or None to start anew."""
+        """Return the state to resume from, or None to start from scratch."""
         ...
 
     def step(self, progress: TrainingStep) -> None:
@@ -46,7 +46,7 @@ class Report(Protocol):
         ...
 
     def save(self, state: TrainingState) -> None:
-        """Keep the state."""
+        """Store the state."""
         ...
 
     @property
@@ -56,7 +56,7 @@ class Report(Protocol):
 
 
 class Silent:
-    """A report without display and without checkpoints."""
+    """A report without display or checkpoints."""
 
     stopping = False
 

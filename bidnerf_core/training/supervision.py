@@ -1,4 +1,4 @@
-"""The supervision of a field by training views: batches of their rays, and the loss of rendering them."""
+"""Supervision of a field by training views: batches of their rays, and the loss of rendering them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COLOUR_PENALTY = 1e-3  # weight of their penalty relative to the colour error
 
 @dataclass(frozen=True)
 class SupervisionConfig(Settings):
-    """Weights of the terms of the loss, for every recipe."""
+    """Weights of the loss terms, for every recipe."""
 
     # weight of depth, from sensors or landmarks, relative to colour; 0 leaves it out
     depth_weight: NotNegative = 0.1
@@ -39,9 +39,10 @@ class SupervisionConfig(Settings):
 class Supervision:
     """The rays of training views and their loss, on the device of the trained field.
 
-    It learns the exposure and white balance of each image beside the field, so that images of different exposure do not spoil
-    the field's colours, gives blurred images less weight, and takes depth from sensors and from landmarks. A simple recipe is
-    ``fit`` with ``step`` as its outcome; others compose ``draw``, ``render`` and ``loss``.
+    It learns the exposure and white balance of each image alongside the field, so that differences in
+    exposure do not spoil the field's colours, gives blurred images less weight, and takes depth from sensors
+    and landmarks. A simple recipe is ``fit`` with ``step`` as its outcome; others compose ``draw``,
+    ``render`` and ``loss``.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Supervision:
         learned = config.exposure and not self.bank.has_alpha
         self.colours = ColourTransforms(len(views)).to(device) if learned else None
         kept = detail_kept(views) if config.sharpness else None
-        # None where no image is blurred, so that the loss is then unweighted.
+        # None if no image is blurred, so that the loss is then unweighted.
         self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float().to(device)
 
     def fit(
@@ -66,14 +67,14 @@ class Supervision:
         schedule: Callable[[int, int], float] = cosine,
         seed: int = 0,
     ) -> None:
-        """Call ``training.fit`` such that it also learns what belongs to the images, and resumes it with the field."""
+        """Call ``training.fit`` so that it also learns the per-image parameters, and resumes them with the field."""
         learned: list[dict[str, Any]] = []
         if self.colours is not None:
             learned = [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]
         fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
 
     def step(self, field: RadianceField, count: int, generator: Generator) -> StepOutcome:
-        """Return the loss of rendering ``count`` rays that are drawn from the views."""
+        """Return the loss of rendering ``count`` rays drawn from the views."""
         batch = self.draw(count, generator)
         rendering = render(field, batch.rays, batch.background, generator)
         loss, mse = self.loss(rendering, batch)

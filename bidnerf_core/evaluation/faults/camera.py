@@ -1,4 +1,4 @@
-"""Faults of the camera: of its calibration, which does not describe the image, its shutter, and the way it is held."""
+"""Camera faults: wrong calibrations, the shutter, and the orientation."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from bidnerf_core.frames.frame import Frame
 
 
 def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """Multiply the stated focal lengths by ``factor``; the image stays as it is."""
+    """Multiply the stated focal lengths by ``factor``; the image is unchanged."""
     camera = frame.intrinsics
     return replace(frame, intrinsics=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
 
 
 def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Reduce the stated camera to a focal length, marked as approximate, as for an uncalibrated photo; the image stays as it is."""
+    """Reduce the stated camera to an approximate focal length, as for an uncalibrated photo; the image is unchanged."""
     if not on:
         return frame
     camera = frame.intrinsics
@@ -39,9 +39,11 @@ def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
 
 
 def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Crop a ``share`` of the width and height at a random corner, and state the principal point as if nothing were cropped.
+    """Crop to a ``share`` of the width and height at a random corner, and state the principal point as if
+    nothing were cropped.
 
-    Its stated offset from the centre of the cropped image is its true offset from the centre of the whole one.
+    Its stated offset from the centre of the cropped image is its true offset from the centre of the whole
+    one.
     """
     camera = frame.intrinsics
     columns, rows = (
@@ -60,20 +62,22 @@ def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def _kept(size: int, share: float, end: Tensor) -> slice:
-    """Return the slice of ``size`` pixels that remains once a ``share`` is cut off at the beginning or the end."""
+    """Return the slice of ``size`` pixels that remains after a ``share`` is cut off at the beginning or the end."""
     cut = min(round(share * size), size - 1)
     return slice(0, size - cut) if bool(end) else slice(cut, size)
 
 
 def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> Frame:
-    """Move the stated principal point by ``pixels`` in a random direction; the image stays as it is."""
+    """Move the stated principal point by ``pixels`` in a random direction; the image is unchanged."""
     camera, (across, down) = frame.intrinsics, random_direction(generator)
     wrong = replace(camera, cx=camera.cx + pixels * across, cy=camera.cy + pixels * down)
     return replace(frame, intrinsics=wrong)
 
 
 def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
-    """Distort the image by a lens whose first radial coefficient is larger by ``k1``, unknown to the stated intrinsics."""
+    """Distort the image with a lens whose first radial coefficient is larger by ``k1``, without changing the
+    stated intrinsics.
+    """
     camera = frame.intrinsics
     own = camera.distortion or (0.0, 0.0, 0.0, 0.0)
     lens = replace(camera, distortion=(own[0] + k1, *own[1:]))
@@ -81,10 +85,11 @@ def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
 
 
 def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame:
-    """Expose the rows one after another while the camera turns by ``degrees`` about a random axis through its centre.
+    """Simulate a rolling shutter while the camera rotates by ``degrees`` about a random axis through its
+    centre.
 
-    The rows are those of the sensor, which are the columns of a portrait image. The middle one is exposed at the frame's pose.
-    A camera that only rotates sees the same points, so no depth is needed.
+    The rows are those of the sensor, which are the columns of a portrait image. The middle one is exposed at
+    the frame's pose. A camera that only rotates sees the same points, so no depth is needed.
     """
     camera = frame.intrinsics
     axis = random_units(1, generator)[0] * math.radians(degrees)
@@ -95,7 +100,8 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
     turned = warped(frame, pixels.nan_to_num(-1.0))
     if frame.depth is None:
         return turned
-    # Along a row's ray (x, y, 1), a point's depth is its z in the frame's camera divided by the ray's z in that camera.
+    # Along a row's ray (x, y, 1), a point's depth is its z in the frame's camera divided by the ray's z in
+    # that camera.
     return replace(turned, depth=(nearest(frame.depth, pixels.nan_to_num(-1.0)) / seen[..., 2]).float())
 
 
@@ -114,7 +120,7 @@ def flipped(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def upside_down(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Turn the image by 180 degrees, as if the camera had been held upside down."""
+    """Rotate the image by 180 degrees, as if the camera had been held upside down."""
     return _turned(frame, Orientation(mirrors_columns=True, mirrors_rows=True)) if on else frame
 
 

@@ -15,7 +15,7 @@ FACTOR = Above(0.0, 100.0)
 LARGEST_SHIFT = 10_000.0
 """Maximum shift of anything, in pixels."""
 LARGER_THAN_IMAGES = 1_000_000
-"""Size, in pixels, of a window that holds any image."""
+"""Size, in pixels, of a window that contains any image."""
 HALF_TURN = SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.pi], dtype=torch.float64))
 """A turn by 180 degrees about the optical axis."""
 
@@ -81,17 +81,18 @@ focal = Fault(
 
 nominal = Fault(
     "1: on, 0: off", SWITCH, 0.0, (1.0,), camera.nominal,
-    summary="only the focal length stated, and as approximate, as of a photo without a calibration",
+    summary="only the focal length stated, and as approximate, as for an uncalibrated photo",
 )  # fmt: skip
 
 stretch = Fault(
     "factor", FACTOR, 1.0, (0.75, 0.9, 1.1, 1.33), camera.stretched,
-    summary="stated focal length across multiplied by a factor, as of an image that was resized to another shape",
+    summary="stated horizontal focal length multiplied by a factor, as if the image's aspect ratio had"
+            " changed",
 )  # fmt: skip
 
 crop = Fault(
     "share of width and height", Range(0.0, 0.9), 0.0, (0.1, 0.25), camera.cropped,
-    summary="rows and columns cut off at a corner, which the stated principal point does not allow for",
+    summary="rows and columns cropped at a corner, not reflected in the stated principal point",
 )  # fmt: skip
 
 principal_point = Fault(
@@ -106,7 +107,7 @@ distortion = Fault(
 
 rolling_shutter = Fault(
     "degrees during the exposure of all rows", Range(0.0, 30.0), 0.0, (0.5, 2.0), camera.rolling_shutter,
-    summary="rows exposed one after the other while the camera turns",
+    summary="rolling shutter while the camera rotates",
 )  # fmt: skip
 
 exposure = Fault(
@@ -156,12 +157,12 @@ moved = Fault(
 
 added = Fault(
     "share of the measured surface", SHARE, 0.0, (0.2,), scene.added_thing, True,
-    summary="a thing on the surface that the map lacks",
+    summary="an object on the surface that the map lacks",
 )  # fmt: skip
 
 vanished = Fault(
     "share of the measured surface", SHARE, 0.0, (0.2,), scene.vanished_thing, True,
-    summary="a piece of the surface gone",
+    summary="a piece of the surface missing",
 )  # fmt: skip
 
 mirror = Fault(

@@ -14,8 +14,8 @@ from bidnerf_core.evaluation.faults.fault import find_fault
 from bidnerf_core.frames.frame import Frame, View
 
 NO_FAULT = "none"
-"""The name that leaves a view as it is."""
-EXAMPLE = "expected NAME:SIZE as depth-scale:1.02"
+"""The name that leaves a view unchanged."""
+EXAMPLE = "expected NAME:SIZE such as depth-scale:1.02"
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class AppliedFault:
 
 
 def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
-    """Return every fault that a command's words name, in canonical form.
+    """Expand a command's words to all the faults they name, in canonical form.
 
-    A word is ``none``, ``NAME:SIZE``, ``NAME:SIZE,SIZE...`` for several faults, or faults of one size each joined by
-    ``+``, which are applied together, from left to right. A fault that is simply on or off needs no size. Raises
-    ``InputError`` for anything else, and for a fault that is named twice.
+    A word is ``none``, ``NAME:SIZE``, ``NAME:SIZE,SIZE...`` for several faults, or faults with one size each
+    joined by ``+``, which are applied together, from left to right. A fault that is simply on or off needs no
+    size. Raises ``InputError`` for anything else, and for duplicate faults.
     """
     found: list[str] = []
     for word in words:
@@ -65,7 +65,7 @@ def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
 
 
 def parse_faults(text: str) -> tuple[AppliedFault, ...]:
-    """Return the faults in a text such as ``depth-scale:1.02+exposure:0.7``; an empty tuple for ``NO_FAULT``."""
+    """Parse a text such as ``depth-scale:1.02+exposure:0.7``; the result is empty for ``NO_FAULT``."""
     if text == NO_FAULT:
         return ()
     faults = tuple(_parsed(part) for part in text.split("+"))
@@ -79,8 +79,8 @@ def parse_faults(text: str) -> tuple[AppliedFault, ...]:
 def faulty(view: View, faults: str | Sequence[AppliedFault], seed: int) -> View:
     """Return the view with all faults, applied in order.
 
-    ``T_ref_camera`` is the true pose of the faulty image. The random choices of a fault depend only on the seed, the frame and
-    the fault, whatever other faults there are.
+    ``T_ref_camera`` is the true pose of the faulty image. The random choices of a fault depend only on the
+    seed, the frame and the fault, regardless of other faults.
     """
     for fault in parse_faults(faults) if isinstance(faults, str) else faults:
         view = fault(view, seed)
@@ -91,7 +91,7 @@ def check_depth(faults: Iterable[str], depth: bool) -> None:
     """Raise ``InputError`` for an unknown fault and, unless ``depth`` is used, for a fault of depth."""
     for part in (part for text in faults for part in parse_faults(text)):
         if find_fault(part.name).needs_depth and not depth:
-            raise InputError(f"fault {part} changes the measured depth, which the method does not get")
+            raise InputError(f"fault {part} changes the measured depth, which the method does not receive")
 
 
 def _parsed(text: str) -> AppliedFault:

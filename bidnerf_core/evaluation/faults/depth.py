@@ -13,7 +13,7 @@ from bidnerf_core.evaluation.faults.warp import nearest
 from bidnerf_core.frames.frame import Frame
 
 PLANE_TRIALS, PLANE_SAMPLE = 256, 4096
-"""Number of planes to try, and of points by which they are compared."""
+"""Number of planes to try, and of points used to compare them."""
 PLANE_TOLERANCE = 0.01
 """Maximum distance of a point from a plane that it belongs to, relative to the point's depth."""
 
@@ -64,7 +64,7 @@ def one_hole(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def misregistered(frame: Frame, pixels: float, generator: Generator) -> Frame:
-    """Move the depth by ``pixels`` relative to the colour image, in a random direction."""
+    """Shift the depth by ``pixels`` relative to the colour image, in a random direction."""
     depth = depth_of(frame)
     move = depth.new_tensor(random_direction(generator)) * pixels
     return replace(frame, depth=nearest(depth, frame.intrinsics.pixel_centres() - move))
@@ -86,7 +86,7 @@ def few_rows(frame: Frame, count: float, generator: Generator) -> Frame:
 
 
 def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Keep only the depth of the plane that holds the most measured points."""
+    """Keep only the depth of the plane that contains the most measured points."""
     if not on:
         return frame
     depth = depth_of(frame)
@@ -103,7 +103,7 @@ def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[
     normals = torch.nn.functional.normalize(crossed, dim=-1)
     planes = torch.cat([normals, -(normals * corners[:, 0]).sum(-1, keepdim=True)], dim=-1)
     planes = planes[crossed.norm(dim=-1) > 0]
-    if len(planes) == 0:  # all points are collinear: any plane through them holds them all
+    if len(planes) == 0:  # all points are collinear: any plane through them contains them all
         return points.new_zeros(4)
     counts = torch.stack([_on_plane(sample, plane).sum() for plane in planes])
     return planes[counts.argmax()]
@@ -125,7 +125,7 @@ def _normal(depth: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
 
 
 def _remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
-    """Return the frame with another depth where there was a measurement; values of 0 and below count as not measured."""
+    """Return the frame with new depth where there was a measurement; values of 0 and below count as not measured."""
     valid = (depth_of(frame) > 0) & (depth > 0)
     return replace(frame, depth=torch.where(valid, depth, torch.zeros_like(depth)))
 

@@ -31,12 +31,12 @@ class Fault:
 
     unit: str  # of the size, in words
     allowed: Range
-    neutral: float | None  # the size that leaves the frame as it is; None where no size does
+    neutral: float | None  # the size that leaves the frame unchanged; None if there is no such size
     sizes: tuple[float, ...]  # sizes worth measuring
     change: Change
     needs_depth: bool = False
     T_true_faulty: SE3 | None = None
-    """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; None where they coincide."""
+    """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; None if they coincide."""
     summary: str = field(kw_only=True)
 
     @property
@@ -60,9 +60,9 @@ def find_fault(name: str) -> Fault:
 
 
 def depth_of(frame: Frame) -> Float[Tensor, "h w"]:
-    """Return the measured depth (planar z, metres). Raises ``InputError`` where nothing was measured."""
+    """Return the measured depth (planar z, metres). Raises ``InputError`` if nothing was measured."""
     if frame.depth is None or not frame.has_depth:
-        raise InputError(f"frame {frame.name} has no measured depth that a fault of depth could change")
+        raise InputError(f"frame {frame.name} has no measured depth for a depth fault to change")
     return frame.depth
 
 
@@ -73,12 +73,12 @@ def random_direction(generator: Generator) -> tuple[float, float]:
 
 
 def uniform_number(generator: Generator, low: float = 0.0, high: float = 1.0) -> float:
-    """Return a number that is uniformly distributed between two limits."""
+    """Return a uniformly distributed number between two limits."""
     return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
 
 def random_pixel(mask: Bool[Tensor, "h w"], generator: Generator) -> tuple[int, int]:
-    """Return the row and the column of a random pixel of ``mask``, which marks at least one."""
+    """Return the row and column of a random pixel of ``mask``, which marks at least one."""
     places = mask.nonzero()
     row, column = places[int(torch.randint(len(places), (), generator=generator))].tolist()
     return row, column

@@ -1,4 +1,4 @@
-"""Faults of the scene: objects in front of it, and objects that moved, appeared or vanished since it was mapped."""
+"""Scene faults: occluding objects, and objects that moved, appeared or vanished since the scene was mapped."""
 
 from __future__ import annotations
 
@@ -27,17 +27,19 @@ TRAVEL, APPROACH = (0.15, 0.3), (0.85, 0.98)
 ADDED_HEIGHT = (0.02, 0.1)
 """Limits of the height of an added object above the surface, towards the camera, relative to the depth."""
 WAVES = (2, 3, 4, 5)
-"""Numbers of periods around a blob's outline of the waves that compose its radius."""
+"""Numbers of periods, around a blob's outline, of the waves that compose its radius."""
 BULGE = 0.35
 """Maximum amplitude of each wave, in the logarithm of the radius."""
 BLOB_OCTAVES = (4, 8, 16, 32, 64, 128)
-"""Numbers of cells along the longer side, for the octaves of noise whose sum is a texture."""
+"""Numbers of cells along the longer side for the octaves of noise that sum to a texture."""
 RIM = 3
 """Width, in pixels, of the surroundings from which a hole is filled."""
 
 
 def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Put a textured object in front of ``share`` of the image. If the frame has depth, that of the object is measured."""
+    """Put a textured object in front of ``share`` of the image. If the frame has depth, the object's depth is
+    measured.
+    """
     mask, colours = _textured_blob(frame, share, generator)
     if frame.depth is None or not frame.has_depth:
         return _pasted(frame, mask, colours, frame.depth)
@@ -54,9 +56,10 @@ def unmeasured_occluder(frame: Frame, share: float, generator: Generator) -> Fra
 
 
 def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Show a piece of the scene at a second place in the image as well, where it covers ``share`` of it, a little nearer.
+    """Show a piece of the scene at a second place in the image, slightly nearer, so that it covers ``share``
+    of the image.
 
-    The features of the copy match those of the map, and agree with each other on a wrong pose.
+    The features of the copy match those of the map, and consistently support a wrong pose.
     """
     height, width = frame.rgb.shape[:2]
     mask = blob(height, width, share, generator)
@@ -68,7 +71,7 @@ def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Put a textured object on ``share`` of the measured surface, from which it protrudes a little."""
+    """Put a textured object on ``share`` of the measured surface, from which it protrudes slightly."""
     mask = _surface_piece(frame, share, generator)
     rise = uniform_number(generator, *ADDED_HEIGHT) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
     colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
@@ -76,10 +79,11 @@ def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Remove ``share`` of the measured surface in one piece, and show the background or the surroundings in its place.
+    """Remove ``share`` of the measured surface in one piece, and show the background or the surroundings in
+    its place.
 
-    Where the frame has alpha and the piece reaches the edge of the scene, the background is seen; otherwise the surrounding
-    colours are continued, at the depth of the farthest surrounding surface.
+    If the frame has alpha and the piece reaches the edge of the scene, the background is visible; otherwise
+    the surrounding colours are continued, at the depth of the farthest surrounding surface.
     """
     mask = _surface_piece(frame, share, generator)
     rim = torch.from_numpy(binary_dilation(mask.numpy(), iterations=RIM)) & ~mask
@@ -135,16 +139,16 @@ def _pasted(
 
 
 def _inpainted(rgb: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
-    """Continue the colours around ``mask`` into it (Telea 2004)."""
+    """Inpaint ``mask`` from the surrounding colours (Telea 2004)."""
     bytes_ = (rgb * 255).round().to(torch.uint8).contiguous().numpy()
     filled = cv2.inpaint(bytes_, mask.to(torch.uint8).numpy(), RIM, cv2.INPAINT_TELEA)
     return torch.from_numpy(filled).to(rgb) / 255
 
 
 def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
-    """Return a mask of one irregular piece around a random place, which covers exactly ``share`` of the image.
+    """Return a mask of one irregular piece around a random place that covers exactly ``share`` of the image.
 
-    With the same state of the generator, a larger share covers all that a smaller one does.
+    With the same generator state, a larger share covers everything that a smaller one does.
     """
     centre = uniform_number(generator, 0.2, 0.8) * width, uniform_number(generator, 0.2, 0.8) * height
     down = torch.arange(height, dtype=torch.float32)[:, None] + 0.5 - centre[1]

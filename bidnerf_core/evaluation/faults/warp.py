@@ -1,4 +1,4 @@
-"""Resampling of images at other places of the image plane."""
+"""Resampling of images at other positions in the image plane."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from bidnerf_core.frames.frame import Frame
 def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
     """Return the frame whose pixel (v, u) shows what ``frame`` shows at ``pixels[v, u]``, given as (u, v).
 
-    Colour and alpha are interpolated, and the values at the border are repeated beyond it. Depth is that of the nearest
-    pixel, since a mean across an edge lies on neither surface; it is 0 beyond the border.
+    Colour and alpha are interpolated, with border values replicated beyond the border. Depth is that of the
+    nearest pixel, since a mean across an edge lies on neither surface; it is 0 beyond the border.
     """
     alpha = None if frame.alpha is None else _interpolated(frame.alpha[..., None], pixels)[..., 0]
     depth = None if frame.depth is None else nearest(frame.depth, pixels)
@@ -25,7 +25,7 @@ def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
 
 
 def reflected(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:
-    """Return pixels (u, v) inside an image: those beyond a border are mirrored at it."""
+    """Return pixels (u, v) inside an image: those beyond a border are reflected at it."""
     size = pixels.new_tensor([width, height])
     folded = pixels.remainder(2 * size)
     return torch.minimum(folded, 2 * size - folded)

@@ -1,1 +1,3 @@
-"""Examples of what bidnerf takes from others by name: a reader, a method, a detector of keypoints and a fault."""
+"""Examples of parts that bidnerf accepts by name from third parties: a reader, a method, a keypoint detector
+and a fault.
+"""

@@ -1,4 +1,4 @@
-"""A detector: OpenCV's ORB, whose 256 bits become as many channels, so that Euclidean distance counts the bits that differ."""
+"""A detector: OpenCV's ORB, whose 256 bits become as many channels, so that Euclidean distance counts differing bits."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bidnerf_core.mapping.landmarks.features import FIRST_CENTRE, grey_image
 
 BITS = 256
 STEP = 32
-"""Value of a bit that is set: squared distances are then of the same order as those of SIFT."""
+"""Value of a set bit: squared distances are then of the same order as those of SIFT."""
 
 
 def detector(rgb: Tensor) -> Keypoints:
-    """ORB (Rublee et al. 2011) by OpenCV, a channel for each of its 256 bits."""
+    """ORB (Rublee et al. 2011) from OpenCV, with one channel for each of its 256 bits."""
     orb = cv2.ORB.create(nfeatures=2000, edgeThreshold=12, patchSize=24, fastThreshold=5)
     found, descriptors = orb.detectAndCompute(grey_image(rgb), None)
     if descriptors is None or not len(found):

@@ -1,4 +1,4 @@
-"""A fault: brightness that varies from row to row, as under a lamp that flickers while rows are exposed."""
+"""A fault: brightness that varies from row to row, as under a flickering lamp with a rolling shutter."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from bidnerf_core.evaluation.faults import Fault
 from bidnerf_core.settings import Range
 
 PERIOD = 24.0
-"""Rows from one bright stripe to the next."""
+"""Number of rows from one bright stripe to the next."""
 
 
 def striped(frame: Frame, size: float, generator: Generator) -> Frame:
-    """Return the frame with stripes of a random phase; ``size`` is their amplitude as a share of the brightness."""
+    """Return the frame with stripes of a random phase; ``size`` is their amplitude relative to the brightness."""
     phase = 2 * math.pi * torch.rand((), generator=generator)
     rows = torch.arange(frame.rgb.shape[0]) * (2 * math.pi / PERIOD)
     gain = 1 + size * (rows + phase).sin()

@@ -1,4 +1,4 @@
-"""A method: the pose by the landmarks of the map alone, without depth, renderings or a second look."""
+"""A method: the pose from the map's landmarks alone, without depth, renderings or a second attempt."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bidnerf_core.settings import Settings
 class LandmarksAloneConfig(Settings):
     """Each field becomes an option of ``bidnerf localize --method landmarks-alone``."""
 
-    least_inliers: int = 12  # least number of landmarks that must agree on an accepted pose
+    least_inliers: int = 12  # minimum number of inliers for an accepted pose
 
 
 def solve(problem: Problem, config: LandmarksAloneConfig, seed: int) -> Localization:
     """Return the pose of the last image. Raises ``InputError`` for a map without landmarks."""
     if problem.matcher is None:
-        raise InputError("method 'landmarks-alone' needs a map with landmarks, which 'bidnerf bake' makes")
+        raise InputError("method 'landmarks-alone' needs a map with landmarks, which 'bidnerf bake' builds")
     began = time.perf_counter()
     found = propose(problem.matcher, problem.views, seed=seed)
     agreeing = 0 if found is None else found.agreeing
@@ -47,5 +47,5 @@ method = Method(
     needs_start=False,
     uses_depth=False,
     uses_landmarks=True,
-    summary="the pose by landmarks alone, accepted if enough of them agree",
+    summary="the pose from landmarks alone, accepted if there are enough inliers",
 )

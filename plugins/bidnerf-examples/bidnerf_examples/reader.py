@@ -1,8 +1,8 @@
 """Folders with a table of poses, as many small robots write them: ``poses.csv``, ``camera.json`` and images.
 
-A row of ``poses.csv`` is the name of an image, its time in seconds, and the twelve numbers of the 3 x 4 matrix
-``T_world_camera`` by rows (metres, x right, y down, z forward). Images are ``NAME.png`` with depth in ``NAME.depth.png``
-(16 bits, millimetres, 0: not measured).
+A row of ``poses.csv`` has the name of an image, its time in seconds, and the twelve numbers of the row-major
+3 x 4 matrix ``T_world_camera`` (metres, x right, y down, z forward). Images are ``NAME.png`` with depth in
+``NAME.depth.png`` (16 bits, millimetres, 0: not measured).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class PoseTable(Dataset):
         return View(frame, self._rows[name].T_world_camera)
 
     def sequence(self) -> FrameSequence:
-        """Return the images in the order of time."""
+        """Return the images in chronological order."""
         rows = sorted(self._rows.values(), key=lambda row: row.time)
         return FileSequence(
             self.path, [SequenceEntry(r.name, r.time, "train", self._reading(r)) for r in rows]
@@ -115,7 +115,7 @@ reader = PoseTableReader()
 
 
 def read_table(file: Path) -> list[Row]:
-    """Return the rows of ``poses.csv``. Raises ``InputError``, which names the line, for one that is not usable."""
+    """Read the rows of ``poses.csv``. Raises ``InputError``, which names the line, for an invalid one."""
     found = []
     with file.open(newline="", encoding="utf-8") as opened:
         for number, cells in enumerate(csv.reader(opened), 1):
@@ -124,7 +124,7 @@ def read_table(file: Path) -> list[Row]:
                 time, *matrix = map(float, values)
                 rows = torch.tensor(matrix, dtype=torch.float64).reshape(3, 4)
             except (ValueError, RuntimeError) as error:
-                raise InputError(f"{file}: line {number} is no name and 13 numbers") from error
+                raise InputError(f"{file}: line {number} is not a name and 13 numbers") from error
             pose = SE3(rows[:, :3], rows[:, 3])
             if not bool(pose.is_rigid()):
                 raise InputError(f"{file}: line {number}: the pose of {name} is not a rigid transform")

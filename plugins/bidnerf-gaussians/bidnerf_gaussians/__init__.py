@@ -1,4 +1,4 @@
-"""Gaussian splats: reads what others trained, or trains them on rays."""
+"""Gaussian splats: imports splats trained elsewhere, or trains them on rays."""
 
 from bidnerf_core.backend import RecipeBackend
 from bidnerf_gaussians.field import GaussiansField

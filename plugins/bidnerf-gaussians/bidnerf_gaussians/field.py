@@ -28,7 +28,7 @@ from bidnerf_gaussians.spherical_harmonics import colours
 LARGEST_ALPHA = 0.999
 """Largest opacity of one Gaussian along a ray, as in gsplat."""
 LEAST_EXTENT = 2.0
-"""Standard deviations to which at least a Gaussian's box extends, so that ``query`` finds nearly all of its density."""
+"""Minimum extent of a Gaussian's box in standard deviations, so that ``query`` finds nearly all of its density."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,14 @@ class FieldConfig:
 
     gaussians: Annotated[int, Range(1, 2 * 10**8)] = 30_000  # number of Gaussians
     degree: Annotated[int, Range(0, 3)] = 0  # degree of the spherical harmonics of colours
-    # composite in the order of the means, as image rasterizers do, instead of in that of the peaks along a ray
+    # composite in the order of the means, as image rasterizers do, instead of the order of the peaks along a
+    # ray
     by_means: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class _Peaks:
-    """Where lines come nearest to Gaussians, in their metric, and what is seen there."""
+    """Where lines come nearest to Gaussians, in the Gaussians' metric, and what is seen there."""
 
     distance: Float[Tensor, "*p"]  # metres from the line's origin; may be negative
     mean: Float[Tensor, "*p"]  # metres: distance of the mean from the line's origin
@@ -52,11 +53,13 @@ class _Peaks:
 
 
 class GaussiansField(nn.Module):
-    """Gaussians that a ray meets at its peak in each, nearest first, as in 3D Gaussian ray tracing (Moenne-Loccoz et al. 2024).
+    """Gaussians, each evaluated at its peak along a ray, nearest first, as in 3D Gaussian ray tracing
+    (Moenne-Loccoz et al. 2024).
 
-    Along a ray with origin o and direction d, a Gaussian of precision P about m is largest at ``t = d'P(m - o) / d'Pd``; its
-    opacity times its value there is alpha. ``hits`` gives these, in the order in which they are composited. Their optical thickness ``-log(1 - alpha)``, spread over the
-    ray as the Gaussian is, makes the density that ``query`` returns: its integral along a ray gives the same opacity.
+    Along a ray with origin o and direction d, a Gaussian with precision P and mean m is largest at ``t =
+    d'P(m - o) / d'Pd``; its opacity times its value there is alpha. ``hits`` returns these in compositing
+    order. Their optical thickness ``-log(1 - alpha)``, distributed along the ray like the Gaussian, is the
+    density that ``query`` returns: its integral along a ray gives the same opacity.
     """
 
     order: Tensor
@@ -84,7 +87,7 @@ class GaussiansField(nn.Module):
 
     @torch.no_grad()
     def refit(self) -> None:
-        """Make the tree anew, after the Gaussians have moved."""
+        """Rebuild the tree after the Gaussians have moved."""
         opacity = self.logits.sigmoid()
         seen = opacity >= LEAST_OPACITY
         # alpha falls to the least opacity at this many standard deviations
@@ -98,7 +101,7 @@ class GaussiansField(nn.Module):
 
     @torch.no_grad()
     def assign(self, gaussians: Gaussians) -> None:
-        """Take on the parameters of as many Gaussians, of the same degree."""
+        """Copy the parameters of the same number of Gaussians of the same degree."""
         for name in ("means", "log_scales", "quaternions", "logits", "harmonics"):
             getattr(self, name).copy_(getattr(gaussians, name))
         self.refit()
@@ -117,7 +120,7 @@ class GaussiansField(nn.Module):
 
     @property
     def sampler(self) -> PeakSampler:
-        """The sampler that puts an interval about each peak."""
+        """The sampler that places an interval around each peak."""
         return PeakSampler(self)
 
     def hits(self, rays: Rays) -> RayHits:
@@ -140,9 +143,10 @@ class GaussiansField(nn.Module):
 
     @torch.no_grad()
     def met(self, rays: Rays, by_means: bool) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        """Return the numbers of the Gaussians that rays (r) meet, nearest first, up to where hardly any light is left.
+        """Return the indices of the Gaussians that rays (r) hit, nearest first, until hardly any light is
+        left.
 
-        With ``by_means``, that with the nearest mean comes first, and otherwise that with the nearest peak.
+        With ``by_means``, they are ordered by the distance of the mean, otherwise by that of the peak.
         """
 
         def meet(index: Tensor, origins: Tensor, directions: Tensor) -> Meeting:
@@ -159,7 +163,7 @@ class GaussiansField(nn.Module):
     def _about(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> tuple[Int[Tensor, "q"], Float[Tensor, "q"], Float[Tensor, "q 3"]]:
-        """Return the pairs of a point and a piece about it, with density and colour."""
+        """Return the pairs of a point and a nearby piece, with density and colour."""
         point, index, counts = pieces_about(positions, self.boxes, self.order)
         towards = directions.index_select(0, point)
         peaks = self._peaks(index, positions.index_select(0, point), towards)
@@ -174,13 +178,13 @@ class GaussiansField(nn.Module):
     def _peaks(
         self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> _Peaks:
-        """Return where lines come nearest to the Gaussians number ``index``."""
+        """Return where lines come nearest to the Gaussians with indices ``index``."""
         means, widths, turns, logits = (
             part.index_select(0, index)
             for part in (self.means, self.log_scales, self.quaternions, self.logits)
         )
         turns = turns * turns.square().sum(-1, keepdim=True).clamp(min=1e-24).rsqrt()
-        # From the point nearest to the mean, so that rounding is that of lengths about the Gaussian.
+        # Relative to the point nearest to the mean, so that rounding is that of lengths around the Gaussian.
         away = means - origins
         along = (away * directions).sum(-1, keepdim=True)
         narrow = (-widths).exp()
@@ -197,10 +201,10 @@ class GaussiansField(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class PeakSampler:
-    """An interval about each Gaussian that a ray meets, as long as its density is there divided by its peak.
+    """An interval around each Gaussian that a ray hits, as long as its density there divided by its peak.
 
-    Where a Gaussian stands alone, density times length is its optical thickness; where several overlap, their intervals end
-    half-way between their peaks. ``hits`` is exact, and what the core renders.
+    For an isolated Gaussian, density times length is its optical thickness; if several overlap, their
+    intervals end half-way between their peaks. ``hits`` is exact, and is what the core renders.
     """
 
     field: GaussiansField

@@ -1,4 +1,4 @@
-"""A set of Gaussians as a file holds it, before it is a field."""
+"""A set of Gaussians as stored in a file, before it becomes a field."""
 
 from __future__ import annotations
 
@@ -17,18 +17,16 @@ COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 LARGEST = 1e12
 """Scene units: largest coordinate and size of a Gaussian."""
 LARGEST_LOGIT = 14.0
-"""Logit of the opacity at which alpha is 1 in single precision, for all that matters."""
+"""Logit of an opacity at which alpha is practically 1 in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """The parameters of n Gaussians, in the terms of the first paper's code (Kerbl et al. 2023)."""
+    """The parameters of n Gaussians, in the terms of the original 3DGS code (Kerbl et al. 2023)."""
 
     means: Float[Tensor, "n 3"]  # scene units, world
     log_scales: Float[Tensor, "n 3"]  # logarithms of the standard deviations along the axes
-    quaternions: Float[
-        Tensor, "n 4"
-    ]  # w, x, y, z of the rotation that takes the axes to the world; not normalized
+    quaternions: Float[Tensor, "n 4"]  # w, x, y, z of the rotation from the axes to the world; not normalized
     logits: Float[Tensor, "n"]  # opacity is their sigmoid
     harmonics: Float[
         Tensor, "n k 3"
@@ -53,7 +51,7 @@ class Gaussians:
     def similar(
         self, scale: float, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
     ) -> Gaussians:
-        """Return the Gaussians moved by ``x -> rotation @ (scale * x) + translation``; colours turn with them."""
+        """Return the Gaussians transformed by ``x -> rotation @ (scale * x) + translation``; colours rotate with them."""
         R = rotation.double()
         means = (scale * self.means.double()) @ R.mT + translation.double()
         turn = quaternion_of(R).to(self.quaternions)
@@ -71,16 +69,16 @@ class Gaussians:
 class Dropped:
     """How many Gaussians of a file were left out, and why."""
 
-    not_finite: int = 0  # a number of theirs is NaN or infinite, or too large
+    not_finite: int = 0  # one of their numbers is NaN or infinite, or too large
     without_rotation: int = 0  # their quaternion is zero
-    invisible: int = 0  # their opacity is below what is ever rendered
+    invisible: int = 0  # their opacity is below anything ever rendered
 
     def __str__(self) -> str:
         parts = [
             f"{count:,} {what}"
             for count, what in (
                 (self.not_finite, "with numbers that are not finite or too large"),
-                (self.without_rotation, "with a quaternion of zero"),
+                (self.without_rotation, "with a zero quaternion"),
                 (self.invisible, "that are transparent"),
             )
             if count
@@ -89,13 +87,14 @@ class Dropped:
 
 
 LEAST_OPACITY = 1 / 255
-"""Opacity below which a Gaussian is never seen; also of alpha along a ray, as in the first paper's code."""
+"""Opacity below which a Gaussian is never visible; also the threshold on alpha along a ray, as in the
+original 3DGS code."""
 
 
 def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
     """Return the Gaussians that can be rendered, and how many were left out.
 
-    Raises ``InputError`` where none is left; ``where`` begins the message.
+    Raises ``InputError``, whose message begins with ``where``, if none is left.
     """
     if found.harmonics.shape[1] not in COEFFICIENTS.values():
         raise InputError(
@@ -111,7 +110,7 @@ def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
     if not bool(kept.any()):
         what = f": {dropped}" if len(found) else ""
         raise InputError(
-            f"{where}: none of its {len(found):,} Gaussians can be rendered{what}, expected one or more"
+            f"{where}: none of its {len(found):,} Gaussians can be rendered{what}, expected at least one"
         )
     few = found if bool(kept.all()) else found[kept]
     return Gaussians(

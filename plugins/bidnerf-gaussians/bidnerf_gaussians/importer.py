@@ -27,30 +27,31 @@ from bidnerf_gaussians.gaussians import Gaussians, cleaned
 from bidnerf_gaussians.recipe import GaussiansConfig
 
 DILATION = 0.3
-"""Square pixels that the first paper's code adds to the covariance of each Gaussian in an image."""
+"""Square pixels that the original 3DGS code adds to the covariance of each Gaussian in an image."""
 OPAQUE = 0.3
-"""Opacity from which a Gaussian counts as matter, where the extent of a scene is measured."""
+"""Opacity from which a Gaussian counts as matter in measuring the extent of a scene."""
 FEWEST = 100
-"""Opaque Gaussians below which all count."""
+"""Number of opaque Gaussians below which all Gaussians count."""
 UP = (0.0, -1.0, 0.0)
 
 
 @dataclass(frozen=True)
 class ImportSettings(Settings):
-    """What a file does not say."""
+    """Settings that a file does not contain."""
 
-    # angle between neighbouring pixels of the training images (radians), by which the first paper's code widens small Gaussians; 0: not widened
+    # angle between neighbouring pixels of the training images (radians), by which the original 3DGS code
+    # widens small Gaussians; 0: not widened
     pixel_angle: Annotated[float, Range(0, 0.1)] = 0.001
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour (rgb) where a ray meets nothing
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour (rgb) where a ray hits nothing
     degree: Annotated[int, Range(0, 3)] = 3  # highest degree of the harmonics that is kept
-    # composite in the order of the means, as the renderers do with which splats are trained
+    # composite in the order of the means, as do the renderers with which splats are trained
     by_means: bool = True
     least_opacity: NotNegative = 0.0  # opacity below which Gaussians are left out
 
 
 @dataclass(frozen=True)
 class GaussiansImporter:
-    """Reads files of Gaussians of all formats."""
+    """Reads files of Gaussians in all formats."""
 
     summary: str = "Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, .glb, checkpoints of gsplat and splatfacto"
     config_type: type = ImportSettings
@@ -63,10 +64,10 @@ class GaussiansImporter:
             return False
 
     def read(self, path: Path, config: ImportSettings, placement: Similarity) -> ImportedField:
-        """Return the field of the Gaussians in a file, see ``Importer``."""
+        """Read the Gaussians in a file as a field, see ``Importer``."""
         found = format_of(path)
         if found is None:
-            raise InputError(f"{path}: no file of Gaussians that can be read, expected {self.summary}")
+            raise InputError(f"{path}: not a readable file of Gaussians, expected {self.summary}")
         return imported(
             found.read(path), str(path), config, placement, found, _cameras_beside(path, placement)
         )
@@ -77,12 +78,12 @@ def imported(
     placement: Similarity = UNMOVED, of: Format | None = None,
     cameras: tuple[StoredCamera, ...] = (),
 ) -> ImportedField:  # fmt: skip
-    """Return Gaussians of any source as a field. Raises ``InputError`` where none of them can be rendered."""
+    """Build a field from Gaussians of any source. Raises ``InputError`` if none of them can be rendered."""
     kept, dropped = cleaned(gaussians, where)
     if config.least_opacity:
         before, kept = len(kept), kept[kept.opacities >= config.least_opacity]
         if not len(kept):
-            raise InputError(f"{where}: no Gaussian is as opaque as {config.least_opacity:g} (least_opacity)")
+            raise InputError(f"{where}: no Gaussian reaches opacity {config.least_opacity:g} (least_opacity)")
     count = len(gaussians)
     kept = replace(kept, harmonics=kept.harmonics[:, : (config.degree + 1) ** 2])
     T = placement.T_target_source
@@ -98,7 +99,7 @@ def imported(
     if str(dropped):
         facts.append(f"left out {dropped}")
     if config.least_opacity:
-        facts.append(f"left out {before - len(kept):,} of an opacity below {config.least_opacity:g}")
+        facts.append(f"left out {before - len(kept):,} with an opacity below {config.least_opacity:g}")
     if of is not None:
         facts.append(f"axes: {of.convention}")
     up = T.rotation.double() @ torch.tensor(UP if of is None else of.up, dtype=torch.float64)
@@ -111,11 +112,12 @@ def imported(
 def with_dilation(
     gaussians: Gaussians, pixel_angle: float, cameras: tuple[StoredCamera, ...] = ()
 ) -> Gaussians:
-    """Return the Gaussians as wide as a renderer of images shows them: no narrower than about half a pixel.
+    """Return the Gaussians as wide as an image renderer shows them: at least about half a pixel.
 
-    The first paper's code adds ``DILATION`` square pixels to the covariance in the image, and Gaussians are trained with it. A
-    ray has no width, so the Gaussians themselves are widened by what a pixel covers at their distance from the nearest camera
-    or, where no camera is known, from half the scene's diameter away (as in the 3D filter of Yu et al. 2024).
+    The original 3DGS code adds ``DILATION`` square pixels to the covariance in the image, and Gaussians are
+    trained with it. A ray has no width, so the Gaussians themselves are widened by the size of a pixel at
+    their distance from the nearest camera or, if no camera is known, from half the scene's diameter away (as
+    in the 3D filter of Yu et al. 2024).
     """
     if pixel_angle == 0:
         return gaussians
@@ -136,15 +138,15 @@ def _distances(means: Float[Tensor, "n 3"], cameras: tuple[StoredCamera, ...]) -
 
 
 def _cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
-    """Return the cameras in the ``cameras.json`` that the first paper's code writes at the top of its output."""
+    """Return the cameras in the ``cameras.json`` that the original 3DGS code writes at the top of its output."""
     folders = [path.parent, *list(path.parent.parents)[:2]]
     file = next((folder / "cameras.json" for folder in folders if (folder / "cameras.json").is_file()), None)
     if file is None:
         return ()
     try:
         return _inria_cameras(file, placement)
-    except InputError as error:  # it may be another program's, with no word of these Gaussians
-        warnings.warn(f"{error}; left aside", InputWarning, stacklevel=2)
+    except InputError as error:  # it may be another program's, unrelated to these Gaussians
+        warnings.warn(f"{error}; ignored", InputWarning, stacklevel=2)
         return ()
 
 

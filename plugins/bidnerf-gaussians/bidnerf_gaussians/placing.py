@@ -1,4 +1,4 @@
-"""Where the Gaussians of a training begin: on measured depth, on landmarks, in silhouettes, else anywhere."""
+"""Initial placement of Gaussians for training: on measured depth, on landmarks, within silhouettes, else anywhere."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from bidnerf_gaussians.gaussians import Gaussians
 from bidnerf_gaussians.spherical_harmonics import C0
 
 CELLS = 96
-"""Along each side of the grid in which silhouettes are carved."""
+"""Cells along each side of the grid in which silhouettes are carved."""
 OPACITY = 0.1
-"""Opacity of a Gaussian at first, as in the first paper's code; on measured points it is larger."""
+"""Initial opacity of a Gaussian, as in the original 3DGS code; larger on measured points."""
 MEASURED_OPACITY = 0.5
 NEIGHBOURS = 3
-"""Neighbours whose mean distance is the width of a Gaussian at first."""
+"""Number of neighbours whose mean distance is the initial width of a Gaussian."""
 
 
 def first_gaussians(
@@ -49,7 +49,7 @@ def first_gaussians(
 
 
 def _widths(means: Float[Tensor, "n 3"], unit: float) -> Float[Tensor, "n"]:
-    """Return the mean distance of each point from its nearest neighbours (metres), within reason."""
+    """Return the mean distance of each point from its nearest neighbours (metres), within limits."""
     if len(means) <= NEIGHBOURS:
         return torch.full((len(means),), unit)
     distances, _ = cKDTree(means.numpy()).query(means.numpy(), k=NEIGHBOURS + 1)
@@ -99,7 +99,7 @@ def _with_distance(
 def _anywhere(
     views: Sequence[View], bounds: SceneBounds, count: int, generator: Generator
 ) -> Float[Tensor, "n 3"]:
-    """Return random points (metres, world) where the views do not show that there is nothing."""
+    """Return random points (metres, world) that the views do not show to be empty."""
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
     if count <= 0:
         return torch.zeros(0, 3)
@@ -117,6 +117,6 @@ def _anywhere(
 
 
 def _surrounded(held: Tensor) -> Tensor:
-    """Return which cells have neighbours that are all held, so that no camera sees them."""
+    """Return which cells have only occupied neighbours, so that no camera sees them."""
     empty = torch.nn.functional.max_pool3d((~held)[None, None].float(), 3, stride=1, padding=1)
     return empty[0, 0] == 0

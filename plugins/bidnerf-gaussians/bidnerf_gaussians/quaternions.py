@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def turned_back(quaternions: Float[Tensor, "*p 4"], vectors: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-    """Return the vectors turned by the inverses of unit quaternions."""
+    """Rotate vectors by the inverses of unit quaternions."""
     w, axis = quaternions[..., :1], quaternions[..., 1:]
     twice = 2 * torch.linalg.cross(vectors, axis)
     return vectors + w * twice + torch.linalg.cross(twice, axis)
@@ -26,7 +26,7 @@ def matrices(quaternions: Float[Tensor, "*p 4"]) -> Float[Tensor, "*p 3 3"]:
 
 
 def product(a: Float[Tensor, "*p 4"], b: Float[Tensor, "*p 4"]) -> Float[Tensor, "*p 4"]:
-    """Return the quaternions that turn as ``b`` does and then as ``a`` does."""
+    """Return the product: the rotation ``b`` followed by ``a``."""
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     w = aw * bw - (av * bv).sum(-1, keepdim=True)
     return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], dim=-1)

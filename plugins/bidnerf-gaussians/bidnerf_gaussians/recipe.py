@@ -1,4 +1,4 @@
-"""Training of Gaussians on rays, from where depth, landmarks or silhouettes show matter."""
+"""Training of Gaussians on rays, starting where depth, landmarks or silhouettes show matter."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from bidnerf_gaussians.placing import first_gaussians
 from bidnerf_gaussians.relocation import relocate
 
 NARROWEST = 0.25
-"""Standard deviation of a Gaussian, in footprints of a pixel, below which none shrinks: finer ones fall between the rays."""
+"""Smallest standard deviation of a Gaussian, in pixel footprints: smaller ones would fall between the rays."""
 FLATTEST = 0.01
-"""Like ``NARROWEST``, where the footprint is not known: in units of the mean distance between the Gaussians of a surface."""
+"""Like ``NARROWEST``, if the footprint is unknown: in units of the mean distance between the Gaussians of a surface."""
 
 
 @dataclass(frozen=True)
@@ -36,18 +36,14 @@ class GaussiansConfig(FieldConfig, SupervisionConfig):
     scale_rate: NotNegative = 0.01  # learning rate of the logarithms of the scales
     turn_rate: NotNegative = 0.005  # learning rate of the quaternions
     opacity_rate: NotNegative = 0.05  # learning rate of the logits of the opacities
-    colour_rate: NotNegative = (
-        0.02  # learning rate of the colours; that of the other harmonics is a tenth of it
-    )
+    colour_rate: NotNegative = 0.02  # learning rate of the colours; a tenth of it for the other harmonics
     seed: Annotated[int, Range(0)] = 0  # seed of all random draws
-    refit_every: Count = 10  # steps from one update of the tree of boxes to the next
-    relocate_every: Count = (
-        100  # steps after which Gaussians that are hardly seen are put where more are needed
-    )
-    relocate_until: Annotated[float, Range(0, 1)] = 0.7  # fraction of the steps in which they are
-    # weight of the mean opacity, which lets Gaussians vanish that are not needed
+    refit_every: Count = 10  # steps between updates of the tree of boxes
+    relocate_every: Count = 100  # steps between relocations of Gaussians that are hardly visible
+    relocate_until: Annotated[float, Range(0, 1)] = 0.7  # fraction of the steps with relocations
+    # weight of the mean opacity, which makes unneeded Gaussians vanish
     opacity_weight: NotNegative = 0.001
-    least_opacity: Positive = 0.01  # opacity below which a Gaussian is put elsewhere
+    least_opacity: Positive = 0.01  # opacity below which a Gaussian is relocated
 
 
 def train(field: GaussiansField, views: Sequence[View], config: GaussiansConfig, report: Report) -> None:

@@ -1,4 +1,4 @@
-"""Densification with a fixed number: Gaussians that are hardly seen are put where others carry much."""
+"""Densification with a fixed number: Gaussians that are hardly visible are moved to where others contribute much."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.quaternions import matrices
 
 MOST_MOVED = 0.05
-"""Largest share of the Gaussians that is moved at once."""
+"""Largest fraction of the Gaussians moved at once."""
 NARROWED = 1.6
-"""Factor by which the two Gaussians that replace one are narrower, as in the first paper's code."""
+"""Factor by which the two Gaussians that replace one are narrower, as in the original 3DGS code."""
 
 
 @torch.no_grad()
 def relocate(field: GaussiansField, least_opacity: float, generator: Generator) -> int:
-    """Split opaque and wide Gaussians, each with one that is nearly transparent, and return how many were moved.
+    """Split opaque and wide Gaussians, reusing nearly transparent ones, and return how many were moved.
 
-    The split ones are drawn by opacity times the area that they cover. Both parts have the opacity with which two behind each other
-    are as opaque as the one was (Kheradmand et al. 2024, eq. 9), and lie about its middle as its own density does.
+    The split ones are drawn by opacity times covered area. Both parts get the opacity with which the two, one
+    behind the other, are as opaque as the original (Kheradmand et al. 2024, eq. 9), and are placed around its
+    mean according to its own density.
     """
     opacity = field.logits.sigmoid().cpu()
     dead = (opacity < least_opacity).nonzero()[:, 0]

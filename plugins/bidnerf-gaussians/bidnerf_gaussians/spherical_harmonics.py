@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, with the signs and the order of the first paper's code (Kerbl et al. 2023)."""
+"""Real spherical harmonics up to degree 3, with the signs and order of the original 3DGS code (Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def basis(directions: Float[Tensor, "*p 3"], count: int) -> Float[Tensor, "*p k"
 
 
 def colours(harmonics: Float[Tensor, "*p k 3"], directions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-    """Return the colours that harmonics have when seen along unit directions, in [0, 1]."""
+    """Evaluate the colours of harmonics along unit directions, in [0, 1]."""
     if harmonics.shape[-2] == 1:
         return (0.5 + C0 * harmonics[..., 0, :]).clamp(0, 1)
     weights = basis(directions, harmonics.shape[-2])
@@ -45,9 +45,10 @@ def colours(harmonics: Float[Tensor, "*p k 3"], directions: Float[Tensor, "*p 3"
 
 
 def rotated(harmonics: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """Return the harmonics of what is turned by ``rotation``: seen along ``R d``, they are what they were along ``d``.
+    """Rotate harmonics by ``rotation``: seen along ``R d``, they are what they were along ``d``.
 
-    Each degree mixes within itself, by the matrix that relates the harmonics at some directions to those at the turned ones.
+    Each degree mixes within itself, by the matrix that relates the harmonics at some directions to those at
+    the rotated ones.
     """
     count = harmonics.shape[1]
     generator = torch.Generator().manual_seed(0)

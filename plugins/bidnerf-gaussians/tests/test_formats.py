@@ -259,7 +259,7 @@ def test_gltf(tmp_path: Path, some: Some) -> None:
         with pytest.raises(InputError, match=r"is too short|is damaged"):
             read_gaussians(path)
     path.write_bytes(glb(some(3))[:-20])
-    with pytest.raises(InputError, match="is cut off"):
+    with pytest.raises(InputError, match="is truncated"):
         read_gaussians(path)
     path.write_bytes(glb(some(4)).replace(b'"count": 4', b'"count": 3', 1))
     with pytest.raises(InputError, match="one for each Gaussian"):
@@ -341,29 +341,29 @@ def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -
     no_image = parts | {"quats.webp": b"no image"}
     huge = json.loads(parts["meta.json"]) | {"count": 10**12}
     cases: dict[str, tuple[bytes, str]] = {
-        "huge.ply": (inria(10**12), "are too few"),
+        "huge.ply": (inria(10**12), "too few"),
         "lists.ply": (inria(1).replace(b"property float x", b"property list uchar int l\nproperty float x"), "lists of numbers"),
-        "bare.ply": (inria(1).replace(b"element vertex", b"element bare 1000000000000\nelement vertex"), "no file of Gaussians"),
-        "cut.ply": (inria(3, body=bytes(100)), "are too few"),
+        "bare.ply": (inria(1).replace(b"element vertex", b"element bare 1000000000000\nelement vertex"), "not a readable file of Gaussians"),
+        "cut.ply": (inria(3, body=bytes(100)), "too few"),
         "degree.ply": (inria(1, 10, bytes(24 * 4)), "properties f_rest_N"),
         "chunks.ply": (compressed_ply((0, 2)), "too few chunks"),
         "odd.splat": (bytes(33), "multiple of 32"),
         "empty.splat": (b"", "multiple of 32"),
-        "cut.spz": (good[: len(good) // 2], "data end after"),
+        "cut.spz": (good[: len(good) // 2], "data ends after"),
         "huge.spz": (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2**32 - 1, 3, 12, 0, 0)), "more than its"),
-        "short.spz": (gzip.compress(unpacked[:-10]), "data end after"),
+        "short.spz": (gzip.compress(unpacked[:-10]), "data ends after"),
         "degree.spz": (gzip.compress(unpacked[:12] + b"\x07" + unpacked[13:]), "degree 7"),
         "version.spz": (gzip.compress(unpacked[:4] + b"\x09" + unpacked[5:]), "version 9"),
         "huge4.spz": (struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10**3, 0, 12, 0, 5, 32) + bytes(80), "is it truncated"),
         "dense4.spz": (struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10**9, 0, 12, 0, 5, 32) + bytes(80), "can hold"),
         "none.sog": (b"no archive", "not a zip archive"),
-        "text.pt": (b"no checkpoint", "no file of Gaussians"),
-        "mesh.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "no file of Gaussians"),
+        "text.pt": (b"no checkpoint", "not a readable file of Gaussians"),
+        "mesh.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "not a readable file of Gaussians"),
     }  # fmt: skip
     archive = bytearray(write_sog(tmp_path / "a.sog", parts).read_bytes())
     archive[6] |= 1  # "encrypted", in both headers of the first member
     archive[archive.index(b"PK\x01\x02") + 8] |= 1
-    cases["encrypted.sog"] = bytes(archive), "has no readable"
+    cases["encrypted.sog"] = bytes(archive), "contains no readable"
     for name, content in (
         ("noimage.sog", no_image),
         ("huge.sog", parts | {"meta.json": json.dumps(huge).encode()}),

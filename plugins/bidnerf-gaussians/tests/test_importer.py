@@ -75,7 +75,7 @@ def test_the_cameras_beside_a_file_are_its_viewpoints(file: Path) -> None:
     assert camera.pose.translation.tolist() == [2, 4, 6]
 
     (file.parent / "cameras.json").write_text('{"another": "program\'s"}')
-    with pytest.warns(InputWarning, match="left aside"):
+    with pytest.warns(InputWarning, match="ignored"):
         assert import_map(file, bake=False).info.cameras
 
 

@@ -1,4 +1,4 @@
-"""Coarse and fine networks as krrish94/nerf-pytorch trains them; reads its checkpoints."""
+"""Coarse and fine networks as trained by krrish94/nerf-pytorch; reads its checkpoints."""
 
 from bidnerf_core.backend import RecipeBackend
 from bidnerf_nerf_pytorch.checkpoint import Checkpoint, read_checkpoint

@@ -1,4 +1,6 @@
-"""Reading of checkpoints. The architecture is inferred from the weights, since the accompanying config file may differ."""
+"""Reading of checkpoints. The architecture is inferred from the weights, since the accompanying config file
+may differ.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io.torch_files import check_sizes, outline_of, read_saved
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 
-EXPECTED = "a checkpoint of nerf-pytorch"
+EXPECTED = "a nerf-pytorch checkpoint"
 NETWORKS = {"coarse": "model_coarse_state_dict", "fine": "model_fine_state_dict"}
 HIDDEN = re.compile(r"layers_xyz\.\d+\.weight")
 
@@ -23,7 +25,7 @@ class Checkpoint:
     """Two networks of one architecture."""
 
     network: NetworkConfig
-    tensors: dict[str, Tensor]  # as the field's state_dict names them
+    tensors: dict[str, Tensor]  # named as in the field's state_dict
     steps: int  # of training
 
 
@@ -34,16 +36,17 @@ def is_checkpoint(path: Path) -> bool:
 
 
 def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
-    """Return the networks in ``path``, without running any code in it.
+    """Read the networks in ``path``, without running any code in it.
 
-    ``octaves`` is the only choice that the weights do not show. Raises ``InputError``, in one line, where there is no such
-    file, it holds code or is not a checkpoint of nerf-pytorch, the fine network is missing, or the architecture is unknown.
+    ``octaves`` is the only choice that the weights do not reveal. Raises a one-line ``InputError`` if there
+    is no such file, it contains code or is not a nerf-pytorch checkpoint, the fine network is missing, or the
+    architecture is unknown.
     """
     found = read_saved(path, EXPECTED)
     if not isinstance(found, dict) or not isinstance(found.get(NETWORKS["coarse"]), dict):
-        raise InputError(f"{path}: no {NETWORKS['coarse']!r} in it, expected a checkpoint of nerf-pytorch")
+        raise InputError(f"{path}: contains no {NETWORKS['coarse']!r}, expected a nerf-pytorch checkpoint")
     if not isinstance(found.get(NETWORKS["fine"]), dict):
-        raise InputError(f"{path}: it has no fine network, expected a coarse and a fine one")
+        raise InputError(f"{path}: has no fine network, expected a coarse and a fine one")
     check_sizes(path, [found[key] for key in NETWORKS.values()], EXPECTED)
     kinds: dict[str, NetworkConfig] = {}
     tensors: dict[str, Tensor] = {}
@@ -51,13 +54,15 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
         kinds[level] = _architecture(found[key], octaves, f"{path}: {level} network")
         tensors |= {f"{level}.network.{name}": value.float() for name, value in found[key].items()}
     if kinds["coarse"] != kinds["fine"]:
-        raise InputError(f"{path}: the networks differ ({kinds['coarse']}; {kinds['fine']}), expected alike")
+        raise InputError(
+            f"{path}: the networks differ ({kinds['coarse']}; {kinds['fine']}), expected equal ones"
+        )
     steps = found.get("iter")
     return Checkpoint(kinds["fine"], tensors, steps + 1 if type(steps) is int and steps >= 0 else 0)
 
 
 def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> NetworkConfig:
-    """Return the architecture that the shapes imply, after checking that such a network has exactly these tensors."""
+    """Infer the architecture from the shapes, after checking that such a network has exactly these tensors."""
     shapes = {name: tuple(getattr(value, "shape", ())) for name, value in tensors.items()}
     width, seen = _sizes(shapes.get("layer1.weight"), where)
     inputs = [shapes.get(f"layers_xyz.{i}.weight", ()) for i in range(sum(map(_is_hidden, shapes)))]
@@ -85,7 +90,7 @@ def _sizes(shape: tuple[int, ...] | None, where: str) -> tuple[int, int]:
 
 
 def _frequencies(width: int, where: str) -> tuple[int, bool]:
-    """Return the number of frequencies of an encoding of length ``width``, and whether the input itself is part of it."""
+    """Return the number of frequencies of an encoding of length ``width``, and whether it includes the input itself."""
     if width < 3 or width % 3:
         raise InputError(f"{where}: unknown architecture, {width} inputs where a multiple of 3 was expected")
     return width // 6, width // 3 % 2 == 1
@@ -99,4 +104,4 @@ def _check(tensors: dict[str, Any], shapes: dict[str, tuple[int, ...]], network:
             raise InputError(f"{where}: unknown architecture, {name!r} is {found}, expected {wanted}")
         value = tensors[name]
         if not (value.is_floating_point() and bool(value.isfinite().all())):
-            raise InputError(f"{where}: {name!r} is not made of finite numbers")
+            raise InputError(f"{where}: {name!r} has values that are not finite numbers")

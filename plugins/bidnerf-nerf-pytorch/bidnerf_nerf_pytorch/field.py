@@ -23,7 +23,7 @@ class FieldConfig(NetworkConfig):
 
 
 class Level(nn.Module):
-    """A network and its sampler. Positions are in the world of its training, and are not scaled."""
+    """A network and its sampler. Positions are in the world it was trained in, and are not scaled."""
 
     def __init__(self, config: NetworkConfig, sampler: RaySampler) -> None:
         super().__init__()

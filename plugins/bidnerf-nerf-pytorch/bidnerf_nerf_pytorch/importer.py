@@ -22,7 +22,7 @@ Box = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class ImportSettings(Settings):
-    """What a checkpoint does not say."""
+    """Settings that a checkpoint does not contain."""
 
     near: float = 2.0  # distance along a ray before which there is nothing, in the scene's unit
     far: float = 6.0  # distance along a ray beyond which there is nothing
@@ -31,7 +31,9 @@ class ImportSettings(Settings):
     box: Box = (-1.5, -1.5, -1.5, 1.5, 1.5, 1.5)
     coarse_samples: Count = 64  # places on a ray at which the coarse network is evaluated
     fine_samples: Count = 64  # further places at which the fine network is evaluated
-    octaves: bool = True  # whether frequencies double (nerf-pytorch's log_sampling), which no weight shows
+    octaves: bool = (
+        True  # whether frequencies double (nerf-pytorch's log_sampling), which the weights do not reveal
+    )
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,11 @@ class NerfPytorchImporter:
             return False
 
     def read(self, path: Path, config: ImportSettings, placement: Similarity) -> ImportedField:
-        """Return the field of both networks, see ``Importer``. It stays in the world that it was trained in."""
+        """Read the field of both networks, see ``Importer``. It stays in the world that it was trained in."""
         if not placement.is_identity:
             raise InputError(
-                f"{path}: networks cannot be moved or scaled; expected photos in their world, and no scale or pose of it"
+                f"{path}: networks cannot be moved or scaled; expected photos in their world, without scale"
+                " or pose"
             )
         bounds = SceneBounds(
             config.box[:3], config.box[3:], config.near, config.far, background_colour(config.background)

@@ -1,4 +1,4 @@
-"""The network that krrish94/nerf-pytorch calls ``FlexibleNeRFModel``, tensor names included."""
+"""The network that krrish94/nerf-pytorch calls ``FlexibleNeRFModel``, including tensor names."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class NetworkConfig(Settings):
 class Network(nn.Module):
     """Maps positions (world) and unit directions to raw density and colour.
 
-    As in the original, the first layer has no activation. Unlike in the original, the density is initially a thin fog: if a
-    ReLU made it zero everywhere, there would be no gradient by which to recover.
+    As in the original, the first layer has no activation. Unlike in the original, the density is initially a
+    thin fog: if a ReLU made it zero everywhere, there would be no gradient to recover with.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -76,7 +76,9 @@ class Network(nn.Module):
 def encoded(
     points: Float[Tensor, "p 3"], frequencies: int, include_input: bool, octaves: bool
 ) -> Float[Tensor, "p f"]:
-    """Return ``(p, sin f1 p, cos f1 p, sin f2 p, ...)`` as nerf-pytorch orders it: unlike in NeRF's eq. 4 there is no pi."""
+    """Return ``(p, sin f1 p, cos f1 p, sin f2 p, ...)`` in nerf-pytorch's order: unlike in NeRF's eq. 4 there
+    is no pi.
+    """
     if octaves:
         factors = powers_of_two(frequencies, points, lowest=1.0)
     else:

@@ -22,7 +22,7 @@ from bidnerf_nerf_pytorch.network import NetworkConfig
 
 @dataclass(frozen=True)
 class NerfPytorchConfig(FieldConfig, SupervisionConfig):
-    """Architecture and training. The defaults are those of the checkpoints that nerf-pytorch offers."""
+    """Architecture and training. The defaults are those of the checkpoints published by nerf-pytorch."""
 
     steps: Count = 200_000  # steps of the optimizer
     rays_per_step: Count = 1024  # number of rays per step
@@ -59,5 +59,5 @@ def _start_from(path: Path, field: NerfPytorchField) -> None:
     for each in fields(NetworkConfig):
         found, expected = getattr(checkpoint.network, each.name), getattr(field.config, each.name)
         if found != expected:
-            raise InputError(f"{path}: its networks have {each.name} {found}, the config says {expected}")
+            raise InputError(f"{path}: its networks have {each.name} {found}, but the config says {expected}")
     field.load_state_dict(checkpoint.tensors)

@@ -80,7 +80,7 @@ def test_a_file_that_ends_early(write: Writer) -> None:
 
 @pytest.mark.parametrize("found", [[], torch.zeros(3), {"state_dict": {}}, {"model_coarse_state_dict": None}])
 def test_a_checkpoint_of_something_else(write: Writer, found: Any) -> None:
-    assert "expected a checkpoint of nerf-pytorch" in refusal(write(found))
+    assert "expected a nerf-pytorch checkpoint" in refusal(write(found))
 
 
 @pytest.mark.parametrize("fine", [None, "missing"])
@@ -152,4 +152,4 @@ def test_networks_that_differ(write: Writer) -> None:
 def test_weights_that_are_no_numbers(write: Writer, value: torch.Tensor) -> None:
     found = contents()
     found["model_coarse_state_dict"]["fc_rgb.bias"] = value
-    assert "'fc_rgb.bias' is not made of finite numbers" in refusal(write(found))
+    assert "'fc_rgb.bias' has values that are not finite numbers" in refusal(write(found))

@@ -125,5 +125,5 @@ def test_a_resumed_training_does_not_need_the_checkpoint(write: Writer) -> None:
 
 def test_a_checkpoint_of_another_architecture_is_refused(write: Writer) -> None:
     config = NerfPytorchConfig(width=SMALL.width, layers=2, checkpoint=str(write()))
-    with pytest.raises(InputError, match="layers 3, the config says 2"):
+    with pytest.raises(InputError, match="layers 3, but the config says 2"):
         backend.train(backend.build(config, BOUNDS), rgb_views(), config, Silent())

@@ -1,1 +1,1 @@
-"""Trained runs of nerfstudio as maps: nerfacto, instant-ngp and vanilla-nerf, rebuilt in PyTorch."""
+"""nerfstudio's trained runs as maps: nerfacto, instant-ngp and vanilla-nerf, reimplemented in PyTorch."""

@@ -1,4 +1,4 @@
-"""The importer of runs of nerfstudio."""
+"""The importer of nerfstudio runs."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ from bidnerf_nerfstudio.run import CONFIG, Run, read_run
 from bidnerf_nerfstudio.weights import Weights
 
 UP = (0.0, 0.0, 1.0)
-"""Upward direction of the training, into which nerfstudio turns the poses by default."""
+"""Upward direction in training coordinates, to which nerfstudio rotates the poses by default."""
 
 
 @dataclass(frozen=True)
 class ImportSettings(Settings):
-    """What a run does not say, or no longer says rightly."""
+    """Settings that a run does not contain, or that have become outdated."""
 
-    data: str = ""  # dataset that the run was trained on, where it has moved; "": where the config says
-    # colour where a ray meets nothing; run: as the run renders, which is black for random and last_sample
+    data: str = ""  # dataset that the run was trained on, if it was moved; "": as in the config
+    # colour where a ray hits nothing; run: as in the run's renderings, which is black for random and
+    # last_sample
     background: Literal["run", "white", "black"] = "run"
 
 
@@ -53,7 +54,7 @@ class NerfstudioImporter:
             return False
 
     def read(self, path: Path, config: ImportSettings, placement: Similarity) -> ImportedField:
-        """Return the field of a run, see ``Importer``."""
+        """Read the field of a run, see ``Importer``."""
         run = read_run(path)
         data, told = _data(run, config)
         to_training, frame = run.trained_from_data(data)
@@ -68,7 +69,10 @@ class NerfstudioImporter:
             else None
         )
         if data is not None and photos is None:
-            told = "its photos are left aside, since their poses are not in the world of the map (--scale, --T-world-file)"
+            told = (
+                "its photos are ignored, since their poses are not in the world of the map (--scale,"
+                " --T-world-file)"
+            )
         facts = (*found.found, frame, *([told] if told else []))
         up = torch.tensor(placed.rotation, dtype=torch.float64).reshape(3, 3).mT @ torch.tensor(
             UP, dtype=torch.float64
@@ -77,7 +81,7 @@ class NerfstudioImporter:
 
 
 def _data(run: Run, config: ImportSettings) -> tuple[Path | None, str]:
-    """Return the dataset of the run, or None and a sentence. Raises ``InputError`` where the given one is not there."""
+    """Return the dataset of the run, or None and a sentence. Raises ``InputError`` if the given one does not exist."""
     if config.data:
         given = Path(config.data)
         if not given.exists():
@@ -98,7 +102,7 @@ class Model:
     read: Callable[[Weights, Record, Record], models.Read]
     reach: Callable[
         [Record], tuple[float, float]
-    ]  # nearest and farthest distance of matter, in units of the training
+    ]  # nearest and farthest distance of matter, in training units
 
 
 def _planes(model: Record) -> tuple[float, float]:
@@ -146,7 +150,7 @@ def _module(field: Any) -> nn.Module:
 def _bounds(
     read: models.Read, reach: tuple[float, float], placement: Placement, run: Run, config: ImportSettings
 ) -> SceneBounds:
-    """Return the bounds in the world: the box about that of the training, and its limits of distance."""
+    """Return the bounds in the world: the box around that of the training, and its distance limits."""
     lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (read.box[:3], read.box[3:]))
     if not bool((lower < upper).all()):
         raise InputError(
@@ -164,7 +168,7 @@ def _bounds(
 
 
 def _splats(run: Run, placement: Similarity) -> ImportedField:
-    """Return the field of a run of splatfacto, by the plugin for Gaussians. Raises ``InputError`` without that."""
+    """Read the field of a splatfacto run using the plugin for Gaussians. Raises ``InputError`` without that plugin."""
     try:
         from bidnerf_gaussians import importer
     except ImportError as error:

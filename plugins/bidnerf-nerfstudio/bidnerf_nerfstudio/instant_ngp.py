@@ -1,4 +1,4 @@
-"""instant-ngp of nerfstudio (Müller et al. 2022): the network of nerfacto, sampled where an occupancy grid says so."""
+"""nerfstudio's instant-ngp (Müller et al. 2022): the network of nerfacto, sampled according to an occupancy grid."""
 
 from __future__ import annotations
 
@@ -23,23 +23,21 @@ from bidnerf_nerfstudio.networks import HashConfig
 from bidnerf_nerfstudio.radiance import PlacedRadiance, RadianceConfig
 
 FADE = 0.95
-"""Factor of the peaks of all cells at each look at the field."""
+"""Decay factor of all cells' peaks per update."""
 OCCUPIED = 0.01
-"""Optical thickness of a step from which a cell is occupied, or the mean of all cells where that is less."""
+"""Optical thickness of a step above which a cell is occupied, or the mean of all cells if that is less."""
 EVERY = 16
-"""Training steps from one look to the next."""
+"""Number of training steps between updates."""
 
 
 @dataclass(frozen=True)
 class NgpConfig(RadianceConfig, SupervisionConfig):
     """Size, sampling and training of the field."""
 
-    grid_levels: Annotated[int, Range(1, 16)] = (
-        1  # boxes of cells, each of which is twice as wide as the one before
-    )
+    grid_levels: Annotated[int, Range(1, 16)] = 1  # boxes of cells, each twice as wide as the previous one
     grid_resolution: Annotated[int, Range(2, 1024)] = 128  # cells along each side of a box
     step: Positive = 2 * math.sqrt(3) / 1000  # length of the shortest interval (trained units)
-    cone_angle: NotNegative = 0.0  # length of an interval at distance 1, where that is more
+    cone_angle: NotNegative = 0.0  # length of an interval at distance 1, if that is larger
     steps: Count = 5000  # steps of the optimizer
     rays_per_step: Count = 1024  # rays of a step
     learning_rate: Positive = 1e-2  # initial learning rate
@@ -47,10 +45,12 @@ class NgpConfig(RadianceConfig, SupervisionConfig):
 
 
 class OccupancyLevels(nn.Module):
-    """Boxes of cells about one centre, each twice as wide as the one before; the smallest that holds a point decides."""
+    """Boxes of cells with a common centre, each twice as wide as the previous one; the smallest that contains
+    a point decides.
+    """
 
     cells: Bool[Tensor, "l n n n"]
-    peak: Float[Tensor, "l n n n"]  # optical thickness of a step, the largest seen recently
+    peak: Float[Tensor, "l n n n"]  # optical thickness of a step, the largest observed recently
 
     def __init__(self, config: NgpConfig) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class OccupancyLevels(nn.Module):
 
     @torch.no_grad()
     def look(self, field: NgpField, generator: Generator) -> None:
-        """Update the cells by the density at a random place in each."""
+        """Update the cells from the density at a random place in each."""
         _, resolution = self.cells.shape[:2]
         axis = torch.arange(resolution, device=self.peak.device, dtype=self.peak.dtype)
         corner = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
@@ -96,9 +96,10 @@ class OccupancyLevels(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class OccupiedSteps:
-    """Samples of rays in the coordinates of the training: steps in occupied cells, longer ones farther away.
+    """Samples along rays in training coordinates: steps in occupied cells, longer ones farther away.
 
-    Steps are even in a coordinate that is the distance in steps up to where the cone is one step wide, and logarithmic beyond.
+    Steps are uniform in a coordinate that is the distance in steps up to where the cone is one step wide, and
+    logarithmic beyond.
     """
 
     grid: OccupancyLevels

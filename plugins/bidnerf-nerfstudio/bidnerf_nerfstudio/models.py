@@ -1,4 +1,4 @@
-"""How the models of nerfstudio are read: the settings of a field of ours, and its tensors."""
+"""Reading nerfstudio models: the settings of the corresponding field here, and its tensors."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from bidnerf_nerfstudio.vanilla import DIRECTION, POSITION, VanillaConfig, reord
 from bidnerf_nerfstudio.weights import Weights, layer_names, mean_code
 
 HALF_OF_BLENDER = 1.5
-"""Half the side of the box that nerfstudio assumes for Blender's scenes."""
+"""Half the side of the box that nerfstudio assumes for Blender scenes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """What was read of a model."""
+    """The result of reading a model."""
 
     settings: Any  # of the backend, without placement and steps
     state: dict[str, Tensor]
-    box: tuple[float, ...]  # corners of the scene in the coordinates of the training
+    box: tuple[float, ...]  # corners of the scene in training coordinates
     contracted: bool
     told: str
 
 
 def nerfacto(weights: Weights, model: Record, parser: Record) -> Read:
-    """Return a run of nerfacto. Raises ``InputError`` where its tensors do not fit together."""
+    """Read a nerfacto run. Raises ``InputError`` if its tensors are inconsistent."""
     radiance, state, box = _radiance(weights, model, bool(model.value("use_average_appearance_embedding")))
     count = int(model.number("num_proposal_iterations") or 2)
     options = model.items("proposal_net_args_list") or [{}]
@@ -60,10 +60,10 @@ def nerfacto(weights: Weights, model: Record, parser: Record) -> Read:
 def _radiance(
     weights: Weights, model: Record, mean: bool
 ) -> tuple[dict[str, Any], dict[str, Tensor], tuple[float, ...]]:
-    """Return the settings, the tensors and the box of nerfstudio's NerfactoField."""
+    """Return the settings, tensors and box of nerfstudio's NerfactoField."""
     base, table = _base(weights)
     layers, head = weights.layers(base), weights.layers("field.mlp_head.")
-    # Versions before 1.0 did not have the setting, and always 16.
+    # Versions before 1.0 did not have the setting, and always used 16.
     encoding = weights.hash_config("field.", table, layers, int(model.number("base_res") or 16))
     geometry = weights.shape(f"{layers[-1]}weight", 2)[0] - 1
     code = torch.zeros(0)
@@ -84,7 +84,7 @@ def _radiance(
 
 
 def _base(weights: Weights) -> tuple[str, str]:
-    """Return the beginnings of the names of the layers and of the table; versions before 1.1 have no "model" in them."""
+    """Return the name prefixes of the layers and of the table; versions before 1.1 have no "model" in them."""
     for begin in ("field.mlp_base.model.", "field.mlp_base."):
         if f"{begin}0.hash_table" in weights.tensors:
             return f"{begin}1.", f"{begin}0.hash_table"
@@ -94,7 +94,7 @@ def _base(weights: Weights) -> tuple[str, str]:
 
 
 def _proposal(weights: Weights, number: int, base: int, place: int) -> tuple[HashConfig, dict[str, Tensor]]:
-    """Return the sizes and the tensors of a proposal network, under the names of that at ``place``."""
+    """Return the sizes and tensors of a proposal network, renamed to those at ``place``."""
     begin, ours = f"proposal_networks.{number}.", f"proposals.{place}.network."
     table = f"{begin}encoding.hash_table"
     linear = f"{begin}linear.weight" in weights.tensors
@@ -104,12 +104,12 @@ def _proposal(weights: Weights, number: int, base: int, place: int) -> tuple[Has
 
 
 def instant_ngp(weights: Weights, model: Record, parser: Record) -> Read:
-    """Return a run of instant-ngp. Raises ``InputError`` where its tensors do not fit together."""
+    """Read an instant-ngp run. Raises ``InputError`` if its tensors are inconsistent."""
     radiance, state, box = _radiance(weights, model, mean=False)
     cells = weights.get("occupancy_grid.binaries")
     if cells.dim() != 4 or len({*cells.shape[1:]}) != 1:
         raise weights.error(f"'occupancy_grid.binaries' is {tuple(cells.shape)}, expected cubes of cells")
-    radiance["initial_density"] = 1.0  # which this model does not set
+    radiance["initial_density"] = 1.0  # this model does not set it
     side = [high - low for low, high in zip(box[:3], box[3:], strict=True)]
     step = model.number("render_step_size") or sum(s * s for s in side) ** 0.5 / 1000
     settings = NgpConfig(
@@ -123,9 +123,9 @@ def instant_ngp(weights: Weights, model: Record, parser: Record) -> Read:
 
 
 def vanilla(weights: Weights, model: Record, parser: Record) -> Read:
-    """Return a run of vanilla-nerf. Raises ``InputError`` where its tensors do not fit together."""
+    """Read a vanilla-nerf run. Raises ``InputError`` if its tensors are inconsistent."""
     if model.value("enable_temporal_distortion"):
-        raise weights.error("a scene that moves (enable_temporal_distortion), expected one at rest")
+        raise weights.error("a dynamic scene (enable_temporal_distortion), expected a static one")
     names: dict[str, str] = {}
     for ours, theirs in (("coarse", "field_coarse"), ("fine", "field_fine")):
         begin = f"{ours}.network."

@@ -32,9 +32,7 @@ class NerfactoConfig(RadianceConfig, SupervisionConfig):
     proposals: tuple[HashConfig, ...] = PROPOSALS  # networks that place the samples, in order
     proposal_samples: tuple[int, ...] = (256, 96)  # samples of each along a ray
     samples: Count = 48  # samples of the field along a ray
-    spacing: Spacing = (
-        "piecewise"  # of the first network's samples: even up to a unit and in the inverse beyond, or even
-    )
+    spacing: Spacing = "piecewise"  # spacing of the first network's samples: uniform up to distance 1 and in the inverse beyond, or uniform
     steps: Count = 5000  # steps of the optimizer
     rays_per_step: Count = 1024  # rays of a step
     learning_rate: Positive = 1e-2  # initial learning rate
@@ -44,11 +42,11 @@ class NerfactoConfig(RadianceConfig, SupervisionConfig):
         super().__post_init__()
         if not len(self.proposals) == len(self.proposal_samples) > 0:
             raise InputError(
-                f"proposal_samples has {len(self.proposal_samples)} numbers, expected one of each of"
-                f" {len(self.proposals)} proposals, which are one at least"
+                f"proposal_samples has {len(self.proposal_samples)} numbers, expected one for each of"
+                f" {len(self.proposals)} proposals, and at least one"
             )
         if min(self.proposal_samples) < 2:
-            raise InputError(f"proposal_samples is {self.proposal_samples}, expected numbers from 2 up")
+            raise InputError(f"proposal_samples is {self.proposal_samples}, expected numbers of at least 2")
 
 
 class Proposal(nn.Module):
@@ -60,13 +58,13 @@ class Proposal(nn.Module):
         self.network = HashNetwork(config, 1)
 
     def forward(self, positions: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
-        """Return densities per trained unit."""
+        """Return densities per training unit."""
         points, inside = unit_cube(positions, self.box)
         return density_of(self.network(points)[:, 0], self.factor) * inside
 
 
 class NerfactoField(PlacedRadiance):
-    """The field of a run of nerfacto."""
+    """The field of a nerfacto run."""
 
     config: NerfactoConfig
 
@@ -78,7 +76,7 @@ class NerfactoField(PlacedRadiance):
 
     @property
     def trained_sampler(self) -> ProposalSampler:
-        """The sampler of rays in the coordinates of the training."""
+        """The sampler of rays in training coordinates."""
         config = self.config
         return ProposalSampler(tuple(self.proposals), config.proposal_samples, config.samples, config.spacing)
 
@@ -90,7 +88,7 @@ class NerfactoField(PlacedRadiance):
 
 @dataclass(frozen=True, eq=False)
 class PlacedSampler:
-    """A sampler in the coordinates of the training, for rays in the world."""
+    """A sampler in training coordinates, for rays in the world."""
 
     sampler: RaySampler
     placement: Placement

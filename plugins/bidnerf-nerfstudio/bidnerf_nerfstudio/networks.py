@@ -1,4 +1,4 @@
-"""The parts of which nerfstudio's fields are made: hash encoding, layers, spherical harmonics."""
+"""The building blocks of nerfstudio's fields: hash encoding, layers, spherical harmonics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bidnerf_core.settings import Count, Layers, Range, Settings
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the coordinates in the hash (Müller et al. 2022, eq. 4)."""
 LARGEST_LOG_DENSITY = 15.0
-"""Limit of the exponent of densities: what is that dense is opaque within a thousandth of any length that matters."""
+"""Limit of the exponent of densities: matter of that density is opaque within a thousandth of any relevant length."""
 FIRST_TABLE = 1e-3
 """Largest entry of an untrained table."""
 
@@ -46,7 +46,7 @@ class HashConfig(Settings):
 
 
 class HashEncoding(nn.Module):
-    """Positions in the unit cube as the concatenated features of all levels, all of which are hashed."""
+    """Positions in the unit cube encoded as the concatenated features of all levels, all of which are hashed."""
 
     def __init__(self, config: HashConfig) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class HashEncoding(nn.Module):
         if count > 1:
             ratio = math.log(config.finest_resolution) - math.log(config.base_resolution)
             growth = math.exp(ratio / (count - 1))
-        # In single precision as in nerfstudio, since the fraction that is cut off decides the resolution.
+        # In single precision as in nerfstudio, since the discarded fraction determines the resolution.
         self.resolutions: tuple[float, ...] = tuple(
             torch.floor(config.base_resolution * growth ** torch.arange(count)).tolist()
         )
@@ -88,7 +88,7 @@ class Perceptron(nn.Module):
 
     def __init__(self, inputs: int, width: int, outputs: int, layers: int, skip: int | None = None) -> None:
         super().__init__()
-        self.skip = skip  # number of the layer to which the input is given once more
+        self.skip = skip  # index of the layer that receives the input again
         widths = [inputs, *[width] * (layers - 1), outputs]
         self.layers = nn.ModuleList(
             nn.Linear(a + (inputs if number == skip else 0), b)
@@ -124,9 +124,11 @@ class HashNetwork(nn.Module):
 def unit_cube(
     positions: Float[Tensor, "p 3"], box: SceneBounds
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"]]:
-    """Return positions (trained coordinates) in [0, 1], 0 where outside of it, and 1 where they are inside and else 0.
+    """Return positions (training coordinates) in [0, 1], 0 if outside, and a mask that is 1 inside and 0
+    outside.
 
-    In a contracted scene, all space within a cube about the origin fills the inner half of each axis, whatever its box is.
+    In a contracted scene, all space within a cube around the origin fills the inner half of each axis,
+    regardless of its box.
     """
     if box.contracted:
         points = (contract(positions) + 2) / 4
@@ -137,7 +139,7 @@ def unit_cube(
 
 
 def density_of(raw: Float[Tensor, "p"], factor: float) -> Float[Tensor, "p"]:
-    """Return the density (per trained unit) of raw outputs: ``factor`` times their exponential."""
+    """Return the density (per training unit) for raw outputs: ``factor`` times their exponential."""
     return factor * raw.clamp(max=LARGEST_LOG_DENSITY).exp()
 
 

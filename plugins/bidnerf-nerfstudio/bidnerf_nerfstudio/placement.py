@@ -1,4 +1,4 @@
-"""Where the world of a map lies in the coordinates in which a field was trained."""
+"""The placement of a map's world in the coordinates in which a field was trained."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from bidnerf_core.geometry.similarity import Similarity
 
 @dataclass(frozen=True)
 class Placement:
-    """The similarity transform from the world of a map to the coordinates of the training, as plain numbers."""
+    """The similarity transform from the world of a map to training coordinates, as plain numbers."""
 
-    scale: float  # trained units per unit of the world
-    rotation: tuple[float, ...]  # 3x3, row by row; the world's axes in those of the training
+    scale: float  # training units per unit of the world
+    rotation: tuple[float, ...]  # 3x3, row by row; the world's axes in training coordinates
     translation: tuple[float, ...]  # trained units
 
     @staticmethod
     def of(numbers: tuple[float, ...], bounds: SceneBounds) -> Placement:
-        """Return the placement in a config, see ``numbers``; without any, the cube about the box becomes [-1, 1].
+        """Return the placement in a config, see ``numbers``; without any, the cube around the box becomes
+        [-1, 1].
 
-        Raises ``InputError`` for another count of numbers.
+        Raises ``InputError`` for the wrong number of values.
         """
         if not numbers:
             scale = 2 / bounds.side
@@ -74,7 +75,7 @@ class Placement:
         )  # fmt: skip
 
     def samples(self, samples: RaySamples) -> RaySamples:
-        """Return samples of rays in trained coordinates as those of the rays in the world."""
+        """Convert samples of rays from training coordinates to the world."""
         return RaySamples(samples.starts / self.scale, samples.ends / self.scale, samples.valid)
 
 

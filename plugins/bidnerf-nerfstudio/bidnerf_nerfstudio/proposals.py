@@ -1,4 +1,4 @@
-"""Sampling by proposal networks: densities of small networks, one after the other, place the samples of a ray."""
+"""Sampling with proposal networks: densities of small networks, one after the other, place the samples of a ray."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Spacing = Literal["piecewise", "uniform"]
 
 @dataclass(frozen=True, eq=False)
 class Proposed:
-    """The intervals at which a proposal network was asked, and what it answered."""
+    """The intervals at which a proposal network was evaluated, and its result."""
 
     borders: Float[Tensor, "*r s+1"]  # in the coordinate of the spacing
     weights: Float[Tensor, "*r s"]
@@ -31,10 +31,10 @@ class Proposed:
 
 @dataclass(frozen=True, eq=False)
 class ProposalSampler:
-    """Samples of rays in the coordinates of the training: nerfstudio's ProposalNetworkSampler, at inference.
+    """Samples of rays in training coordinates: nerfstudio's ProposalNetworkSampler, at inference.
 
-    The first network is asked at even steps of ``spacing``; each further one, and then the field, at places distributed as the
-    weights of the one before.
+    The first network is evaluated at uniform steps of ``spacing``; each further one, and then the field, at
+    places distributed as the previous one's weights.
     """
 
     densities: Sequence[Density]
@@ -71,7 +71,7 @@ class ProposalSampler:
 
 
 def _even(count: int, rays: Rays, jitter: Generator | None) -> Float[Tensor, "*r s"]:
-    """Return borders from 0 to 1; with jitter, those within are shifted by up to half a step."""
+    """Return borders from 0 to 1; with jitter, the inner ones are shifted by up to half a step."""
     even = torch.linspace(0, 1, count + 1, dtype=rays.near.dtype, device=rays.near.device)
     even = even.expand(*rays.near.shape, -1)
     if jitter is None:
@@ -81,7 +81,7 @@ def _even(count: int, rays: Rays, jitter: Generator | None) -> Float[Tensor, "*r
 
 
 def place(distances: Tensor, spacing: Spacing) -> Tensor:
-    """Return the coordinate at distances (trained units): half of them below 1, even in their inverse beyond."""
+    """Return the coordinate at distances (training units): half of them below 1, uniform in their inverse beyond."""
     if spacing == "uniform":
         return distances
     return torch.where(distances < 1, distances / 2, 1 - 1 / (2 * distances.clamp(min=1)))
@@ -97,7 +97,7 @@ def distance(places: Tensor, spacing: Spacing) -> Tensor:
 def interlevel_loss(
     borders: Float[Tensor, "*r n"], weights: Float[Tensor, "*r m"], proposed: Proposed
 ) -> Float[Tensor, ""]:
-    """Return by how much the field's weights exceed what a proposal allows (Barron et al. 2022, eq. 13)."""
+    """Return how much the field's weights exceed what a proposal allows (Barron et al. 2022, eq. 13)."""
     total = torch.cat([torch.zeros_like(proposed.weights[..., :1]), proposed.weights.cumsum(-1)], dim=-1)
     known = proposed.borders.contiguous()
     first = torch.searchsorted(known, borders[..., :-1].contiguous(), right=True).sub(1)

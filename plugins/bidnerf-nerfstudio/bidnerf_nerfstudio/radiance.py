@@ -26,7 +26,7 @@ HARMONICS = 16
 
 @dataclass(frozen=True)
 class RadianceConfig(Settings):
-    """Size of the networks, and where the world of the map is."""
+    """Size of the networks, and the placement of the map's world."""
 
     encoding: HashConfig = field(default_factory=HashConfig)
     geometry_features: Count = 15  # features that the density network passes on to the colour network
@@ -34,9 +34,10 @@ class RadianceConfig(Settings):
     colour_layers: Layers = 3  # layers of weights of the colour network, the last one included
     appearance: int = 32  # length of the appearance code; 0: none
     initial_density: Positive = 0.01  # factor of all densities (nerfstudio's average_init_density)
-    # scale, rotation (3x3) and shift from the world to the coordinates of the training; (): the box becomes [-1, 1]
+    # scale, rotation (3x3) and translation from the world to training coordinates; (): the box becomes [-1,
+    # 1]
     placement: tuple[float, ...] = ()
-    # corners of the scene in the coordinates of the training
+    # corners of the scene in training coordinates
     box: tuple[float, float, float, float, float, float] = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
@@ -46,7 +47,7 @@ class RadianceConfig(Settings):
 
 
 class Radiance(nn.Module):
-    """Density and colour at places in the coordinates of the training, seen with the mean appearance of its images."""
+    """Density and colour in training coordinates, seen with the mean appearance of the training images."""
 
     def __init__(self, config: RadianceConfig, contracted: bool) -> None:
         super().__init__()
@@ -70,7 +71,7 @@ class Radiance(nn.Module):
         raw, features = self.base(points).split(
             [1, self.head.layers[0].in_features - HARMONICS - len(self.appearance)], -1
         )
-        # nerfstudio's torch implementation takes the harmonics of the directions that it moved to [0, 1].
+        # nerfstudio's torch implementation evaluates the harmonics at directions shifted to [0, 1].
         harmonics = spherical_harmonics((directions + 1) / 2)
         code = self.appearance.expand(len(positions), -1)
         rgb = self.head(torch.cat([harmonics, features, code], dim=-1)).sigmoid()
@@ -78,7 +79,7 @@ class Radiance(nn.Module):
 
 
 class PlacedRadiance(nn.Module):
-    """Networks in the world of a map; subclasses say where rays are sampled."""
+    """Networks in the world of a map; subclasses define where rays are sampled."""
 
     def __init__(self, config: RadianceConfig, bounds: SceneBounds) -> None:
         super().__init__()

@@ -1,4 +1,6 @@
-"""The folder of a trained run: its config, its latest checkpoint, and how its poses were transformed. No code in it is run."""
+"""The folder of a trained run: its config, its latest checkpoint, and how its poses were transformed. No code
+in it is run.
+"""
 
 from __future__ import annotations
 
@@ -23,19 +25,19 @@ from bidnerf_nerfstudio.placement import after, inverse
 
 CONFIG = "config.yml"
 TRANSFORMS = "dataparser_transforms.json"
-EXPECTED = "the folder of a run of nerfstudio, with config.yml and nerfstudio_models/step-*.ckpt"
+EXPECTED = "the folder of a nerfstudio run, with config.yml and nerfstudio_models/step-*.ckpt"
 LARGEST_CONFIG = 4 * 2**20
-"""Bytes; a config has ten thousand, and YAML is slow to parse."""
+"""Bytes; a config has about ten thousand, and YAML is slow to parse."""
 STEP = re.compile(r"step-(\d+)\.ckpt")
 PREFIX = "_model."
 COLMAP = ((0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0))
-"""What nerfstudio takes for a missing ``applied_transform`` of data that it processed with COLMAP."""
+"""nerfstudio's default for a missing ``applied_transform`` in data that it processed with COLMAP."""
 RIGID = 1e-3
-"""Largest entry by which the product of a rotation and its transpose may differ from one; nerfstudio has single precision."""
+"""Largest entry of the product of a rotation and its transpose, minus the identity; nerfstudio uses single precision."""
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Reads objects of Python as the plain values that they are written with: nothing is imported, nothing is called."""
+    """Reads Python objects as the plain values with which they are written: nothing is imported or called."""
 
 
 def _plain(loader: yaml.SafeLoader, suffix: str, node: yaml.Node) -> Any:
@@ -51,7 +53,7 @@ _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 @dataclass(frozen=True)
 class Run:
-    """A run of nerfstudio, as far as it can be read without nerfstudio."""
+    """A nerfstudio run, as far as it can be read without nerfstudio."""
 
     folder: Path
     config: Record
@@ -68,12 +70,12 @@ class Run:
 
     @property
     def parser(self) -> Record:
-        """The settings of what read the dataset."""
+        """The settings of the dataset parser."""
         return _part(_part(_part(self.config, "pipeline"), "datamanager"), "dataparser")
 
     @property
     def data(self) -> Path | None:
-        """The dataset that the run was trained on, a folder or a JSON file, as the config names it."""
+        """The dataset that the run was trained on, a folder or a JSON file, according to the config."""
         manager = _part(_part(self.config, "pipeline"), "datamanager")
         for record in (self.parser, manager, self.config):
             parts = record.value("data")
@@ -83,7 +85,7 @@ class Run:
 
     @cached_property
     def checkpoint(self) -> Path:
-        """The checkpoint of the latest step. Raises ``InputError`` where there is none."""
+        """The checkpoint of the latest step. Raises ``InputError`` if there is none."""
         parts = self.config.value("relative_model_dir")
         named = isinstance(parts, list) and bool(parts) and all(isinstance(part, str) for part in parts)
         folder = self.folder.joinpath(*parts) if named else self.folder / "nerfstudio_models"
@@ -91,17 +93,15 @@ class Run:
             (int(match[1]), path) for path in folder.glob("*.ckpt") if (match := STEP.fullmatch(path.name))
         ]
         if not found:
-            raise InputError(
-                f"{folder}: no step-*.ckpt, expected the checkpoint of a training that has saved one"
-            )
+            raise InputError(f"{folder}: no step-*.ckpt, expected the checkpoint of a training run")
         return max(found)[1]
 
     def weights(self) -> tuple[dict[str, Tensor], int]:
-        """Return the tensors of the model by name, and the number of training steps. Raises ``InputError`` for damage."""
+        """Return the model's tensors by name, and the number of training steps. Raises ``InputError`` for damage."""
         found = read_saved(self.checkpoint, EXPECTED)
         tensors = found.get("pipeline") if isinstance(found, dict) else None
         if not isinstance(tensors, dict):
-            raise InputError(f"{self.checkpoint}: no 'pipeline' in it, expected a checkpoint of nerfstudio")
+            raise InputError(f"{self.checkpoint}: contains no 'pipeline', expected a nerfstudio checkpoint")
         named = {
             name.removeprefix("module.").removeprefix(PREFIX): value
             for name, value in tensors.items()
@@ -112,15 +112,16 @@ class Run:
         return named, step + 1 if type(step) is int and step >= 0 else 1
 
     def trained_from_data(self, data: Path | None) -> tuple[Similarity, str]:
-        """Return the transform from the coordinates of the dataset to those of the training, and a sentence on it.
+        """Return the transform from dataset coordinates to training coordinates, and a sentence about it.
 
-        ``data`` is the dataset, where it still is. Without it, coordinates are those before ``applied_transform``, which the
-        dataset may name; without the run's own file, they are those of the training.
+        ``data`` is the dataset, if it still exists. Without it, coordinates are those before
+        ``applied_transform``, which the dataset may state; without the run's own file, they are training
+        coordinates.
         """
         path = self.folder / TRANSFORMS
         if not path.is_file():
             return Similarity(1.0, SE3.identity()), (
-                f"no {TRANSFORMS}, which older versions did not write: poses come out in the coordinates of the training"
+                f"no {TRANSFORMS}, which older versions did not write: poses will be in training coordinates"
             )
         record = read_record(path, "the transform and the scale of nerfstudio's poses")
         scale = record.number("scale")
@@ -129,18 +130,18 @@ class Run:
         found = Similarity(scale, _moved(record, _rows(record, "transform"), scale))
         if data is None:
             return found, (
-                "poses come out in the coordinates of the original data, before any applied_transform: the dataset is not"
-                " where the config says (--data)"
+                "poses will be in the coordinates of the original data, before any applied_transform: the"
+                " dataset is not where the config says (--data)"
             )
         applied = _applied(data)
-        told = "poses come out in the coordinates of the dataset"
+        told = "poses will be in the coordinates of the dataset"
         if applied is None:
             return found, told
         return after(found, inverse(applied)), f"{told}, whose applied_transform is taken into account"
 
 
 def read_run(path: Path) -> Run:
-    """Return the run in a folder, or that of a config.yml. Raises ``InputError`` for anything else."""
+    """Read the run in a folder, or the one of a config.yml. Raises ``InputError`` for anything else."""
     folder = path.parent if path.name == CONFIG else path
     file = folder / CONFIG
     if not file.is_file():
@@ -166,7 +167,7 @@ def _part(record: Record, key: str) -> Record:
 
 
 def _rows(record: Record, key: str) -> Float[Tensor, "3 4"]:
-    """Return a matrix of 3 rows (or 4) of 4 numbers."""
+    """Return a matrix with 3 (or 4) rows of 4 numbers."""
     rows = record.items(key) or []
     if not (len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)):
         raise record.error(f"{key} is not readable, expected 3 rows of 4 numbers")
@@ -175,17 +176,17 @@ def _rows(record: Record, key: str) -> Float[Tensor, "3 4"]:
 
 
 def _moved(record: Record, rows: Float[Tensor, "3 4"], scale: float) -> SE3:
-    """Return the motion that follows scaling, of a motion that precedes it."""
+    """Return the transform after scaling that is equivalent to one before it."""
     rotation = rows[:, :3]
     off = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
     if not (float(off) < RIGID and float(torch.linalg.det(rotation)) > 0):
-        raise record.error("transform is no rotation and shift, expected one")
+        raise record.error("transform is not a rigid transform, expected a rotation and a translation")
     u, _, vh = torch.linalg.svd(rotation)
     return SE3(u @ vh, scale * rows[:, 3])
 
 
 def _applied(data: Path) -> Similarity | None:
-    """Return what was applied to the poses of a dataset before they were stored in it, or None where nothing is said."""
+    """Return the transform applied to a dataset's poses before they were stored, or None if it states none."""
     file = data if data.suffix == ".json" else data / "transforms.json"
     if not file.is_file():
         return None

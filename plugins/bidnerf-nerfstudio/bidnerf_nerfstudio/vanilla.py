@@ -1,4 +1,4 @@
-"""vanilla-nerf of nerfstudio (Mildenhall et al. 2020): a coarse and a fine network, with hierarchical sampling."""
+"""nerfstudio's vanilla-nerf (Mildenhall et al. 2020): a coarse and a fine network, with hierarchical sampling."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ POSITION, DIRECTION = 10, 4
 HIGHEST = {POSITION: 8.0, DIRECTION: 4.0}
 """Octave of the highest frequency; the lowest has one period per unit."""
 SKIP = 4
-"""Number of the layer that is given the encoded position once more."""
+"""Index of the layer that receives the encoded position again."""
 PADDING = 0.01
 """Added to the weight of every interval of the coarse network, as in nerfstudio's PDFSampler."""
 
@@ -45,7 +45,8 @@ class VanillaConfig(SupervisionConfig):
     colour_layers: Layers = 2  # layers of the colour network
     coarse_samples: Count = 64  # samples of the coarse network along a ray
     fine_samples: Count = 129  # further samples of the fine network, placed by the coarse one
-    # scale, rotation (3x3) and shift from the world to the coordinates of the training; (): the box becomes [-1, 1]
+    # scale, rotation (3x3) and translation from the world to training coordinates; (): the box becomes [-1,
+    # 1]
     placement: tuple[float, ...] = ()
     steps: Count = 20000  # steps of the optimizer
     rays_per_step: Count = 512  # rays of a step
@@ -61,7 +62,7 @@ def encoded(points: Float[Tensor, "p 3"], count: int) -> Float[Tensor, "p f"]:
 
 
 class VanillaNetwork(nn.Module):
-    """Density and colour at places in the coordinates of the training."""
+    """Density and colour in training coordinates."""
 
     def __init__(self, config: VanillaConfig) -> None:
         super().__init__()
@@ -77,7 +78,7 @@ class VanillaNetwork(nn.Module):
     def forward(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
-        """Return densities per trained unit, and colours."""
+        """Return densities per training unit, and colours."""
         features = self.base(encoded(positions, POSITION)).relu()
         seen = self.head(torch.cat([encoded(directions, DIRECTION), features], dim=-1)).relu()
         return softplus(self.density(features))[:, 0], self.colour(seen).sigmoid()
@@ -113,10 +114,10 @@ class VanillaField(HierarchicalField):
 
 
 def reordered(weight: Float[Tensor, "o i"], count: int, weights: Weights) -> Float[Tensor, "o i"]:
-    """Return a layer's weights for the order of the encoding here.
+    """Reorder a layer's weights for the order of the encoding here.
 
-    nerfstudio has the sines of all frequencies of x, then of y and z, the cosines likewise, and then the point. Columns beyond
-    those of the encoding stay.
+    nerfstudio has the sines of all frequencies of x, then of y and z, the cosines likewise, and then the
+    point. Columns after those of the encoding are unchanged.
     """
     width = encoded_width(count)
     if weight.dim() != 2 or weight.shape[1] < width:

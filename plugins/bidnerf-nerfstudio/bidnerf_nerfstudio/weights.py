@@ -1,4 +1,4 @@
-"""The tensors of nerfstudio's models under the names of the networks here, and the sizes that their shapes imply."""
+"""The tensors of nerfstudio's models under the names of the networks here, and the sizes implied by their shapes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_nerfstudio.networks import HashConfig
 
 TCNN = (
-    "was trained with tiny-cuda-nn, whose networks cannot be read here; expected a training with"
+    "was trained with tiny-cuda-nn, whose networks cannot be read here; train with"
     " --pipeline.model.implementation torch"
 )
 
@@ -39,18 +39,18 @@ class Weights:
         if found is None:
             raise self.error(f"no {name!r}, expected a checkpoint of the model that the config names")
         if found.is_floating_point() and not bool(found.isfinite().all()):
-            raise self.error(f"{name!r} is not made of finite numbers")
+            raise self.error(f"{name!r} has values that are not finite numbers")
         return found.float()
 
     def number(self, name: str) -> int:
-        """Return a whole number that is stored as a tensor."""
+        """Return an integer stored as a tensor."""
         found = self.get(name)
         if found.numel() != 1:
             raise self.error(f"{name!r} is {tuple(found.shape)}, expected one number")
         return int(found)
 
     def layers(self, prefix: str) -> list[str]:
-        """Return the beginnings of the names of a network's layers, in order."""
+        """Return the name prefixes of a network's layers, in order."""
         names: list[str] = []
         while f"{prefix}layers.{len(names)}.weight" in self.tensors:
             names.append(f"{prefix}layers.{len(names)}.")
@@ -68,7 +68,9 @@ class Weights:
         return shape
 
     def hash_config(self, field: str, table: str, layers: list[str], base: int) -> HashConfig:
-        """Return the sizes of a hash encoding and of the layers that follow it; ``field`` begins the names of its numbers."""
+        """Return the sizes of a hash encoding and of the layers that follow it; ``field`` is the prefix of
+        its numbers.
+        """
         rows, features = self.shape(table, 2)
         levels, log2 = self.number(f"{field}num_levels"), self.number(f"{field}log2_hashmap_size")
         if not (1 <= levels <= 64 and 1 <= log2 <= 30 and rows == levels * 2**log2):
@@ -79,11 +81,11 @@ class Weights:
         return HashConfig(levels, features, log2, base, self.number(f"{field}max_res"), width, len(layers))
 
     def renamed(self, names: Mapping[str, str]) -> dict[str, Tensor]:
-        """Return the tensors whose names (values) are given under other names (keys)."""
+        """Return the tensors named by the values of ``names`` under the keys."""
         return {ours: self.get(theirs) for ours, theirs in names.items()}
 
     def load(self, field: nn.Module, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Load the tensors into a field and return its whole state. Raises ``InputError`` where shapes differ."""
+        """Load the tensors into a field and return its whole state. Raises ``InputError`` if shapes differ."""
         expected = field.state_dict()
         for name, value in expected.items():
             if name not in state:
@@ -95,7 +97,7 @@ class Weights:
 
 
 def layer_names(ours: str, theirs: list[str]) -> dict[str, str]:
-    """Return the names of the weights and biases of layers: nerfstudio's by those here, which begin with ``ours``."""
+    """Map the names of weights and biases here, which begin with ``ours``, to nerfstudio's."""
     return {
         f"{ours}layers.{number}.{part}": f"{prefix}{part}"
         for number, prefix in enumerate(theirs)
@@ -104,7 +106,7 @@ def layer_names(ours: str, theirs: list[str]) -> dict[str, str]:
 
 
 def mean_code(weights: Weights, name: str, mean: bool) -> Tensor:
-    """Return the appearance code that nerfstudio renders with: the mean over its images, or zeros."""
+    """Return the appearance code with which nerfstudio renders: the mean over its images, or zeros."""
     codes = weights.get(name)
     if codes.dim() != 2 or not len(codes):
         raise weights.error(f"{name!r} is {tuple(codes.shape)}, expected a code for each image")

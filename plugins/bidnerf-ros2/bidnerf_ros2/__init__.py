@@ -1,1 +1,1 @@
-"""ROS: bags as sequences of bidnerf, and a node of ROS 2 that publishes the poses that it finds."""
+"""ROS: bags as bidnerf sequences, and a ROS 2 node that publishes the poses it finds."""

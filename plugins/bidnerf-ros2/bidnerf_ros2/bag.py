@@ -1,9 +1,11 @@
-"""Bags of ROS 2 (folders with ``metadata.yaml``, files ``.mcap`` and ``.db3``) and of ROS 1 (``.bag``) as sequences.
+"""ROS 2 bags (folders with ``metadata.yaml``, files ``.mcap`` and ``.db3``) and ROS 1 bags (``.bag``) as
+sequences.
 
-The images are those of the topic with most colour images that has a camera info beside it: ``/camera/image_raw`` goes with
-``/camera/camera_info``. Depth comes from the topic of depth images of the same aspect ratio; each image has the depth nearest in time,
-within half of the usual interval of the faster of both. Times are those of the messages' headers. A bag has no poses of its images, so it can be
-tracked, but no map can be trained from it.
+Images come from the topic with the most colour images that has a matching camera info: ``/camera/image_raw``
+goes with ``/camera/camera_info``. Depth comes from the topic of depth images with the same aspect ratio; each
+image gets the depth nearest in time, within half the usual interval of the faster of the two. Times are those
+of the message headers. A bag has no poses for its images, so it can be tracked, but no map can be trained
+from it.
 """
 
 from __future__ import annotations
@@ -31,30 +33,30 @@ METADATA, SUFFIXES = "metadata.yaml", (".bag", ".mcap", ".db3")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
 WAITING = 30
-"""Images that may wait for their depth, which is recorded with a delay."""
+"""Number of images that may wait for their depth, which is recorded with a delay."""
 FASTEST = 0.02
-"""Seconds by which the times of an image and its depth may differ in any case."""
+"""Seconds by which the times of an image and its depth may always differ."""
 
 
 @dataclass(frozen=True)
 class Topics:
-    """The topics of a bag that make a sequence."""
+    """The topics of a bag that form a sequence."""
 
     image: str
     info: str
     depth: str | None
     camera: Intrinsics
-    frames: int  # messages of the images' topic
+    frames: int  # number of messages in the image topic
     interval: float  # seconds, the mean of the images or of depth, whichever come faster
 
 
 @dataclass(frozen=True)
 class BagSequence:
-    """The frames of a bag in the order of time, see ``FrameSequence``."""
+    """The frames of a bag in chronological order, see ``FrameSequence``."""
 
     path: Path
     topics: Topics
-    camera: Intrinsics  # of the images, or the one that was given in its place
+    camera: Intrinsics  # of the images, or the given one instead
 
     def __len__(self) -> int:
         return self.topics.frames
@@ -64,7 +66,7 @@ class BagSequence:
             yield TimedFrame(time, frame_of(image, self.camera, depth, f"{number:06d}"))
 
     def _paired(self) -> Iterator[tuple[float, Any, Any | None]]:
-        """Yield images with their times and their depth, once that can have been recorded."""
+        """Yield images with their times and depth, once the depth can have been recorded."""
         images: deque[tuple[float, Any]] = deque()
         depths: deque[tuple[float, Any]] = deque(maxlen=2 * WAITING)
         for topic, time, message in _messages(self.path, (self.topics.image, self.topics.depth)):
@@ -86,7 +88,7 @@ class BagSequence:
 
 
 class BagReader(Reader):
-    """The reader of bags."""
+    """The reader for bags."""
 
     accepts = ("camera",)
     suffixes = SUFFIXES
@@ -97,28 +99,29 @@ class BagReader(Reader):
         return "metadata.yaml and its .mcap or .db3 (a bag of ROS 2), or a file .bag, .mcap or .db3"
 
     def recognises(self, path: Path) -> bool:
-        """Return whether a folder is a bag of ROS 2, or a file is a bag by its name."""
+        """Return whether a folder is a ROS 2 bag, or a file is a bag by its name."""
         return (path / METADATA).is_file() or (path.is_file() and path.suffix.lower() in SUFFIXES)
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Raise ``InputError``: a bag is a sequence, not a dataset."""
         raise InputError(
-            f"{path}: a bag has no poses of its images, expected 'bidnerf track MAP {path}', or a dataset with poses"
+            f"{path}: a bag has no poses for its images, expected 'bidnerf track MAP {path}', or a dataset"
+            " with poses"
         )
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        """Return the images of a bag. Raises ``InputError`` for a bag without images and camera infos that fit."""
+        """Return the images of a bag. Raises ``InputError`` for a bag without images and matching camera infos."""
         topics = _topics(path)
         given = options.camera
         if given is not None and not isinstance(given, Intrinsics):
-            raise InputError(f"{path}: a bag has a camera of its own; expected Intrinsics to replace it")
+            raise InputError(f"{path}: a bag has its own camera; expected Intrinsics to replace it")
         depth = "no depth" if topics.depth is None else f"depth of {topics.depth}"
         log.info("%s: images of %s, camera of %s, %s", path, topics.image, topics.info, depth)
         return BagSequence(path, topics, given or topics.camera)
 
 
 def _messages(path: Path, names: tuple[str | None, ...]) -> Iterator[tuple[str, float, Any]]:
-    """Yield the topic, the time and the content of each message of some topics. Raises ``InputError`` for a damaged bag."""
+    """Yield the topic, time and content of each message of some topics. Raises ``InputError`` for a damaged bag."""
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
             wanted = [connection for connection in bag.connections if connection.topic in names]
@@ -128,15 +131,15 @@ def _messages(path: Path, names: tuple[str | None, ...]) -> Iterator[tuple[str, 
                 yield connection.topic, time or recorded * 1e-9, message
     except InputError:
         raise
-    except Exception as error:  # the formats' parsers raise anything
+    except Exception as error:  # the formats' parsers may raise anything
         raise InputError(f"{path}: the bag cannot be read ({type(error).__name__}: {error})") from error
 
 
 def _first(path: Path, topic: str) -> Any:
-    """Return the first message of a topic. Raises ``InputError`` where the bag only counts some."""
+    """Return the first message of a topic. Raises ``InputError`` if the bag declares messages but has none."""
     for _, _, message in _messages(path, (topic,)):
         return message
-    raise InputError(f"{path}: has no message of {topic}, though it counts some; is it truncated?")
+    raise InputError(f"{path}: has no message of {topic}, although it declares some; is it truncated?")
 
 
 def _topics(path: Path) -> Topics:
@@ -151,9 +154,7 @@ def _topics(path: Path) -> Topics:
                 elif connection.msgtype == INFO and connection.msgcount:
                     infos.add(connection.topic)
     except (AnyReaderError, OSError, ValueError, KeyError) as error:
-        raise InputError(
-            f"{path}: not a bag that can be read ({error}), expected {BagReader().expected}"
-        ) from error
+        raise InputError(f"{path}: not a readable bag ({error}), expected {BagReader().expected}") from error
     first = {topic: _first(path, topic) for topic in (*counts, *infos)}
     colour = [t for t in counts if not is_depth(first[t]) and _info_beside(t, infos) in infos]
     if not colour:
@@ -172,7 +173,7 @@ def _topics(path: Path) -> Topics:
 
 
 def _info_beside(image: str, infos: set[str]) -> str:
-    """Return the camera info that belongs to a topic of images: in its namespace, or one above for compressed images."""
+    """Return the camera info for a topic of images: in its namespace, or one above for compressed images."""
     namespace = image.rpartition("/")[0]
     names = [f"{space}/camera_info" for space in (namespace, namespace.rpartition("/")[0])]
     return next((name for name in names if name in infos), names[0])

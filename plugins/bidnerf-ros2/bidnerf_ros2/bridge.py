@@ -1,4 +1,4 @@
-"""What the node does, without ROS: messages in, poses out; localization runs in a thread of its own."""
+"""What the node does, without ROS: messages in, poses out; localization runs in its own thread."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Estimate:
 
 
 class _Recorded:
-    """A localizer, or a tracker where there is no odometry, that keeps the answers with the stamps of their images."""
+    """A localizer, or without odometry a tracker, that keeps the answers with their image stamps."""
 
     def __init__(self, localizer: Localizer, has_odometry: bool) -> None:
         self._localizer, self._tracker = localizer, None if has_odometry else Tracker(localizer)
@@ -45,9 +45,10 @@ class _Recorded:
 
 
 class Bridge:
-    """Localizes images in the background. With odometry, it keeps the correction of its drift, as ``Corrector`` does.
+    """Localizes images in the background. With odometry, it estimates the correction of its drift, as
+    ``Corrector`` does.
 
-    Without odometry, a ``Tracker`` follows the images. An image is dropped if another one waits already.
+    Without odometry, a ``Tracker`` tracks the images. An image is dropped if another one is already waiting.
     """
 
     def __init__(self, localizer: Localizer, has_odometry: bool) -> None:
@@ -58,9 +59,10 @@ class Bridge:
     def give(
         self, image: Any, info: Any, depth: Any | None, T_odom_camera: SE3 | None, rectified: bool = False
     ) -> bool:
-        """Hand over an image with its camera, its depth, and the pose of its optical frame by odometry.
+        """Submit an image with its camera, its depth, and the pose of its optical frame from odometry.
 
-        Return False if it was dropped. Raises ``InputError`` for messages that cannot be used, and that of an earlier image.
+        Returns False if it was dropped. Raises ``InputError`` for invalid messages, and the error of an
+        earlier image.
         """
         self._number += 1
         frame = frame_of(image, intrinsics(info, rectified), depth, f"{self._number:06d}")
@@ -86,14 +88,15 @@ class Bridge:
         return found
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._corrector.close()
 
 
 def fill_pose(message: Any, found: Localization, T_camera_base: SE3 | None = None) -> None:
-    """Write an accepted pose into a ``PoseWithCovariance``: that of the optical frame, or of a base fixed to the camera.
+    """Write an accepted pose into a ``PoseWithCovariance``: that of the optical frame, or of a base fixed to
+    the camera.
 
-    Raises ``ValueError`` for a pose without a covariance: ROS has no way to say that it is not known.
+    Raises ``ValueError`` for a pose without a covariance: ROS has no way to mark it as unknown.
     """
     if found.covariance is None:
         raise ValueError("a pose without covariance")

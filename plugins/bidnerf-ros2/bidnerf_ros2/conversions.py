@@ -1,9 +1,9 @@
-"""Poses and covariances as ROS has them; pure functions, which need no ROS.
+"""Poses and covariances in ROS conventions; pure functions that need no ROS.
 
-bidnerf's camera axes are x right, y down, z forward: those of an *optical* frame (REP 103, "suffix frames"). Bodies have x forward, y
-left, z up. A covariance of bidnerf is that of a right update at the camera, translation before rotation, in the camera's axes;
-``geometry_msgs/PoseWithCovariance`` has (x, y, z, rotation about X, about Y, about Z) about *fixed* axes, those of the frame in the
-header.
+bidnerf's camera axes are x right, y down, z forward: those of an *optical* frame (REP 103, "suffix frames").
+Bodies have x forward, y left, z up. A bidnerf covariance is that of a right update at the camera, translation
+before rotation, in the camera's axes; ``geometry_msgs/PoseWithCovariance`` has (x, y, z, rotation about X,
+about Y, about Z) about *fixed* axes, those of the frame in the header.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ def covariance_elsewhere(covariance: Float[Tensor, "6 6"], T_camera_base: SE3) -
 
 
 def transform_of(message: Any) -> SE3:
-    """Return the rigid transform in a ``geometry_msgs/Transform`` or ``Pose``. Raises ``InputError`` for no rotation."""
+    """Convert a ``geometry_msgs/Transform`` or ``Pose`` to a rigid transform. Raises ``InputError`` if its
+    rotation is invalid.
+    """
     place = message.translation if hasattr(message, "translation") else message.position
     turn = message.rotation if hasattr(message, "rotation") else message.orientation
     t = torch.tensor([place.x, place.y, place.z], dtype=torch.float64)

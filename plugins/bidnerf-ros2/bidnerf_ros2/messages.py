@@ -1,6 +1,6 @@
-"""Images and cameras of ``sensor_msgs`` as bidnerf has them; pure functions, which need no ROS.
+"""Conversion of ``sensor_msgs`` images and cameras to bidnerf's; pure functions that need no ROS.
 
-They read attributes only, so they take messages of ROS itself and those that ``rosbags`` reads.
+They only read attributes, so they accept messages of ROS itself and those read by ``rosbags``.
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ COLOURS = {
     "mono8": (0,),
     "8UC1": (0,),
 }
-"""The channels in the order of red, green, blue; alpha is left out. ``8UC3`` does not say its order."""
+"""The channels in the order red, green, blue; alpha is ignored. ``8UC3`` does not specify its order."""
 DEPTHS = {"16UC1": (np.uint16, 0.001), "mono16": (np.uint16, 0.001), "32FC1": (np.float32, 1.0)}
-"""Type and metres of a step (REP 118)."""
+"""Type, and metres per step (REP 118)."""
 BYTES = {"rgba8": 4, "bgra8": 4, "rgb8": 3, "bgr8": 3}
 LARGEST = 100_000_000
 """Pixels of an image."""
 COMPRESSED_DEPTH = struct.Struct("<iff")
-"""The head of ``compressed_depth_image_transport``: a format, and the two parameters of its quantization of inverse depth."""
+"""The header of ``compressed_depth_image_transport``: a format, and the two parameters of its inverse-depth
+quantization."""
 
 
 def intrinsics(info: Any, rectified: bool = False) -> Intrinsics:
-    """Return the camera of a ``CameraInfo`` (of ROS 1 or 2), as it is after binning and in its region of interest.
+    """Return the camera of a ``CameraInfo`` (ROS 1 or 2) after binning and within its region of interest.
 
-    ROS counts pixels from the centre of the first one, bidnerf from its corner. ``rectified``: whether the images are free of
-    distortion (topics ``image_rect``), whose camera is the matrix P. Raises ``InputError`` for fisheye lenses and no calibration.
+    ROS measures pixels from the centre of the first one, bidnerf from its corner. ``rectified``: whether the
+    images are free of distortion (topics ``image_rect``); their camera is the matrix P. Raises ``InputError``
+    for fisheye lenses and uncalibrated cameras.
     """
     k, d, p = (_values(info, name) for name in "kdp")
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if rectified else (k[0], k[4], k[2], k[5])
@@ -80,7 +82,7 @@ def colour_image(message: Any) -> np.ndarray:
 
 
 def depth_image(message: Any) -> tuple[np.ndarray, float]:
-    """Return the planar z (h, w) of a depth ``Image`` or ``CompressedImage``, and the metres of one of its steps.
+    """Return the planar z (h, w) of a depth ``Image`` or ``CompressedImage``, and its metres per step.
 
     Raises ``InputError`` for other encodings and for damaged images.
     """
@@ -93,14 +95,14 @@ def depth_image(message: Any) -> tuple[np.ndarray, float]:
 
 
 def is_depth(message: Any) -> bool:
-    """Return whether an image is one of depth, by its encoding."""
+    """Return whether an image is a depth image, judging by its encoding."""
     if hasattr(message, "format"):
         return "compressedDepth" in message.format
     return message.encoding in ("16UC1", "32FC1")
 
 
 def frame_of(image: Any, camera: Intrinsics, depth: Any | None, name: str) -> Frame:
-    """Return a frame of an image message, a camera of the same aspect ratio, and a depth message, if there is one."""
+    """Build a frame from an image message, a camera of the same aspect ratio, and an optional depth message."""
     if depth is None:
         return Frame.from_numpy(colour_image(image), camera, name=name)
     metres, unit = depth_image(depth)
@@ -125,13 +127,14 @@ def _decoded(content: bytes) -> Image.Image:
         image = Image.open(io.BytesIO(content), formats=("JPEG", "PNG", "TIFF", "WEBP"))
         if image.width * image.height > LARGEST:
             raise InputError(
-                f"an image of {image.width}x{image.height}, expected at most {LARGEST // 10**6} megapixels"
+                f"an image has {image.width}x{image.height} pixels, expected at most {LARGEST // 10**6}"
+                " megapixels"
             )
         image.load()
     except InputError:
         raise
     except Exception as error:  # decoders may raise anything
-        raise InputError(f"a compressed image that is not readable ({type(error).__name__})") from error
+        raise InputError(f"a compressed image is not readable ({type(error).__name__})") from error
     return image
 
 
@@ -140,7 +143,7 @@ def _compressed_depth(message: Any) -> tuple[np.ndarray, float]:
     if "compressedDepth" not in message.format:  # a plain PNG
         return np.asarray(_decoded(data)), 0.001
     if len(data) < COMPRESSED_DEPTH.size:
-        raise InputError("a compressed depth image that breaks off")
+        raise InputError("a compressed depth image is truncated")
     _, a, b = COMPRESSED_DEPTH.unpack_from(data)
     stored = np.asarray(_decoded(data[COMPRESSED_DEPTH.size :]))
     if encoding != "32FC1":

@@ -1,6 +1,7 @@
-"""The node of ROS 2: images, camera infos, depth and TF in; poses with covariances, TF and diagnostics out.
+"""The ROS 2 node: images, camera infos, depth and TF in; poses with covariances, TF and diagnostics out.
 
-It needs a ROS 2 installation (``rclpy``, ``tf2_ros``, ``message_filters``); all that it computes is in ``bridge`` and ``conversions``.
+It needs a ROS 2 installation (``rclpy``, ``tf2_ros``, ``message_filters``); all computations are in
+``bridge`` and ``conversions``.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from bidnerf_ros2.conversions import fill, transform_of
 PARAMETERS: dict[str, Any] = {
     "map": "",  # folder of the map
     "map_frame": "map",  # the name of the map's frame in TF
-    "odom_frame": "",  # frame of an odometry in TF; empty: there is none, and the images are tracked
+    "odom_frame": "",  # frame of an odometry in TF; empty: none, and the images are tracked
     "base_frame": "",  # frame whose pose is published; empty: the images' optical frame
     "use_depth": True,  # subscribe to depth
     "rectified": False,  # whether the images are free of distortion
-    "rate": 10.0,  # Hz, of TF and of looking for answers
+    "rate": 10.0,  # Hz, of TF and of polling for answers
     "slop": 0.02,  # seconds between an image and its depth
 }
 
@@ -100,7 +101,7 @@ def make_node() -> Any:
                 self.publish_status(image.header.stamp, ERROR, str(error), {})
 
         def transform(self, target: str, source: str, stamp: Any) -> Any:
-            """Return T_target_source at a time, or None where TF does not know it."""
+            """Return T_target_source at a time, or None if TF does not know it."""
             try:
                 wait = rclpy.duration.Duration(seconds=0.0)
                 return transform_of(self.buffer.lookup_transform(target, source, stamp, wait).transform)
@@ -122,7 +123,7 @@ def make_node() -> Any:
             level, text, values = diagnosis(found)
             self.publish_status(answer.stamp, level, text, values)
             if not found.converged or found.covariance is None:
-                return  # never a pose that the method itself does not accept
+                return  # never a pose that the method itself did not accept
             base = self.options["base_frame"]
             T_camera_base = self.transform(self.optical_frame, base, answer.stamp) if base else None
             if base and T_camera_base is None:

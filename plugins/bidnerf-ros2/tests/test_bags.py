@@ -59,10 +59,10 @@ def test_depth_that_was_not_recorded_is_missing(tmp_path: Path) -> None:
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "b", MOMENTS, CAMERA)
-    with pytest.raises(InputError, match="no poses of its images"):
+    with pytest.raises(InputError, match="no poses for its images"):
         open_dataset(path)
     (tmp_path / "junk.bag").write_bytes(b"junk")
-    with pytest.raises(InputError, match=r"junk\.bag: not a bag"):
+    with pytest.raises(InputError, match=r"junk\.bag: not a readable bag"):
         open_sequence(tmp_path / "junk.bag")
     with pytest.raises(InputError, match="no topic of colour images with a camera_info"):
         open_sequence(bags.write(tmp_path / "empty", [], CAMERA))

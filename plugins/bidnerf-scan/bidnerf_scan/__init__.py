@@ -10,10 +10,10 @@ from bidnerf_scan.scan import Scan
 __all__ = ["Scan", "ScanConfig", "ScanField", "ScanImporter", "backend", "importer", "read_scan"]
 
 backend = RecipeBackend(
-    "meshes and point clouds that were scanned, or discs on measured depth",
+    "scanned meshes and point clouds, or discs on measured depth",
     ScanConfig,
     ScanField,
     train,
     ScanConfig(pieces=6000, steps=300),
 )
-"""Meshes and point clouds that were scanned, or discs on measured depth."""
+"""Scanned meshes and point clouds, or discs on measured depth."""

@@ -27,11 +27,11 @@ LARGEST_ALPHA = 0.999
 """Opacity of one piece, at most."""
 LEAST_ALPHA = 1 / 255
 ROUNDING = 2e-6
-"""Error of a place on a ray in single precision, in units of its distance: triangles reach over their edges by it."""
+"""Relative error of a position on a ray in single precision: triangles extend beyond their edges by it."""
 FLATTEST = 1e-6
-"""Sine of the angle between a ray and a plane, below which they do not meet."""
+"""Sine of the angle between a ray and a plane below which they do not meet."""
 THICKNESS = 0.005
-"""Thickness of a surface for whoever samples rays, in units of the scene's side."""
+"""Thickness of a surface when rays are sampled, in units of the scene's side."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class FieldConfig:
     pieces: Annotated[int, Range(1, 2 * 10**8)] = 30_000  # number of triangles or discs
     images: Annotated[int, Range(0, 10**6)] = 0  # number of textures
     texels: Annotated[int, Range(0, 2 * 10**9)] = 0  # number of their pixels
-    # half of the depth (metres) over which density is spread about a surface; 0: a share of the scene's side
+    # half of the depth (metres) over which density is spread around a surface; 0: proportional to the scene's
+    # side
     thickness: NotNegative = 0.0
 
 
@@ -52,15 +53,15 @@ class _Crossings:
     distance: Float[Tensor, "p"]  # metres along the line
     u: Float[Tensor, "p"]
     v: Float[Tensor, "p"]
-    alpha: Float[Tensor, "p"]  # 0 beside the piece
+    alpha: Float[Tensor, "p"]  # 0 outside the piece
 
 
 class ScanField(nn.Module):
     """Flat pieces: opaque triangles, and discs that fade towards their rims.
 
-    ``hits`` gives the places at which a ray crosses them, nearest first, which is exact. The density that ``query`` returns
-    spreads each piece's optical thickness ``-log(1 - alpha)`` over ``thickness`` before and behind it, along the direction from
-    which it is seen, so that its integral along a ray gives the same opacity.
+    ``hits`` returns the exact points where a ray crosses them, nearest first. The density that ``query``
+    returns spreads each piece's optical thickness ``-log(1 - alpha)`` over ``thickness`` before and behind
+    it, along the direction from which it is seen, so that its integral along a ray gives the same opacity.
     """
 
     corner: Tensor
@@ -105,19 +106,19 @@ class ScanField(nn.Module):
 
     @property
     def thickness(self) -> float:
-        """Metres over which density is spread before and behind a surface."""
+        """Metres over which density is spread in front of and behind a surface."""
         return self.config.thickness or THICKNESS * self.bounds.side
 
     @torch.no_grad()
     def refit(self) -> None:
-        """Make the tree anew, after pieces have moved."""
+        """Rebuild the tree after pieces have moved."""
         disc = (self.first.square() + self.second.square()).sqrt()
         corners = torch.stack([torch.zeros_like(self.first), self.first, self.second])
         low, high = corners.amin(0), corners.amax(0)
         low = torch.where(self.is_round[:, None], -disc, low)
         high = torch.where(self.is_round[:, None], disc, high)
         middle = self.corner + (low + high) / 2
-        # A little wider, so that rounding hides no piece whose box is flat.
+        # Slightly wider, so that rounding hides no piece whose box is flat.
         size = torch.linalg.vector_norm(high - low, dim=-1, keepdim=True)
         half = (high - low) / 2 + 1e-3 * size + 4e-7 * (self.bounds.far + middle.abs())
         order, levels = tree_of(middle, half, torch.ones_like(self.is_round))
@@ -127,7 +128,7 @@ class ScanField(nn.Module):
 
     @torch.no_grad()
     def assign(self, pieces: Pieces) -> None:
-        """Take on as many pieces, with as many textures and texels."""
+        """Copy the same number of pieces, with the same numbers of textures and texels."""
         for name in ("corner", "first", "second", "rgb", "logits", "is_round"):
             getattr(self, name).copy_(getattr(pieces, name))
         if pieces.textures is not None:
@@ -137,7 +138,7 @@ class ScanField(nn.Module):
 
     @property
     def sampler(self) -> SurfaceSampler:
-        """The sampler that puts an interval about each surface."""
+        """The sampler that places an interval around each surface."""
         return SurfaceSampler(self)
 
     def hits(self, rays: Rays) -> RayHits:
@@ -159,7 +160,7 @@ class ScanField(nn.Module):
 
     @torch.no_grad()
     def met(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        """Return the numbers of the pieces that rays (r) cross, nearest first, up to where hardly any light is left."""
+        """Return the indices of the pieces that rays (r) cross, nearest first, until hardly any light is left."""
 
         def meet(index: Tensor, origins: Tensor, directions: Tensor) -> Meeting:
             found = self._crossings(index, origins, directions)
@@ -175,7 +176,7 @@ class ScanField(nn.Module):
     def _about(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> tuple[Int[Tensor, "q"], Float[Tensor, "q"], Float[Tensor, "q 3"]]:
-        """Return the pairs of a point and a piece about it, with density and colour."""
+        """Return the pairs of a point and a nearby piece, with density and colour."""
         with torch.no_grad():
             point, index, counts = pieces_about(positions, self.boxes, self.order, directions, self.thickness)
         crossed = self._crossings(index, positions.index_select(0, point), directions.index_select(0, point))
@@ -190,7 +191,7 @@ class ScanField(nn.Module):
     def _crossings(
         self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> _Crossings:
-        """Return where lines cross the planes of pieces number ``index`` (Moeller and Trumbore 1997)."""
+        """Return where lines cross the planes of the pieces with indices ``index`` (Moeller and Trumbore 1997)."""
         corner, first, second, logits, is_round = (
             part.index_select(0, index)
             for part in (self.corner, self.first, self.second, self.logits, self.is_round)
@@ -234,7 +235,7 @@ class ScanField(nn.Module):
         return found.clamp(0, 1)
 
     def _textured(self, index: Tensor, u: Tensor, v: Tensor) -> Float[Tensor, "p 3"]:
-        """Return the textures' colours, which are repeated beyond their borders; white where there is none."""
+        """Return the textures' colours, repeated beyond their borders; white for pieces without one."""
         uv, image = self.uv.index_select(0, index), self.image.index_select(0, index)
         start, width, height = self.shapes.index_select(0, image.clamp(min=0)).unbind(-1)
         place = uv[:, 0] + u[:, None] * uv[:, 1] + v[:, None] * uv[:, 2]
@@ -251,10 +252,10 @@ class ScanField(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSampler:
-    """An interval about each piece that a ray crosses, as long as its density is there divided by its peak.
+    """An interval around each piece that a ray crosses, as long as its density there divided by its peak.
 
-    Where pieces lie close to each other, their intervals end half-way between them. ``hits`` is exact, and what the core
-    renders.
+    If pieces are close together, their intervals end half-way between them. ``hits`` is exact, and is what
+    the core renders.
     """
 
     field: ScanField

@@ -32,36 +32,37 @@ UPS = {
 }
 Up = Literal["format", "+x", "-x", "+y", "-y", "+z", "-z"]
 FINEST = 2.0**-22
-"""Relative rounding of a coordinate in single precision, with some reserve."""
+"""Relative rounding of a coordinate in single precision, with some margin."""
 COARSEST = 2e-4
 """Rounding of coordinates, in units of the scene's longest side, beyond which a scan must be moved to the origin."""
 SURFACE_POINTS = 300_000
-"""Points on a mesh, evenly over its area, which make its surface and tell its extent."""
+"""Number of points sampled uniformly on a mesh, which form its surface and determine its extent."""
 TRIED = 4000
-"""Rays by which a solid object is told from a room."""
+"""Number of rays used to distinguish a solid object from a room."""
 FEWEST_BETWEEN = 0.02
-"""Share of the places in the box that must have matter on two opposite sides."""
+"""Fraction of the places in the box that must have matter on two opposite sides."""
 MOSTLY = 0.9
 HARDLY_CLIPPED = 1.5
-"""Ratio of the sides of the boxes about all and about nearly all points, up to which the box holds all."""
+"""Ratio of the sides of the boxes around all and around nearly all points up to which the box contains all."""
 
 
 @dataclass(frozen=True)
 class ScanSettings(Settings):
-    """What a file does not say."""
+    """Settings that a file does not contain."""
 
-    # axis of the file's coordinates that is upwards; by default that of the format's convention
+    # upward axis in the file's coordinates; by default that of the format's convention
     up: Up = "format"
-    # place in the file's coordinates that becomes the origin, before scaling: surveys have coordinates of millions of metres
+    # place in the file's coordinates that becomes the origin, before scaling: surveys have coordinates of
+    # millions of metres
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # largest number of discs: clouds of more points are thinned by a grid
+    # largest number of discs: larger clouds are thinned on a grid
     points: Annotated[int, Range(3, 10**8)] = 1_000_000
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour (rgb) where a ray meets nothing
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour (rgb) where a ray hits nothing
 
 
 @dataclass(frozen=True)
 class ScanImporter:
-    """Reads meshes and point clouds of all formats."""
+    """Reads meshes and point clouds in all formats."""
 
     summary: str = "meshes and point clouds: .ply, .obj, .glb, .gltf, .pcd, .las, .laz, .e57"
     config_type: type = ScanSettings
@@ -74,10 +75,10 @@ class ScanImporter:
             return False
 
     def read(self, path: Path, config: ScanSettings, placement: Similarity) -> ImportedField:
-        """Return the field of the mesh or the cloud in a file, see ``Importer``."""
+        """Read the mesh or cloud in a file as a field, see ``Importer``."""
         found = format_of(path)
         if found is None:
-            raise InputError(f"{path}: no mesh or point cloud that can be read, expected {self.summary}")
+            raise InputError(f"{path}: not a readable mesh or point cloud, expected {self.summary}")
         return imported(found.read(path), str(path), config, placement, found)
 
 
@@ -85,7 +86,7 @@ def imported(
     scan: Scan, where: str, config: ScanSettings = ScanSettings(), placement: Similarity = UNMOVED,
     of: Format | None = None,
 ) -> ImportedField:  # fmt: skip
-    """Return a scan of any source as a field. Raises ``InputError`` where nothing of it can be rendered."""
+    """Build a field from a scan of any source. Raises ``InputError`` if nothing in it can be rendered."""
     kept, dropped = cleaned(scan, where)
     points = placement.apply(torch.from_numpy(kept.points - np.array(config.origin)).double())
     used = points if kept.faces is None else points[torch.from_numpy(kept.faces).unique()]
@@ -95,8 +96,8 @@ def imported(
         facts.append(f"left out {dropped}")
     if not scan.has_colours:
         facts.append(
-            "no colours: it gives no landmarks, and poses are found by its shape alone, which takes images with depth and is"
-            " seldom accepted (--photos gives landmarks)"
+            "no colours: it gives no landmarks, and poses are found from its shape alone, which needs"
+            " images with depth and is seldom accepted (--photos gives landmarks)"
         )
     colours: Tensor | None = None
     if kept.faces is None:
@@ -117,7 +118,7 @@ def imported(
     field.assign(pieces)
     solid = kept.faces is not None and is_solid(field)
     if solid:
-        facts.append("its faces look outwards all around: a solid object, seen from outside")
+        facts.append("its faces all point outwards: a solid object, seen from outside")
     axis = ("+z" if of is None else of.up) if config.up == "format" else config.up
     facts.append(
         f"axes: {axis[1]} {'up' if axis[0] == '+' else 'down'}"
@@ -135,9 +136,10 @@ def imported(
 
 @torch.no_grad()
 def is_solid(field: ScanField) -> bool:
-    """Return whether rays from within a mesh meet the backs of its faces, as in a model of an object and not in one of a room.
+    """Return whether rays from within a mesh hit the backs of its faces, as in a model of an object but not
+    in one of a room.
 
-    Where faces look to either side at random, or where few rays from within the box meet any, it counts as not solid.
+    If faces point to either side at random, or few rays from within the box hit any, it counts as not solid.
     """
     bounds, generator = field.bounds, torch.Generator().manual_seed(0)
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
@@ -152,7 +154,7 @@ def is_solid(field: ScanField) -> bool:
     for index, way in ((piece[:, 0], directions), (opposite[:, 0], -directions)):
         normal = torch.linalg.cross(field.first[index], field.second[index])
         backs.append((normal * way).sum(-1) > 0)
-    between = valid[:, 0] & other[:, 0]  # something is met either way
+    between = valid[:, 0] & other[:, 0]  # something is hit either way
     if float(between.float().mean()) < FEWEST_BETWEEN:
         return False
     both = (backs[0] & backs[1])[between].float().mean()
@@ -181,13 +183,14 @@ def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSetti
     if rounding > COARSEST * side:
         x, y, z = (round(o + float(m)) for o, m in zip(config.origin, middle, strict=True))
         raise InputError(
-            f"{where}: its coordinates are about ({x}, {y}, {z}), which single precision resolves to {rounding:.2g} only;"
-            f" expected a scan near the origin (--origin {x} {y} {z} makes that place the origin)"
+            f"{where}: its coordinates are around ({x}, {y}, {z}), which single precision resolves only to"
+            f" {rounding:.2g}; expected a scan near the origin (--origin {x} {y} {z} makes that place the"
+            " origin)"
         )
 
 
 def surface_points(pieces: Pieces) -> Float[Tensor, "n 3"]:
-    """Return points (metres, world) on triangles, evenly over their area."""
+    """Return points (metres, world) distributed uniformly over the area of triangles."""
     piece, u, v = surface_places(pieces)
     return pieces.corner[piece] + u[:, None] * pieces.first[piece] + v[:, None] * pieces.second[piece]
 
@@ -195,7 +198,9 @@ def surface_points(pieces: Pieces) -> Float[Tensor, "n 3"]:
 def surface_places(
     pieces: Pieces,
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return places on triangles, evenly over their area and always the same: numbers of triangles, and u and v in them."""
+    """Return places distributed uniformly over the area of triangles, always the same: indices of triangles,
+    and u and v in them.
+    """
     area = torch.linalg.vector_norm(torch.linalg.cross(pieces.first, pieces.second), dim=-1).double()
     ends = area.cumsum(0) / area.sum().clamp(min=1e-300)
     generator = torch.Generator().manual_seed(0)
@@ -208,7 +213,7 @@ def surface_places(
 def _bounds(
     points: Float[Tensor, "n 3"], background: tuple[float, float, float], footprint: float
 ) -> SceneBounds:
-    """Return bounds that hold all points, unless a few of them are far away."""
+    """Return bounds that contain all points, unless a few of them are far away."""
     found = bounds_about(points, background, footprint)
     lower, upper = points.amin(0).double(), points.amax(0).double()
     if found.contracted or float((upper - lower).max()) > HARDLY_CLIPPED * found.side:

@@ -1,4 +1,4 @@
-"""Flat pieces of a surface: triangles of a mesh and discs about the points of a cloud."""
+"""Flat pieces of a surface: triangles of a mesh and discs around the points of a cloud."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from torch import Tensor
 from bidnerf_scan.scan import Scan
 
 NEIGHBOURS = 12
-"""Points to which the plane and the colours of a disc are fitted, itself among them."""
+"""Number of points, including itself, to which the plane and colours of a disc are fitted."""
 SPACED = 8
-"""Neighbour whose distance tells how far points are apart."""
+"""Neighbour whose distance measures the spacing of points."""
 WIDER = 1.3
-"""Radius of a disc, in units of that distance: discs overlap so much that a surface of random points is opaque."""
+"""Radius of a disc in units of that distance: discs overlap enough that a surface of random points is opaque."""
 WIDEST = 4.0
-"""Radius of a disc, in units of the median radius, that is not exceeded: beyond it, a point is alone."""
+"""Largest radius of a disc, in units of the median radius; beyond it, a point is isolated."""
 OPAQUE = 8.0
 """Logit of the opacity of a triangle."""
 DISC_OPACITY = 3.0
-"""Logit of the opacity of a disc in its middle."""
+"""Logit of the opacity at the middle of a disc."""
 AT_ONCE = 100_000
 GREY = 0.5
 
@@ -35,8 +35,8 @@ class Textures:
 
     texels: UInt8[Tensor, "t 3"]
     shapes: Int[Tensor, "k 3"]  # of each image: its first texel, its width, its height
-    image: Int[Tensor, "n"]  # number of a piece's image; -1 where it has none
-    uv: Float[Tensor, "n 3 2"]  # at the corner, and how it changes along the first and the second edge
+    image: Int[Tensor, "n"]  # index of a piece's image; -1 if it has none
+    uv: Float[Tensor, "n 3 2"]  # at the corner, and its change along the first and second edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +48,7 @@ class Pieces:
     corner: Float[Tensor, "n 3"]  # of a triangle; middle of a disc
     first: Float[Tensor, "n 3"]  # edge of a triangle; radius of a disc
     second: Float[Tensor, "n 3"]
-    rgb: Float[
-        Tensor, "n 3 3"
-    ]  # colour at the corner, and how it changes along the first and the second edge
+    rgb: Float[Tensor, "n 3 3"]  # colour at the corner, and its change along the first and second edge
     logits: Float[Tensor, "n"]  # of the opacity
     is_round: Bool[Tensor, "n"]
     textures: Textures | None = None
@@ -89,7 +87,8 @@ def _textures(scan: Scan) -> Textures | None:
 
 
 def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None) -> Pieces:
-    """Return a disc about each point (metres, world): in the plane through its neighbours, as wide as their distances.
+    """Return a disc around each point (metres, world), in the plane fitted to its neighbours and as wide as
+    their distances.
 
     The colours of its neighbours give that of a disc, as a linear function within its plane (Park et al. 2017, eq. 10).    There must be three points at least.
     """
@@ -114,7 +113,7 @@ def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None)
 def _discs(
     points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"], tree: cKDTree, part: range
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both radii (p 3) and the colours (p 3 3) of the discs about some points."""
+    """Return both radii (p 3) and the colours (p 3 3) of the discs around some points."""
     some = points.double()[part.start : part.stop]
     away, near = tree.query(some.numpy(), k=min(NEIGHBOURS, len(points)), workers=-1)
     index = torch.from_numpy(np.asarray(near, dtype=np.int64))
@@ -125,7 +124,8 @@ def _discs(
     centred = offsets - offsets.mean(1, keepdim=True)
     _, axes = torch.linalg.eigh(centred.mT @ centred)
     first, second = axes[..., 2] * radius[:, None], axes[..., 1] * radius[:, None]
-    # Colours are fitted in coordinates of the disc, in units of its radius, with a little weight against thin strips.
+    # Colours are fitted in coordinates of the disc, in units of its radius, with slight regularization
+    # against thin strips.
     flat = torch.stack([(offsets * edge[:, None]).sum(-1) for edge in (first, second)], -1)
     flat = flat / radius[:, None, None].square()
     ones = torch.ones_like(flat[..., :1])

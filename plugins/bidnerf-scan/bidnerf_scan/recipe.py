@@ -21,11 +21,11 @@ from bidnerf_scan.field import FieldConfig, ScanField
 from bidnerf_scan.pieces import Pieces, cloud_pieces, thinned
 
 DRAWN = 8
-"""Pixels with measured depth that are drawn for each disc."""
+"""Number of pixels with measured depth drawn for each disc."""
 FEWEST = 100
-"""Measured points below which discs are put anywhere."""
+"""Number of measured points below which discs are placed anywhere."""
 OPACITY = 0.1
-"""Opacity at first of a disc that is put anywhere."""
+"""Initial opacity of a disc that is placed anywhere."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class ScanConfig(FieldConfig, SupervisionConfig):
 
 
 def config_of(pieces: Pieces) -> ScanConfig:
-    """Return the size of a field for these pieces."""
+    """Return a config whose size matches these pieces."""
     if pieces.textures is None:
         return ScanConfig(pieces=len(pieces))
     return ScanConfig(
@@ -51,8 +51,8 @@ def config_of(pieces: Pieces) -> ScanConfig:
 def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping.
 
-    Discs lie where the views measured depth and do not move. Without measured depth, they lie anywhere in the box of the scene,
-    and only their colours and opacities tell matter from free space.
+    Discs are placed where the views measured depth and do not move. Without measured depth, they are placed
+    anywhere in the scene's box, and only their colours and opacities distinguish matter from free space.
     """
     supervision = Supervision(views, field.bounds, config, device_of(field))
     if report.resume() is None:
@@ -72,7 +72,7 @@ def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: R
 
 
 def first_pieces(field: ScanField, views: Sequence[View], generator: Generator) -> Pieces:
-    """Return as many discs as the field has: on measured depth where there is some, else anywhere."""
+    """Return as many discs as the field has: on measured depth if there is some, else anywhere."""
     count = len(field.corner)
     points, rgb = _measured(views, field.bounds, DRAWN * count, generator)
     if len(points) < FEWEST:
@@ -81,7 +81,9 @@ def first_pieces(field: ScanField, views: Sequence[View], generator: Generator) 
     points, colours = thinned(points, rgb, count)
     assert colours is not None
     found = cloud_pieces(points, colours)
-    missing = count - len(found)  # cells of a grid are never as many as wanted; copies are transparent
+    missing = count - len(
+        found
+    )  # the number of grid cells is never exactly the wanted one; copies are transparent
     again = torch.randint(len(found), (missing,), generator=generator)
     every = torch.cat([torch.arange(len(found)), again])
     logits = torch.cat([found.logits, torch.full((missing,), -20.0)])

@@ -1,4 +1,4 @@
-"""What a scan consists of: points or vertices, and the faces between them."""
+"""The contents of a scan: points or vertices, and the faces between them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FARTHEST = 1e12
 
 
 FEWEST = 3
-"""Points that have a plane."""
+"""Number of points that define a plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +26,12 @@ class Scan:
     rgb: NDArray[np.float32] | None = None  # (n, 3), in [0, 1]; None where the file holds no colours
     faces: NDArray[np.int64] | None = None  # (m, 3): triangles; None for a cloud
     uv: NDArray[np.float32] | None = None  # (m, 3, 2): place of each corner in its texture, v upwards
-    image: NDArray[np.int64] | None = None  # (m,): number of each triangle's texture; -1 where it has none
+    image: NDArray[np.int64] | None = None  # (m,): index of each triangle's texture; -1 if it has none
     images: tuple[NDArray[np.uint8], ...] = ()  # textures, (h, w, 3)
 
     @property
     def has_colours(self) -> bool:
-        """Whether it is known how anything looks."""
+        """Whether any colours are known."""
         return self.rgb is not None or bool(self.images)
 
 
@@ -42,7 +42,7 @@ class Dropped:
     not_finite: int = 0  # points whose coordinates are NaN or infinite
     broken_faces: int = 0  # faces with corners that are left out or do not exist
     flat_faces: int = 0  # faces without an area
-    repeated: int = 0  # points at the place of another
+    repeated: int = 0  # duplicate points
 
     def __str__(self) -> str:
         parts = [
@@ -51,7 +51,7 @@ class Dropped:
                 (self.not_finite, "points with coordinates that are not finite"),
                 (self.broken_faces, "faces with corners that do not exist"),
                 (self.flat_faces, "faces without an area"),
-                (self.repeated, "points at the place of another"),
+                (self.repeated, "duplicate points"),
             )
             if count
         ]
@@ -59,7 +59,7 @@ class Dropped:
 
 
 def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
-    """Return the usable part of a scan, and what was left out. Raises ``InputError`` where nothing is left."""
+    """Return the usable part of a scan, and what was left out. Raises ``InputError`` if nothing is left."""
     dropped = Dropped()
     if not len(scan.points):
         raise InputError(f"{where}: holds no points, expected a mesh or a point cloud")
@@ -74,7 +74,7 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
         dropped.repeated = len(points) - len(first)
         first.sort()
         if len(first) < FEWEST:
-            raise InputError(f"{where}: {len(first)} points at different places, expected three at least")
+            raise InputError(f"{where}: {len(first)} distinct points, expected at least three")
         return Scan(points[first], None if rgb is None else rgb[first]), dropped
     exists = np.asarray(np.all((scan.faces >= 0) & (scan.faces < len(scan.points)), axis=-1))
     whole = exists.copy()
@@ -97,7 +97,7 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
 
 
 def joined(scans: Sequence[Scan]) -> Scan:
-    """Return one mesh of several, or one cloud. Meshes without colours are grey among others."""
+    """Merge several meshes or clouds into one. Meshes without colours become grey if others have some."""
     if len(scans) == 1:
         return scans[0]
     points = np.concatenate([scan.points for scan in scans])

@@ -100,12 +100,12 @@ def test_broken_parts_are_left_out_and_counted() -> None:
     points = np.random.default_rng(0).normal(size=(200, 3))
     points[0], points[1, 2], points[3] = np.nan, np.inf, points[2]
     found = " ".join(imported(Scan(points, np.full((200, 3), np.nan, np.float32)), "x").found)
-    assert "left out 2 points with coordinates that are not finite, 1 points at the place of another" in found
+    assert "left out 2 points with coordinates that are not finite, 1 duplicate points" in found
     with pytest.raises(InputError, match="finite"):
         imported(Scan(np.full((5, 3), np.nan)), "x")
     with pytest.raises(InputError, match="no points"):
         imported(Scan(np.zeros((0, 3))), "x")
-    with pytest.raises(InputError, match="three at least"):
+    with pytest.raises(InputError, match="at least three"):
         imported(Scan(np.ones((9, 3))), "x")
     mesh = Scan(points, None, np.array([[2, 4, 5], [0, 4, 5], [4, 4, 5], [4, 5, 999]]))
     found = " ".join(imported(mesh, "x").found)

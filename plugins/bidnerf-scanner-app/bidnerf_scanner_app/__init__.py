@@ -1,4 +1,4 @@
-"""Reads folders of "All Data" as the iOS program "3D Scanner App" exports them."""
+"""Reads "All Data" folders exported by the iOS app "3D Scanner App"."""
 
 from bidnerf_scanner_app.reader import ScannerAppReader, reader
 

@@ -1,4 +1,4 @@
-"""Folders of "All Data" as the iOS program "3D Scanner App" exports them.
+"""Folders exported by the iOS app "3D Scanner App" as "All Data".
 
 A frame N has ``frame_N.json`` (ARKit's ``cameraPoseARFrame``, a row-major camera-to-world matrix with OpenGL axes, and
 ``intrinsics`` of the photo, 3x3 and row-major). Some frames have a photo ``frame_N.jpg``. Scans with a LiDAR have
@@ -12,9 +12,9 @@ and the intrinsics with them. A scan of 127 training photos then takes 0.6 GB in
 confidence is not high and beyond 5 m, the range of the LiDAR; each of the photo's pixels has the depth of the nearest
 measurement.
 
-ARKit counts pixels from the centre of the upper left one. Where a frame has ARKit's ``projectionMatrix``, the principal
-point is taken from it: it is relative to the image's borders and so holds for photos of any size. Otherwise, half a pixel
-is added.
+ARKit measures pixels from the centre of the upper left one. If a frame has ARKit's ``projectionMatrix``, the
+principal point is taken from it: it is relative to the image's borders and so holds for photos of any size.
+Otherwise, half a pixel is added.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from bidnerf_core.io.images import Background, decode, reduced
 from bidnerf_core.io.json import Record, read_record
 
 LARGEST_SIDE = 640
-"""Usual number of pixels on the longer side of a photo once it is read."""
+"""Default limit of the pixels on a photo's longer side."""
 RANGE = 5.0
 """Range of the LiDAR (metres) according to Apple; depth beyond it was inferred from the photo."""
 HIGH_CONFIDENCE = 2
@@ -90,13 +90,13 @@ class ScannerFrame:
 
 @dataclass(frozen=True)
 class ScannerAppReader(Reader):
-    """The reader of folders of "3D Scanner App"; ``largest`` is the usual limit of the longer side of photos (pixels)."""
+    """Reader for "3D Scanner App" folders; ``largest`` is the default limit of the longer side of photos (pixels)."""
 
     largest: int = LARGEST_SIDE
     expected = f"frame_0.jpg, frame_0.json ... with {POSE}"
 
     def recognises(self, path: Path) -> bool:
-        """Return whether the first ``frame_N.json`` has a pose of ARKit; a broken one is left to other readers."""
+        """Return whether the first ``frame_N.json`` has an ARKit pose; a malformed one is left to other readers."""
         first = next(iter(sorted(path.glob("frame_*.json"))), None)
         try:
             return first is not None and POSE.encode() in read_file(first, "JSON")
@@ -104,7 +104,7 @@ class ScannerAppReader(Reader):
             return False
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read all descriptions. Raises ``InputError`` where one is missing or not usable."""
+        """Read all descriptions. Raises ``InputError`` if one is missing or invalid."""
         return self._dataset(path, options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -117,7 +117,7 @@ class ScannerAppReader(Reader):
 
 
 class ScannerAppDataset(SplitDataset[ScannerFrame]):
-    """Views of a folder of "3D Scanner App"; see ``Dataset``."""
+    """Views of a "3D Scanner App" folder; see ``Dataset``."""
 
     unit: LengthUnit | None = "metres"
     up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
@@ -153,25 +153,30 @@ def _between(frame: ScannerFrame, name: str) -> Frame:
     photo_width, photo_height = projected_size(frame.record)
     if not same_aspect((width, height), (photo_width, photo_height)):
         raise InputError(
-            f"{frame.beside('depth')}: depth is {width}x{height}, its camera's photos are "
-            f"{photo_width}x{photo_height}; expected the same aspect ratio"
+            f"{frame.beside('depth')}: depth is {width}x{height}, but its camera's photos are"
+            f" {photo_width}x{photo_height}; expected the same aspect ratio"
         )
     camera = scanner_camera(frame.record, photo_width, photo_height).resized(width, height)
     return Frame(name, torch.zeros(height, width, 3), camera, depth, has_colour=False)
 
 
 def scanner_frames(folder: Path) -> list[ScannerFrame]:
-    """Read the descriptions of all photos, ordered by number. Raises ``InputError`` where one is missing or not usable.
+    """Read the descriptions of all photos, ordered by number. Raises ``InputError`` if one is missing or
+    invalid.
 
-    Depth is expected for all frames or, as from phones without a LiDAR, for none.
+    Depth is expected for all frames or, from phones without a LiDAR, for none.
     """
     numbered = {path: PHOTO.fullmatch(path.name) for path in folder.iterdir()}
     photos = sorted((int(found[1]), path) for path, found in numbered.items() if found)
     if not photos:
-        raise InputError(f"{folder}: has frame_N.json but no photo, expected frame_N.jpg beside some of them")
+        raise InputError(
+            f"{folder}: has frame_N.json but no photo, expected frame_N.jpg next to some of them"
+        )
     for (number, path), (following, other) in pairwise(photos):
         if number == following:
-            raise InputError(f"{folder}: {path.name} and {other.name} have one number, expected each once")
+            raise InputError(
+                f"{folder}: {path.name} and {other.name} have the same number, expected each once"
+            )
     has_depth = any(folder.glob("depth_*.png")) or any(folder.glob("conf_*.png"))
     return [_frame(path.with_suffix(".json"), path, has_depth) for _, path in photos]
 
@@ -192,24 +197,24 @@ def _frame(description: Path, photo: Path | None, has_depth: bool) -> ScannerFra
     for kind in ("depth", "conf") if has_depth else ():
         if not frame.beside(kind).is_file():
             there = description if photo is None else photo
-            raise InputError(f"{frame.beside(kind)}: no such file, expected it as {there.name} is there")
+            raise InputError(f"{frame.beside(kind)}: no such file, although {there.name} exists")
     return frame
 
 
 def projected_size(record: Record) -> tuple[int, int]:
-    """Return the size (width, height) of the photos to which the intrinsics belong.
+    """Return the size (width, height) of the photos that the intrinsics describe.
 
-    Raises ``InputError`` where there is no projection matrix to determine it from.
+    Raises ``InputError`` if there is no projection matrix to determine it from.
     """
     fx, _, _, _, fy, *_ = _numbers(record, INTRINSICS, 9)
     projection = _numbers(record, PROJECTION, 16)
     if projection[0] <= 0 or projection[5] <= 0:
-        raise record.error(f"{PROJECTION} has no positive focal lengths, expected a matrix of ARKit's")
+        raise record.error(f"{PROJECTION} has no positive focal lengths, expected an ARKit matrix")
     return round(2 * fx / projection[0]), round(2 * fy / projection[5])
 
 
 def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
-    """Return the camera of a photo of this size. Raises ``InputError`` where the intrinsics are for another size."""
+    """Return the camera of a photo of this size. Raises ``InputError`` if the intrinsics are for another size."""
     fx, skew, cx, _, fy, cy, *last = _numbers(record, INTRINSICS, 9)
     if abs(skew) > 1e-6 or last != [0, 0, 1]:
         raise record.error(f"{INTRINSICS} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], expected 3x3 row by row")
@@ -228,7 +233,7 @@ def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
 def read_measured(depth: Path, confidence: Path) -> DepthImage:
     """Read depth (metres), 0 where the confidence is not high and outside the sensor's range.
 
-    Raises ``InputError`` where a file is not readable or does not have the expected content.
+    Raises ``InputError`` if a file cannot be read or does not have the expected content.
     """
     measured = read_depth_image(depth, MILLIMETRE)
     sure = decode(confidence)
@@ -247,7 +252,7 @@ def _kept(metres: Float[Tensor, "h w"], confidence: Tensor) -> Float[Tensor, "h 
 
 def _other_size(record: Record, width: int, height: int) -> InputError:
     return record.error(
-        f"{INTRINSICS} are not of its photo of {width}x{height}; expected intrinsics scaled with the photo"
+        f"{INTRINSICS} do not match its photo of {width}x{height}; expected intrinsics scaled with the photo"
     )
 
 

@@ -241,7 +241,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "depth shape": (
         square_depth,
-        r"depth_2\.png: depth is 9x9, its image 960x720; expected the same aspect ratio",
+        r"depth_2\.png: depth is 9x9, but its image is 960x720; expected the same aspect ratio",
     ),
     "scaled pose": (
         lambda f: rewrite(f, lambda c: c["cameraPoseARFrame"].__setitem__(0, 2.0)),
@@ -270,7 +270,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "photo of half the size": (
         lambda f: iio.imwrite(f / "frame_2.jpg", np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8)),
-        r"intrinsics are not of its photo of 480x360; expected intrinsics scaled with the photo",
+        r"intrinsics do not match its photo of 480x360; expected intrinsics scaled with the photo",
     ),
     "no photos": (remove_photos, r"scan: has frame_N.json but no photo"),
     "number twice": (
@@ -366,7 +366,7 @@ def test_a_phone_without_depth_has_a_sequence_of_photos(scan: Path) -> None:
     [
         (
             lambda scan: (scan / "conf_5.png").unlink(),
-            r"conf_5\.png: no such file, expected it as frame_5\.json is there",
+            r"conf_5\.png: no such file, although frame_5\.json exists",
         ),
         (lambda scan: (scan / "frame_5.json").unlink(), r"frame_5\.json: no such file"),
         (
@@ -377,7 +377,7 @@ def test_a_phone_without_depth_has_a_sequence_of_photos(scan: Path) -> None:
             lambda scan: [
                 iio.imwrite(scan / f"{kind}_5.png", np.ones((48, 48), np.uint8)) for kind in ("depth", "conf")
             ],
-            r"depth_5\.png: depth is 48x48, its camera's photos are 960x720",
+            r"depth_5\.png: depth is 48x48, but its camera's photos are 960x720",
         ),
         (
             lambda scan: (scan / "frame_5.json").write_text(

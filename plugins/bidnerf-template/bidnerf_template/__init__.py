@@ -1,4 +1,4 @@
-"""A minimal backend: a grid of voxels with trilinear interpolation."""
+"""A minimal backend: a voxel grid with trilinear interpolation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]
 
 @dataclass(frozen=True)
 class TemplateConfig(SupervisionConfig):
-    """Each field is an option of ``bidnerf train`` and is stored with the map, so it must be what JSON can hold."""
+    """Each field is an option of ``bidnerf train`` and is stored with the map, so it must be JSON-serializable."""
 
     resolution: int = 96  # grid points along each axis of the modelled space
     samples: int = 96  # samples along a ray
@@ -29,7 +29,7 @@ class TemplateConfig(SupervisionConfig):
 
 
 class TemplateField(nn.Module):
-    """The radiance field. Its ``state_dict`` is all that is saved."""
+    """The radiance field. Only its ``state_dict`` is saved."""
 
     def __init__(self, config: TemplateConfig, bounds: SceneBounds) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class TemplateField(nn.Module):
         raw = raw.reshape(4, *positions.shape[:-1])
         density = (
             functional.softplus(raw[0] - 4) * 100 / self.side
-        )  # thin at first, whatever the unit of length
+        )  # thin at first, regardless of the length unit
         return FieldValues(density, raw[1:].sigmoid().movedim(0, -1))
 
 

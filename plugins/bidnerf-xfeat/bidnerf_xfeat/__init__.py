@@ -1,1 +1,1 @@
-"""XFeat, a learned detector of keypoints, for the landmarks of bidnerf."""
+"""XFeat, a learned keypoint detector, for bidnerf's landmarks."""

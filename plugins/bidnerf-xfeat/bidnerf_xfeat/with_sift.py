@@ -1,4 +1,4 @@
-"""XFeat and SIFT as one detector, so that a map has landmarks of both and a pose is that on which they agree together."""
+"""XFeat and SIFT as one detector, so that a map has landmarks of both and a pose is supported by both together."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ ZERO = 128
 
 @dataclass(frozen=True)
 class WithSift:
-    """Keypoints of XFeat and of SIFT in turns.
+    """Keypoints of XFeat and SIFT in alternation.
 
-    Descriptors have the channels of both, those of the other detector 0, so that the descriptors of two detectors are farther apart
-    than unrelated ones of the same. SIFT's are of half their usual length, which is that of XFeat's.
+    Descriptors have the channels of both, with zeros for the other detector, so that descriptors of different
+    detectors are farther apart than unrelated ones of the same detector. SIFT's are scaled to half their
+    usual length, which is that of XFeat's.
     """
 
     xfeat: XFeat = XFeat()
@@ -49,7 +50,7 @@ class WithSift:
 
 
 def _zeros(rows: Keypoints, columns: Keypoints) -> UInt8[Tensor, "n d"]:
-    """Return as many zeros as ``rows`` has keypoints and the descriptors of ``columns`` channels."""
+    """Return zeros for as many keypoints as ``rows`` has, with as many channels as ``columns``'s descriptors."""
     return torch.full((len(rows), columns.descriptors.shape[1]), ZERO, dtype=torch.uint8)
 
 

@@ -18,14 +18,14 @@ NAMES = {
     "means": "means", "scales": "log_scales", "quats": "quaternions", "opacities": "logits", "sh0": "sh0",
     "shN": "shN", "features_dc": "sh0", "features_rest": "shN",
 }  # fmt: skip
-"""What the parameters of both are called here."""
+"""The names used here for the parameters of both."""
 PREFIX = "_model.gauss_params."
 """Prefix of the names of splatfacto's parameters."""
 ZIP = b"PK\x03\x04"
 
 
 def recognises(path: Path) -> bool:
-    """Return whether the file was written by ``torch.save`` and names parameters of Gaussians."""
+    """Return whether the file was written by ``torch.save`` and contains names of Gaussian parameters."""
     if path.suffix.lower() not in ENDINGS or not path.is_file():
         return False
     try:
@@ -35,7 +35,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Return the Gaussians of a checkpoint. Raises ``InputError`` where it would run code, or holds something else."""
+    """Read the Gaussians of a checkpoint. Raises ``InputError`` if it would run code, or contains something else."""
     found = _parameters(read_saved(path, EXPECTED))
     missing = [name for name in ("means", "log_scales", "quaternions", "logits", "sh0") if name not in found]
     if missing:
@@ -51,7 +51,7 @@ def read(path: Path) -> Gaussians:
             parts["quaternions"].reshape(count, 4), parts["logits"].reshape(count), harmonics,
         )  # fmt: skip
     except (RuntimeError, TypeError) as error:
-        raise InputError(f"{path}: tensors of different counts ({error}), expected {EXPECTED}") from error
+        raise InputError(f"{path}: tensors with different counts ({error}), expected {EXPECTED}") from error
 
 
 def _parameters(saved: Any) -> dict[str, Tensor]:
@@ -62,7 +62,7 @@ def _parameters(saved: Any) -> dict[str, Tensor]:
 
 
 def _inside(found: Any) -> dict[str, Any]:
-    """Return the parameters by name: gsplat keeps them under "splats", splatfacto under "pipeline" with a prefix."""
+    """Return the parameters by name: gsplat stores them under "splats", splatfacto under "pipeline" with a prefix."""
     for key in ("splats", "pipeline"):
         if isinstance(found, dict) and isinstance(found.get(key), dict):
             found = found[key]

@@ -1,4 +1,6 @@
-"""glTF 2.0 with the extension ``KHR_gaussian_splatting`` (Khronos, review draft): ``.glb``, or ``.gltf`` with files beside it."""
+"""glTF 2.0 with the extension ``KHR_gaussian_splatting`` (Khronos, review draft): ``.glb``, or ``.gltf`` with
+accompanying files.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,9 @@ JSON, BINARY = 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 LARGEST_HEADER = 1 << 20
-"""Bytes of a file that are searched for the name of the extension."""
+"""Number of bytes of a file that are searched for the name of the extension."""
 UNEVEN = 1e-3
-"""Relative difference of a node's scales along its axes up to which they count as one."""
+"""Relative difference between a node's scales along its axes up to which they count as equal."""
 
 
 def recognises(path: Path) -> bool:
@@ -51,11 +53,11 @@ class _Scene:
         if uri is None and self.binary is not None and number == 0:
             return self.binary
         if not isinstance(uri, str) or Path(uri).name != uri:
-            raise InputError(f"{self.path}: names a buffer {str(uri)[:40]!r}, expected a file beside it")
+            raise InputError(f"{self.path}: names a buffer {str(uri)[:40]!r}, expected a file next to it")
         return read_file(self.path.parent / uri, f"a buffer of {EXPECTED}", LARGEST_FILE)
 
     def accessor(self, number: int) -> np.ndarray:
-        """Return the numbers (n w) of an accessor, those of normalized integers as fractions."""
+        """Return the numbers (n w) of an accessor; normalized integers become fractions."""
         entry = self.gltf["accessors"][number]
         if "sparse" in entry or "bufferView" not in entry:
             raise InputError(f"{self.path}: accessor {number} is sparse or empty, expected plain numbers")
@@ -71,7 +73,7 @@ class _Scene:
         last = start + (count - 1) * stride + width * kind.itemsize
         if min(start, count, stride - width * kind.itemsize) < 0 or last > len(content):
             raise InputError(
-                f"{self.path}: accessor {number} declares {count:,} elements, for which its buffer of"
+                f"{self.path}: accessor {number} declares {count:,} elements, but its buffer of"
                 f" {len(content):,} bytes is too short"
             )
         rows = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).astype(np.float32)
@@ -81,7 +83,9 @@ class _Scene:
 
 
 def read(path: Path) -> Gaussians:
-    """Return the Gaussians of all nodes of a file, each moved by its node. Raises ``InputError`` for a damaged file."""
+    """Read the Gaussians of all nodes of a file, each with its node's transform applied. Raises
+    ``InputError`` for a damaged file.
+    """
     scene = _opened(path)
     try:
         found = [
@@ -110,20 +114,20 @@ def _opened(path: Path) -> _Scene:
         while place + 8 <= len(content):
             length, kind = struct.unpack_from("<II", content, place)
             if place + 8 + length > len(content):
-                raise InputError(f"{path}: a chunk of {length:,} bytes is cut off, expected {EXPECTED}")
+                raise InputError(f"{path}: a chunk of {length:,} bytes is truncated, expected {EXPECTED}")
             chunks.setdefault(kind, content[place + 8 : place + 8 + length])
             place += 8 + length
         if JSON not in chunks:
-            raise InputError(f"{path}: has no chunk of JSON, expected {EXPECTED}")
+            raise InputError(f"{path}: has no JSON chunk, expected {EXPECTED}")
         text, binary = chunks[JSON], chunks.get(BINARY)
     gltf = parse_json(text, str(path), EXPECTED)
     if not isinstance(gltf, dict):
-        raise InputError(f"{path}: its JSON is no object, expected {EXPECTED}")
+        raise InputError(f"{path}: its JSON is not an object, expected {EXPECTED}")
     return _Scene(path, gltf, binary)
 
 
 def _meshes(scene: _Scene) -> list[tuple[dict[str, Any], np.ndarray]]:
-    """Return the meshes that nodes show, with the matrices that take them to the world."""
+    """Return the meshes that nodes show, with their transforms to the world."""
     nodes = scene.gltf.get("nodes", [])
     parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
     found = []
@@ -159,7 +163,7 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
     names = primitive["attributes"]
     if "extensions" in primitive["extensions"][EXTENSION]:
         further = ", ".join(primitive["extensions"][EXTENSION]["extensions"])
-        raise InputError(f"{scene.path}: its Gaussians are compressed ({further}), which is not read")
+        raise InputError(f"{scene.path}: its Gaussians are compressed ({further}), which is not supported")
     harmonics = []
     for degree in COEFFICIENTS:
         of_degree = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for n in range(2 * degree + 1)]
@@ -187,7 +191,7 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
 
 
 def _placed(gaussians: Gaussians, matrix: np.ndarray, path: Path) -> Gaussians:
-    """Return the Gaussians moved by a node. Raises ``InputError`` where it stretches or mirrors them."""
+    """Return the Gaussians with a node's transform applied. Raises ``InputError`` if it stretches or mirrors them."""
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not scale > 0 or float(np.ptp(scales)) > UNEVEN * scale:

@@ -1,4 +1,4 @@
-"""What several formats have in common."""
+"""Functions shared by several formats."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def gaussians_of(
     logits: np.ndarray,
     harmonics: np.ndarray,
 ) -> Gaussians:
-    """Return the Gaussians of arrays, in single precision."""
+    """Build Gaussians from arrays, in single precision."""
     parts = (means, log_scales, quaternions, logits, harmonics)
     return Gaussians(*(torch.from_numpy(np.array(part, dtype=np.float32)) for part in parts))
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
-    """Return the Gaussians of all parts, with harmonics up to the highest degree among them."""
+    """Concatenate Gaussians, with harmonics up to the highest degree among them."""
     count = max(part.harmonics.shape[1] for part in parts)
     full = [
         replace(part, harmonics=pad(part.harmonics, (0, 0, 0, count - part.harmonics.shape[1])))
@@ -38,13 +38,13 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def logit(opacity: np.ndarray) -> np.ndarray:
-    """Return the logits of opacities of one byte, which may be 0 or 1."""
+    """Return the logits of one-byte opacities, which may be 0 or 1."""
     inside = opacity.astype(np.float64).clip(1e-6, 1 - 1e-6)
     return np.log(inside / (1 - inside))
 
 
 def smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the quaternions (n 4) whose component number ``largest`` (n) is not stored, in the order of the file.
+    """Return the quaternions (n 4) whose component ``largest`` (n) is not stored, in the order of the file.
 
     ``others`` (n 3) are the stored ones as fractions of sqrt(1/2), in [-1, 1].
     """

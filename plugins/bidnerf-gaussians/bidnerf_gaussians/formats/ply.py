@@ -1,4 +1,4 @@
-"""PLY files of splats: the layout of the first paper's code, and the compressed one of PlayCanvas."""
+"""PLY files of splats: the layout of the original 3DGS code, and PlayCanvas's compressed one."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ COLOUR = tuple(f"f_dc_{i}" for i in range(3))
 NEEDED = (*MEANS, *COLOUR, "opacity", *SCALES, *TURNS)
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 CHUNK = 256
-"""Gaussians that share a range in a compressed file."""
+"""Number of Gaussians that share a range in a compressed file."""
 DEGREES = {3 * (count - 1): degree for degree, count in COEFFICIENTS.items()}
 """Degree of the harmonics by the number of properties ``f_rest_N``."""
 
 
 def recognises(path: Path) -> bool:
-    """Return whether the file is a PLY with the properties of the first paper's code."""
+    """Return whether the file is a PLY with the properties of the original 3DGS code."""
     header = _header(path)
     vertex = None if header is None else header.element("vertex")
     return vertex is not None and {"opacity", "scale_0", "rot_0"} <= set(vertex.names)
 
 
 def recognises_compressed(path: Path) -> bool:
-    """Return whether the file is a compressed PLY of PlayCanvas."""
+    """Return whether the file is a compressed PlayCanvas PLY."""
     header = _header(path)
     vertex = None if header is None else header.element("vertex")
     return vertex is not None and "packed_position" in vertex.names
@@ -50,7 +50,7 @@ def _header(path: Path) -> PlyHeader | None:
 
 
 def read(path: Path) -> Gaussians:
-    """Return the Gaussians of a PLY: logarithms of the scales, logits of the opacities, quaternions w, x, y, z."""
+    """Read the Gaussians of a PLY: log scales, logits of the opacities, quaternions w, x, y, z."""
     vertices = _vertices(read_ply(path, EXPECTED), path)
     names = vertices.dtype.names or ()
     missing = [name for name in NEEDED if name not in names]
@@ -68,7 +68,7 @@ def read(path: Path) -> Gaussians:
 
 def _vertices(elements: Mapping[str, np.ndarray], path: Path) -> np.ndarray:
     if "vertex" not in elements:
-        raise InputError(f"{path}: lists of numbers in or before its vertices, expected {EXPECTED}")
+        raise InputError(f"{path}: has lists of numbers in or before its vertices, expected {EXPECTED}")
     return elements["vertex"]
 
 
@@ -86,7 +86,7 @@ def _columns(rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Write a PLY file in the layout of the first paper's code."""
+    """Write a PLY file in the layout of the original 3DGS code."""
     count = gaussians.harmonics.shape[1] - 1
     rest = gaussians.harmonics[:, 1:].mT.reshape(len(gaussians), -1)
     names = (
@@ -105,14 +105,14 @@ def write(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_compressed(path: Path) -> Gaussians:
-    """Return the Gaussians of a compressed PLY: numbers of a few bits, within the range of their chunk."""
+    """Read the Gaussians of a compressed PLY: numbers with a few bits, within the range of their chunk."""
     elements = read_ply(path, EXPECTED)
     vertices, chunks = _vertices(elements, path), elements.get("chunk")
     names = vertices.dtype.names or ()
     missing = [name for name in PACKED if name not in names]
     if missing or chunks is None or len(chunks) * CHUNK < len(vertices):
         found = f"no property {', '.join(missing)}" if missing else "too few chunks"
-        raise InputError(f"{path}: has {found}, expected a compressed PLY file of PlayCanvas")
+        raise InputError(f"{path}: has {found}, expected a compressed PlayCanvas PLY file")
     position, turn, scale, colour = (vertices[name].astype(np.uint32) for name in PACKED)
     chunk = np.arange(len(vertices)) // CHUNK
 

@@ -1,4 +1,4 @@
-"""SOG of PlayCanvas: images (WebP) of quantized numbers beside a ``meta.json``, in a folder or a zip archive ``.sog``."""
+"""PlayCanvas SOG: images (WebP) of quantized numbers next to a ``meta.json``, in a folder or a zip archive ``.sog``."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 META = "meta.json"
 EXPECTED = "a SOG folder or archive"
 LARGEST_MEMBER = 512 * 2**20
-"""Bytes of an unpacked member of an archive."""
+"""Largest size of an unpacked archive member in bytes."""
 LARGEST_IMAGE = 64 * 2**20
 """Pixels: one for each Gaussian."""
 PALETTE_WIDTH = 64
-"""Entries of the palette of harmonics in a row of its image."""
+"""Number of palette entries per row of the image of harmonics."""
 
 Member = Callable[[str], bytes]
 
@@ -40,7 +40,9 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Return the Gaussians of a folder or archive of version 2. Raises ``InputError`` for another, and where it is damaged."""
+    """Read the Gaussians of a folder or archive of version 2. Raises ``InputError`` for other versions, and
+    if it is damaged.
+    """
     with _opened(path) as member:
         meta = parse_json(member(META), f"{path}: {META}", EXPECTED)
         try:
@@ -55,13 +57,13 @@ def read(path: Path) -> Gaussians:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Member]:
-    """Give a function that returns the content of a member, whose size is checked before it is unpacked."""
+    """Yield a function that returns the content of a member, whose size is checked before it is unpacked."""
     if path.suffix.lower() != ".sog":
         folder = path.parent if path.name == META else path
 
         def of_folder(name: str) -> bytes:
             if Path(name).name != name:
-                raise InputError(f"{path}: names a file {name!r}, expected one beside {META}")
+                raise InputError(f"{path}: names a file {name!r}, expected one next to {META}")
             return read_file(folder / name, f"a part of {EXPECTED}", LARGEST_MEMBER)
 
         yield of_folder
@@ -85,9 +87,9 @@ def _opened(path: Path) -> Iterator[Member]:
                 raise
             except (
                 Exception
-            ) as error:  # of zipfile and of its decompressors; an encrypted member has another one
+            ) as error:  # raised by zipfile and its decompressors; an encrypted member raises another one
                 raise InputError(
-                    f"{path}: has no readable {name} in it ({error}), expected {EXPECTED}"
+                    f"{path}: contains no readable {name} ({error}), expected {EXPECTED}"
                 ) from error
 
         yield of_archive
@@ -133,21 +135,21 @@ def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:
 def _rest(
     meta: Any, book: np.ndarray, pixels: Callable[[str, int], np.ndarray], member: Member, path: Path
 ) -> np.ndarray:
-    """Return the harmonics (n k 3) above degree 0: each Gaussian names an entry of a palette."""
+    """Return the harmonics (n k 3) above degree 0: each Gaussian refers to a palette entry."""
     count = COEFFICIENTS[meta["bands"]] - 1
     labels = pixels("shN", 1).astype(np.int32)
     entry = labels[:, 0] + 256 * labels[:, 1]
     palette = _image(member(meta["files"][0]), f"{path}: {meta['files'][0]}")
     if palette.shape[1] != PALETTE_WIDTH * count:
         raise InputError(f"{path}: a palette {palette.shape[1]} wide, expected {PALETTE_WIDTH * count}")
-    entries = palette[..., :3].reshape(-1, count, 3)  # row by row, ``PALETTE_WIDTH`` a row
+    entries = palette[..., :3].reshape(-1, count, 3)  # row by row, with ``PALETTE_WIDTH`` entries per row
     if int(entry.max()) >= len(entries):
         raise InputError(f"{path}: names entry {int(entry.max())} of a palette of {len(entries)}")
     return book[entries[entry]]
 
 
 def _image(content: bytes, where: str) -> np.ndarray:
-    """Return the pixels (h w 4) of an image, whose size is checked before it is decoded."""
+    """Decode the pixels (h w 4) of an image, whose size is checked before decoding."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -158,6 +160,4 @@ def _image(content: bytes, where: str) -> np.ndarray:
                 )
             return np.asarray(image.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{where}: is no image that can be read ({error}), expected a lossless WebP"
-        ) from error
+        raise InputError(f"{where}: is not a readable image ({error}), expected a lossless WebP") from error

@@ -1,4 +1,4 @@
-"""``.splat`` files: 32 bytes a Gaussian, without a header and without dependence on direction."""
+"""``.splat`` files: 32 bytes per Gaussian, without a header and without view dependence."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Return the Gaussians of a file: scales themselves, colours and opacities of a byte, quaternions (b - 128) / 128."""
+    """Read the Gaussians of a file: plain scales, one-byte colours and opacities, quaternions (b - 128) / 128."""
     content = read_file(path, "a .splat file", LARGEST_FILE)
     if not content or len(content) % ROW.itemsize:
-        raise InputError(f"{path}: has {len(content):,} bytes, expected a multiple of 32: one Gaussian each")
+        raise InputError(
+            f"{path}: has {len(content):,} bytes, expected a multiple of 32, the size of a Gaussian"
+        )
     rows = np.frombuffer(content, ROW)
     rgba = rows["rgba"] / np.float32(255)
     with np.errstate(divide="ignore", invalid="ignore"):

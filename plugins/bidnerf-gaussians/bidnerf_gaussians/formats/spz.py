@@ -1,7 +1,8 @@
-"""``.spz`` files of Niantic: versions 1 to 3, one gzip stream, and version 4, a Zstandard stream for each attribute.
+"""Niantic's ``.spz`` files: versions 1 to 3, one gzip stream, and version 4, a Zstandard stream for each
+attribute.
 
-Axes in the file are x right, y up, z back; those of a PLY file are x right, y down, z forward. Reading and writing turn them,
-so that a scene has the same coordinates in both.
+Axes in the file are x right, y up, z back; those of a PLY file are x right, y down, z forward. Reading and
+writing convert them, so that a scene has the same coordinates in both.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
-HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits of a fraction, flags, reserved
-HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # ..., number of streams, place of their sizes
+HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fraction bits, flags, reserved
+HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # ..., number of streams, offset of their sizes
 EXPECTED = "an .spz file"
 COLOUR_SCALE = 0.15
 WRITTEN = 3
-"""Version that is written: the newest one that the standard library can compress."""
+"""The version written: the newest one that the standard library can compress."""
 FLIP = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 """Rotation from the axes of the file (x right, y up, z back) to x right, y down, z forward."""
 ORIGIN = torch.zeros(3)
 MOST_INFLATED = 1032
-"""Largest factor by which deflate can compress. Zstandard can do more, but not with what Gaussians differ in."""
+"""Largest factor by which deflate can compress. Zstandard can do more, but not on the data that distinguish Gaussians."""
 
 
 def recognises(path: Path) -> bool:
-    """Return whether the file begins as an .spz file does."""
+    """Return whether the file begins like an .spz file."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -45,7 +46,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Return the Gaussians of a file. Raises ``InputError`` where its sizes do not fit what it declares."""
+    """Read the Gaussians of a file. Raises ``InputError`` if its sizes do not match its header."""
     content = read_file(path, EXPECTED, LARGEST_FILE)
     sections, version, count, degree, bits = (
         _streams(content, path) if content.startswith(MAGIC) else _unzipped(content, path)
@@ -54,7 +55,7 @@ def read(path: Path) -> Gaussians:
 
 
 def _sizes(version: int, count: int, degree: int) -> list[int]:
-    """Return the bytes of positions, opacities, colours, scales, rotations and harmonics."""
+    """Return the numbers of bytes of positions, opacities, colours, scales, rotations and harmonics."""
     harmonics = 3 * (COEFFICIENTS[degree] - 1)
     each = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, harmonics)
     return [size * count for size in each]
@@ -71,7 +72,7 @@ def _checked(header: tuple[Any, ...], versions: range, path: Path) -> tuple[int,
     if degree not in COEFFICIENTS:
         raise InputError(f"{path}: harmonics of degree {degree}, expected 0 to 3")
     if bits > 24:
-        raise InputError(f"{path}: {bits} bits of a fraction, expected 0 to 24")
+        raise InputError(f"{path}: {bits} fraction bits, expected 0 to 24")
     return version, count, degree, bits
 
 
@@ -94,7 +95,8 @@ def _unzipped(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, i
         raise InputError(f"{path}: is damaged ({error}), expected {EXPECTED}") from error
     if len(rest) < sum(sizes):
         raise InputError(
-            f"{path}: declares {count:,} Gaussians, but its data end after {len(rest):,} of {sum(sizes):,} bytes"
+            f"{path}: declares {count:,} Gaussians, but its data ends after {len(rest):,} of {sum(sizes):,}"
+            " bytes"
         )
     ends = np.cumsum([0, *sizes])
     return [rest[a:b] for a, b in pairwise(ends)], version, count, degree, bits
@@ -135,12 +137,12 @@ def _zstandard(content: bytes, size: int, path: Path) -> bytes:
         import zstandard
     except ImportError as error:
         raise InputError(
-            f"{path}: is of version 4, which needs the package zstandard: pip install zstandard"
+            f"{path}: has version 4, which needs the package zstandard: pip install zstandard"
         ) from error
     try:
         told = zstandard.get_frame_parameters(
             content
-        ).content_size  # which the library trusts, whatever our limit
+        ).content_size  # which the library trusts, regardless of our limit
         if told not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise InputError(f"{path}: a stream unpacks to {told:,} bytes, expected {size:,}")
         found = bytes(zstandard.ZstdDecompressor().decompress(content, max_output_size=size))
@@ -169,21 +171,21 @@ def _halves(found: np.ndarray, count: int) -> np.ndarray:
 
 
 def _fixed(found: np.ndarray, count: int, bits: int) -> np.ndarray:
-    """Return numbers of 24 bits, of which ``bits`` are behind the point."""
+    """Convert 24-bit fixed-point numbers with ``bits`` fraction bits."""
     parts = found.reshape(count, 3, 3).astype(np.int32)
     whole = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16
     return np.where(whole >= 2**23, whole - 2**24, whole) / np.float32(2**bits)
 
 
 def _first_three(turn: np.ndarray) -> np.ndarray:
-    """Return quaternions w, x, y, z of which x, y and z are stored and w is not negative."""
+    """Return quaternions w, x, y, z, of which x, y and z are stored and w is not negative."""
     xyz = turn / np.float32(127.5) - 1
     w = np.sqrt(np.clip(1 - (xyz**2).sum(-1, keepdims=True), 0, None))
     return np.concatenate([w, xyz], axis=-1)
 
 
 def _smallest(turn: np.ndarray) -> np.ndarray:
-    """Return quaternions w, x, y, z of which all but the largest of x, y, z, w are stored, in 9 bits and a sign."""
+    """Return quaternions w, x, y, z, of which all but the largest component are stored, with 9 bits and a sign each."""
     packed = np.ascontiguousarray(turn).view("<u4")[:, 0]
     tens = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=-1)
     others = np.where(tens & 512, -1, 1) * (tens & 511) / np.float32(511)
@@ -191,7 +193,7 @@ def _smallest(turn: np.ndarray) -> np.ndarray:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Write version 3. Positions keep as many bits of a fraction as the extent of the scene leaves of 24."""
+    """Write version 3. Positions have as many fraction bits as the extent of the scene leaves of 24."""
     found = gaussians.similar(1.0, FLIP, ORIGIN)
     largest = max(1e-9, float(found.means.abs().max()) if len(found) else 1.0)
     bits = int(np.clip(np.floor(23 - np.log2(largest * (1 + 1e-6))), 0, 24))
@@ -211,7 +213,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
 
 
 def _packed(quaternions: np.ndarray) -> np.ndarray:
-    """Return quaternions w, x, y, z as four bytes each, the inverse of ``_smallest``."""
+    """Pack quaternions w, x, y, z into four bytes each, the inverse of ``_smallest``."""
     q = np.roll(quaternions.astype(np.float64), -1, axis=-1)
     q /= np.linalg.norm(q, axis=-1, keepdims=True).clip(1e-12)
     largest = np.abs(q).argmax(-1)

@@ -13,14 +13,14 @@ from bidnerf_core.errors import InputError
 from bidnerf_scan.scan import Scan, joined
 
 MOST_POINTS = 2 * 10**8
-"""Largest number of points of all nodes: one small mesh may be placed by any number of them."""
+"""Largest number of points over all nodes: a small mesh may be placed by any number of them."""
 MOST_TEXELS = 2 * 10**9
 
 
 def read(path: Path, expected: str) -> Scan:
-    """Return all meshes of a file as one or, where it has none, its points.
+    """Return all meshes of a file as one or, if it has none, its points.
 
-    The file's counts must have been checked. Raises ``InputError`` for what trimesh cannot read.
+    The file's counts must have been checked. Raises ``InputError`` if trimesh cannot read it.
     """
     import trimesh
 
@@ -31,13 +31,13 @@ def read(path: Path, expected: str) -> Scan:
             nodes = [(node, scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
             count = sum(len(getattr(geometry, "vertices", ())) for _, geometry in nodes)
             parts = [] if count > MOST_POINTS else [_placed(scene, node) for node, _ in nodes]
-    except (Exception, RecursionError) as error:  # trimesh raises whatever its parsing steps do
+    except (Exception, RecursionError) as error:  # trimesh raises whatever its parsing steps raise
         said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise InputError(
             f"{path}: not readable ({said[:200]}), expected {expected}; is it truncated?"
         ) from error
     if count > MOST_POINTS:
-        raise InputError(f"{path}: its nodes place {count:,} points, expected {MOST_POINTS:,} at most")
+        raise InputError(f"{path}: its nodes place {count:,} points, expected at most {MOST_POINTS:,}")
     meshes = [part for part in parts if part.faces is not None and len(part.faces)]
     chosen = meshes or [part for part in parts if len(part.points)]
     if not chosen:
@@ -91,7 +91,7 @@ def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64]
 
 
 def _material(material: Any) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32] | None]:
-    """Return the texture (h, w, 3) of a material and its colour (3,), where it has them."""
+    """Return the texture (h, w, 3) of a material and its colour (3,), if it has them."""
     texture = getattr(material, "baseColorTexture", None)
     texture = getattr(material, "image", None) if texture is None else texture
     image = None if texture is None else np.asarray(texture.convert("RGB"), np.uint8)

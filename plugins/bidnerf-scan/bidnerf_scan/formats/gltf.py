@@ -1,4 +1,4 @@
-"""glTF, binary or with its buffers beside it, by trimesh."""
+"""glTF, binary or with separate buffers, read by trimesh."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "
 
 
 def recognises(path: Path) -> bool:
-    """Return whether the file is glTF of something else than Gaussian splats."""
+    """Return whether the file is a glTF without Gaussian splats."""
     if path.suffix.lower() not in (".glb", ".gltf"):
         return False
     try:
         return SPLATS not in (_content(path).get("extensionsUsed") or ())
-    except InputError:  # said when it is read
+    except InputError:  # reported when it is read
         return True
 
 
@@ -36,7 +36,7 @@ def read(path: Path) -> Scan:
     needed = [name for name in COMPRESSED if name in (content.get("extensionsUsed") or ())]
     if needed:
         raise InputError(
-            f"{path}: is compressed ({needed[0]}), which is not read, expected glTF without compression"
+            f"{path}: is compressed ({needed[0]}), which is not supported, expected glTF without compression"
             " (`gltf-transform copy` or Blender write it)"
         )
     _check_counts(path, content)
@@ -51,11 +51,11 @@ def _content(path: Path) -> dict[str, Any]:
         if path.suffix.lower() == ".glb":
             head = file.read(20)
             if len(head) < 20 or head[:4] != b"glTF":
-                raise InputError(f"{path}: no header of a binary glTF file, expected {EXPECTED}")
+                raise InputError(f"{path}: no binary glTF header, expected {EXPECTED}")
             _, total, length = struct.unpack("<III", head[4:16])
             if total > size or length > size - 20:
                 raise InputError(
-                    f"{path}: has {size:,} bytes and declares {max(total, length + 20):,}; is it truncated?"
+                    f"{path}: has {size:,} bytes but declares {max(total, length + 20):,}; is it truncated?"
                 )
             text = file.read(length)
         else:
@@ -67,12 +67,12 @@ def _content(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its JSON is damaged ({error}), expected {EXPECTED}") from error
     if not isinstance(content, dict):
-        raise InputError(f"{path}: its JSON is no object, expected {EXPECTED}")
+        raise InputError(f"{path}: its JSON is not an object, expected {EXPECTED}")
     return content
 
 
 def _check_counts(path: Path, content: dict[str, Any]) -> None:
-    """Raise ``InputError`` for accessors that count more numbers than their buffers hold."""
+    """Raise ``InputError`` for accessors with more numbers than their buffers hold."""
     views = content.get("bufferViews") or []
     for number, accessor in enumerate(content.get("accessors") or []):
         try:
@@ -87,7 +87,8 @@ def _check_counts(path: Path, content: dict[str, Any]) -> None:
                 held = max(path.stat().st_size, 2**20)  # zeros, which sparse values replace
             if count < 0 or size > held:
                 raise InputError(
-                    f"{path}: accessor {number} declares {count:,} elements, for which {held:,} bytes are too few; is it damaged?"
+                    f"{path}: accessor {number} declares {count:,} elements, but {held:,} bytes are too few for"
+                    " them; is it damaged?"
                 )
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Wavefront OBJ, by trimesh, with the material file and the textures beside it."""
+"""Wavefront OBJ, read by trimesh, with its material file and textures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EXPECTED = "an OBJ file of a mesh or of points"
 
 
 def recognises(path: Path) -> bool:
-    """Return whether the file's name is that of an OBJ file: its text has no mark."""
+    """Return whether the file has the extension of an OBJ file, whose text has no signature."""
     return path.suffix.lower() == ".obj"
 
 

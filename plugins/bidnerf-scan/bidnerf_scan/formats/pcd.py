@@ -1,4 +1,4 @@
-"""PCD, the point cloud library's format: text, binary, and binary compressed by LZF."""
+"""PCD, the Point Cloud Library's format: text, binary, and LZF-compressed binary."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bidnerf_scan.scan import Scan
 
 EXPECTED = "a PCD file"
 LARGEST = 4 * 2**30
-"""Bytes of a file that is read."""
+"""Largest file, in bytes, that is read."""
 LARGEST_HEADER = 64 * 1024
 SMALLEST_NUMBER = 2
-"""Bytes of a number in a text file, with the blank behind it."""
+"""Bytes per number in a text file, including the separating blank."""
 LARGEST_RATIO = 300
-"""Bytes that one byte of LZF can stand for are fewer."""
+"""Upper bound on the bytes that one byte of LZF can represent."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class _Header:
 
 
 def recognises(path: Path) -> bool:
-    """Return whether the file's name is that of a PCD file."""
+    """Return whether the file has the extension of a PCD file."""
     return path.suffix.lower() == ".pcd"
 
 
 def read(path: Path) -> Scan:
-    """Return the points of a PCD file. The pose of its sensor (VIEWPOINT) is left out, since points are in the world."""
+    """Read the points of a PCD file. The pose of its sensor (VIEWPOINT) is ignored, since points are in the world."""
     data = read_file(path, EXPECTED, LARGEST)
     header = _header(path, data)
     rows = _rows(path, header, memoryview(data)[header.length :])
@@ -74,7 +74,7 @@ def _header(path: Path, data: bytes) -> _Header:
     while "DATA" not in found:
         end = data.find(b"\n", at, LARGEST_HEADER)
         if end < 0:
-            raise InputError(f"{path}: no header of a PCD file, expected {EXPECTED}")
+            raise InputError(f"{path}: no PCD header, expected {EXPECTED}")
         words = data[at:end].decode("latin-1").split()
         at = end + 1
         if words and not words[0].startswith("#"):
@@ -103,7 +103,7 @@ def _header(path: Path, data: bytes) -> _Header:
 
 
 def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
-    """Return the points as a structured array. Counts are checked against the data before memory is allocated for them."""
+    """Return the points as a structured array. Counts are checked against the data before memory is allocated."""
     size = header.count * header.kind.itemsize
     if header.encoding == "ascii":
         _require(path, header, _width(header) * SMALLEST_NUMBER * header.count, len(data) + 1)
@@ -120,7 +120,7 @@ def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
     _require(path, header, size, min(whole, LARGEST_RATIO * packed))
     columns = _decompressed(path, bytes(data[8 : 8 + packed]), whole)
     rows, at = np.zeros(header.count, header.kind), 0
-    for name in header.kind.names or ():  # field after field, each of all points
+    for name in header.kind.names or ():  # field by field, each for all points
         kind = header.kind[name]
         width = header.count * kind.itemsize
         rows[name] = np.frombuffer(columns[at : at + width], kind.base).reshape(rows[name].shape)
@@ -161,7 +161,7 @@ def _text_rows(path: Path, header: _Header, text: bytes) -> NDArray:
 
 
 def _decompressed(path: Path, data: bytes, size: int) -> bytes:
-    """Return what LZF (Lehmann 2000) compressed: literal runs, and copies of what was written before."""
+    """Decompress LZF (Lehmann 2000): literal runs, and copies of earlier output."""
     found, at = bytearray(), 0
     try:
         while at < len(data):
@@ -181,13 +181,13 @@ def _decompressed(path: Path, data: bytes, size: int) -> bytes:
                 raise IndexError
             length += 2
             pattern = found[start : start + length]
-            while len(pattern) < length:  # a copy may overlap with itself
+            while len(pattern) < length:  # a copy may overlap itself
                 pattern += pattern[: length - len(pattern)]
             found += pattern
             if len(found) > size:
                 raise IndexError
     except IndexError as error:
-        raise InputError(f"{path}: its compressed data are damaged; is the file truncated?") from error
+        raise InputError(f"{path}: its compressed data is damaged; is the file truncated?") from error
     if len(found) != size:
         raise InputError(
             f"{path}: {len(found):,} bytes when decompressed, expected {size:,}; is it truncated?"

@@ -1,4 +1,4 @@
-"""PLY: point clouds by the core's reader, meshes by trimesh."""
+"""PLY: point clouds with the core's reader, meshes with trimesh."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from bidnerf_scan.scan import Scan
 
 EXPECTED = "a PLY file of a mesh or of points"
 SPLATS = ({"opacity", "scale_0"}, {"packed_position"})
-"""Properties of the points of Gaussian splats, which are no scan."""
+"""Properties of Gaussian splats, which are not scans."""
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
 def recognises(path: Path) -> bool:
-    """Return whether the file is a PLY of something else than Gaussian splats."""
+    """Return whether the file is a PLY without Gaussian splats."""
     if path.suffix.lower() != ".ply":
         return False
     try:
         header = read_ply_header(path)
-    except InputError:  # said when it is read
+    except InputError:  # reported when it is read
         with path.open("rb") as file:
             return file.read(3) == b"ply"
     vertex = header.element("vertex")
@@ -62,7 +62,7 @@ def _colours(rows: NDArray) -> NDArray[np.float32] | None:
 
 
 def _check_size(path: Path, header: PlyHeader) -> None:
-    """Raise ``InputError`` where the elements that are declared need more bytes than the file has."""
+    """Raise ``InputError`` if the declared elements need more bytes than the file has."""
     left = path.stat().st_size - header.length
     for element in header.elements:
         width = sum(np.dtype(kind).itemsize for _, kind in element.properties)
@@ -70,7 +70,7 @@ def _check_size(path: Path, header: PlyHeader) -> None:
         least += 1 if element.has_lists else 0
         if element.count * least > left + 1:
             raise InputError(
-                f"{path}: declares {element.count:,} elements {element.name!r}, for which its {left:,} bytes of data are too"
-                " few; is the file truncated?"
+                f"{path}: declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of"
+                " data are too few for them; is the file truncated?"
             )
         left -= element.count * least

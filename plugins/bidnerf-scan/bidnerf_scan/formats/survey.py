@@ -1,4 +1,4 @@
-"""Surveyors' formats: LAS and LAZ by laspy, E57 by pye57, which are extras."""
+"""Surveying formats: LAS and LAZ with laspy, E57 with pye57, which are extras."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from bidnerf_scan.scan import Scan, joined
 
 
 def recognises_las(path: Path) -> bool:
-    """Return whether the file's name is that of LAS, compressed or not."""
+    """Return whether the file has the extension of LAS, compressed or not."""
     return path.suffix.lower() in (".las", ".laz")
 
 
 def recognises_e57(path: Path) -> bool:
-    """Return whether the file's name is that of E57."""
+    """Return whether the file has the extension of E57."""
     return path.suffix.lower() == ".e57"
 
 
@@ -27,7 +27,7 @@ def _library(name: str, path: Path, extra: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"{path}: reading it takes {name}, which is not installed (pip install 'bidnerf-scan[{extra}]')"
+            f"{path}: reading it needs {name}, which is not installed (pip install 'bidnerf-scan[{extra}]')"
         ) from error
 
 
@@ -41,7 +41,8 @@ def read_las(path: Path) -> Scan:
             least = 1 if path.suffix.lower() == ".laz" else 8 * header.point_format.size
             if count * least > 8 * size:
                 raise InputError(
-                    f"{path}: declares {count:,} points, for which its {size:,} bytes are too few; is the file truncated?"
+                    f"{path}: declares {count:,} points, but its {size:,} bytes are too few for them; is the"
+                    " file truncated?"
                 )
             rows = file.read()
         points = np.stack([np.asarray(axis, np.float64) for axis in (rows.x, rows.y, rows.z)], axis=-1)
@@ -55,13 +56,13 @@ def read_las(path: Path) -> Scan:
             f"{path}: not readable ({type(error).__name__}: {error}), expected LAS; is it truncated?"
         ) from error
     if not rgb.size or rgb.max() == 0:
-        return Scan(points)  # fields for colours that nobody filled in
-    # The standard scales to 16 bits; many programs write 8.
+        return Scan(points)  # the colour fields are unused
+    # The standard uses 16 bits; many programs write 8.
     return Scan(points, rgb / np.float32(65535 if rgb.max() > 255 else 255))
 
 
 def read_e57(path: Path) -> Scan:
-    """Return the points of all scans of an E57 file, each moved by its pose."""
+    """Read the points of all scans of an E57 file, each transformed by its pose."""
     pye57 = _library("pye57", path, "e57")
     parts = []
     try:
@@ -70,8 +71,8 @@ def read_e57(path: Path) -> Scan:
             count = int(file.get_header(number).point_count)
             if count > path.stat().st_size:
                 raise InputError(
-                    f"{path}: declares {count:,} points, for which its {path.stat().st_size:,} bytes are too few; is the file"
-                    " truncated?"
+                    f"{path}: declares {count:,} points, but its {path.stat().st_size:,} bytes are too few"
+                    " for them; is the file truncated?"
                 )
             rows = file.read_scan(number, colors=True, intensity=False, ignore_missing_fields=True)
             points = np.stack([rows[f"cartesian{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
@@ -82,7 +83,7 @@ def read_e57(path: Path) -> Scan:
             parts.append(Scan(points, rgb))
     except InputError:
         raise
-    except Exception as error:  # pye57 passes on errors of a library in C++
+    except Exception as error:  # pye57 passes on errors of a C++ library
         raise InputError(
             f"{path}: not readable ({type(error).__name__}: {error}), expected E57; is it truncated?"
         ) from error
