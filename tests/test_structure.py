@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import av
 import cv2
@@ -21,6 +23,7 @@ from bidnerf_core.datasets.whole import all_views
 from bidnerf_core.geometry.similarity import fit_similarity
 from bidnerf_core.maps.photos import posed_images, poses_folder
 from bidnerf_core.results.errors import pose_error
+from bidnerf_core.structure.agreement import Agreement, agreement
 from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
 from bidnerf_core.structure.pairs import ALL_OF_FRAMES, ALL_OF_PHOTOS, NEIGHBOURS, chosen_pairs, few
@@ -205,7 +208,7 @@ def test_what_has_no_photos_or_has_poses(search: Search, tmp_path: Path, bidnerf
     (tmp_path / "empty").mkdir()
     cases = [
         (tmp_path / "nothing", "no such file or folder"),
-        (tmp_path / "empty", "contains no photos"),
+        (tmp_path / "empty", "no photos in it"),
         (search.out, "dataset whose poses are known"),
         (search.photos / "000.png", "expected a folder of photos or a video"),
         (tmp_path / "clip.mp4", "no such file"),
@@ -420,3 +423,45 @@ def test_split_all_reads_every_view_once(tmp_path: Path) -> None:
 def write_single(folder: Path, view: bn.View) -> None:
     bn.write_transforms(folder, {"train": [view]})
     (folder / "transforms_train.json").rename(folder / "transforms.json")
+
+
+def test_pairs_with_many_matches_tell_a_folded_model() -> None:
+    """Three photos of a cloud of points; that of the third place was put elsewhere, so two pairs contradict it."""
+    pycolmap = pytest.importorskip("pycolmap")
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[500.0, 320.0, 240.0, 0.02])
+    points = np.random.default_rng(0).uniform([-2, -1.5, 4], [2, 1.5, 8], (400, 3))
+    true = {
+        n: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.05 * n, 0])), [0.4 * n, 0, 0])
+        for n in (1, 2, 3)
+    }
+    seen = {n: camera.img_from_cam(T * points) for n, T in true.items()}
+    every = np.column_stack([np.arange(400)] * 2)
+    pairs = {(1, 2): every, (2, 3): every, (1, 3): every[:50]}
+    database = SimpleNamespace(
+        read_two_view_geometries=lambda: (
+            [pycolmap.image_pair_to_pair_id(*pair) for pair in pairs],
+            [SimpleNamespace(inlier_matches=matches) for matches in pairs.values()],
+        ),
+        read_keypoints=lambda number: seen[number],
+    )
+
+    def model(poses: dict[int, Any]) -> Any:
+        return SimpleNamespace(
+            reg_image_ids=lambda: list(poses),
+            image=lambda number: SimpleNamespace(camera_id=1, cam_from_world=lambda: poses[number]),
+            camera=lambda number: camera,
+        )
+
+    assert agreement(model(true), database, pycolmap) == Agreement(2, 0)
+    folded = true | {3: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.6, 0])), [-1.5, 0.5, 0])}
+    assert agreement(model(folded), database, pycolmap) == Agreement(2, 1)
+    assert agreement(model({1: true[1], 3: folded[3]}), database, pycolmap) == Agreement(0, 0)
+
+
+def test_poses_that_many_pairs_contradict_are_doubted(search: Search) -> None:
+    assert search.found.doubt is None
+    assert search.found.sure_pairs > 0
+    doubt = replace(search.found, sure_pairs=400, contradicting=3).doubt
+    assert doubt is not None
+    assert doubt.startswith("3 of 400 pairs")
+    assert replace(search.found, sure_pairs=400, contradicting=2).doubt is None

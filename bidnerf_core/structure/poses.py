@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,12 @@ import torch
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.video import is_video
-from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 from bidnerf_core.structure import video_frames
+from bidnerf_core.structure.agreement import agreement
 from bidnerf_core.structure.keypoints import Described, described, write_cameras, write_keypoints
 from bidnerf_core.structure.library import pycolmap_for
 from bidnerf_core.structure.mapping import (
@@ -262,6 +264,8 @@ class _Search:
     ) -> FoundPoses:
         photos, model = {photo.number: photo for photo in found.photos}, models.largest
         error = model.compute_mean_reprojection_error()
+        with self._pycolmap.Database.open(self._database) as database:
+            found_in = agreement(model, database, self._pycolmap)
         turn_upright(model, photos, self._pycolmap)
         full_size(model, photos)
         base = self._folder / FRAMES if is_video(self._source) else self._source
@@ -275,11 +279,13 @@ class _Search:
         result = FoundPoses(
             self._source.name, len(images), model.num_reg_images(), tuple(models.sizes), tuple(left), model.num_points3D(),
             error, round(time.monotonic() - self._began, 1), self._inputs, self._pycolmap.__version__,
-            is_video(self._source),
+            is_video(self._source), found_in.pairs, found_in.contradicting,
         )  # fmt: skip
         write_found(self._folder, result)
         for line in str(result).splitlines():
             log.info(f"{self._source}: {line}")
+        if result.doubt is not None:
+            warnings.warn(f"{self._source}: {result.doubt}", InputWarning, stacklevel=2)
         return result
 
 

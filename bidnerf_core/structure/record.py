@@ -34,6 +34,8 @@ DATABASE = "database.db"
 """The file of keypoints and matches in the work folder."""
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 FRAME_FILE = re.compile(r"\d{6,}\.jpg")
+CONTRADICTING = 0.005
+"""Share of the pairs with many matches that may contradict the poses; some are due to repeated details."""
 LARGEST_NAMED = 5
 """Number of photos named in a remark."""
 
@@ -66,6 +68,18 @@ class FoundPoses:
     inputs: str  # digest of the names, sizes and times of the files, and of the camera
     pycolmap: str  # its version
     video: bool = False  # whether the photos are frames of a video, which were written next to this record
+    sure_pairs: int = 0  # of placed photos, with so many matches that they show the same place for certain
+    contradicting: int = 0  # of these, pairs whose matches contradict the poses
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the poses may be wrong as a whole, with the remedy; None where nothing speaks against them."""
+        if self.contradicting <= CONTRADICTING * self.sure_pairs:
+            return None
+        return (
+            f"{self.contradicting} of {self.sure_pairs} pairs of photos that share many keypoints contradict the poses found:"
+            " places that look alike were probably taken for one; give poses from a phone app, or photos of a smaller part"
+        )
 
     def __str__(self) -> str:
         lines = [
