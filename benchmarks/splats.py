@@ -95,7 +95,7 @@ def quality(scene: Scene, images: int) -> dict[str, Any]:
     found = judge(scene.map.field, scene.map.bounds, views)
     names = ("frames", "psnr_mean_dB", "psnr_lowest_dB", "samples_per_ray", "depth_error_median")
     return {
-        "steps": scene.map.info.steps,
+        "steps": scene.map.info.step,
         "parameters": sum(p.numel() for p in scene.map.field.parameters()),
         "weights_MB": weights / 1e6,
         **{name: found[name] for name in names},
