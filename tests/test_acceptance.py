@@ -148,7 +148,7 @@ def test_fresh_rays_lead_to_an_outcome(found: RefinementResult, expected: Outcom
 )
 def test_the_loss_of_a_descent_leads_to_an_outcome(loss: float, finite: bool, expected: Outcome) -> None:
     verdict = descent_verdict(loss, 0.02, finite, "reached 5 steps", SUPPORTED, 0.5)
-    why = "" if expected is Outcome.DIVERGED else f"; mean loss {loss:.3g}, accepted below 0.02"
+    why = "" if expected is Outcome.DIVERGED else f"; mean loss {loss:.3g}, must be below 0.02"
     assert verdict == Verdict(expected, f"reached 5 steps{why}")
 
 

@@ -31,6 +31,7 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.fields import residuals
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import METHODS, AutoConfig, ByColourConfig, Problem, settings_of
+from bidnerf_core.localization.advice import ADVICE
 from bidnerf_core.localization.auto import auto
 from bidnerf_core.localization.settings import ColourRefinementSettings
 from bidnerf_core.maps.description import MapInfo
@@ -258,10 +259,13 @@ def test_links_of_the_readme_lead_somewhere() -> None:
     assert [target for target in targets if not (ROOT / target).exists()] == []
 
 
-def test_every_outcome_has_advice() -> None:
+def test_every_outcome_has_advice_in_the_words_of_the_code() -> None:
     text = (ROOT / "docs" / "troubleshooting.md").read_text()
-    refusals = [outcome for outcome in Outcome if outcome is not Outcome.CONVERGED]
-    assert [outcome for outcome in refusals if f"\n### {outcome}\n" not in text] == []
+    assert {*Outcome} - {Outcome.CONVERGED} == {*ADVICE}
+    for outcome, advice in ADVICE.items():
+        section = " ".join(text.partition(f"\n### {outcome}\n")[2].partition("\n##")[0].split())
+        assert advice.first in section, outcome
+        assert advice.meaning.rstrip(".") in section, outcome
 
 
 def test_commands_and_methods_are_documented() -> None:

@@ -33,7 +33,8 @@ from bidnerf_core.localization import (
     rig,
     settings_of,
 )
-from bidnerf_core.localization.beyond_chance import NO_RIVAL, Support
+from bidnerf_core.localization.acceptance import DescentDiagnostics
+from bidnerf_core.localization.beyond_chance import NO_RIVAL
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.history import WINDOW
 from bidnerf_core.localization.solvers.pivots import PivotName
@@ -110,8 +111,8 @@ def test_the_loss_of_depth_is_not_compared_with_that_of_a_colour(problem: Proble
     found = localize(
         problem, "bid", {"rays": 64, "max_steps": 80, "converged_loss": 10.0, "plain_share": 0.0}
     )
-    assert isinstance(found.diagnostics, Support)
-    assert found.diagnostics.plain == NO_RIVAL
+    assert isinstance(found.diagnostics, DescentDiagnostics)
+    assert found.diagnostics.support.plain == NO_RIVAL
     assert "contrast" not in found.reason
 
 

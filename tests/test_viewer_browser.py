@@ -38,6 +38,18 @@ DROP = """([content, name]) => {
   dataTransfer.items.add(new File([bytes], name, { type: "image/png" }));
   for (const kind of ["dragenter", "dragover", "drop"]) document.dispatchEvent(new DragEvent(kind, { dataTransfer, bubbles: true }));
 }"""
+VISIBLE = """(side) => {
+  const tag = document.querySelector(`.pictures .tag.${side}`), [top, right, bottom, left] = tag.parentElement.style.clipPath.match(/\\d+/g).map(Number);
+  return left + right < 100;
+}"""
+FARTHEST = """() => {
+  const { space, map, answer } = page, off = (m) => {
+    const v = new THREE.Vector3(m[3], m[7], m[11]).project(space.camera);
+    return Math.max(Math.abs(v.x), Math.abs(v.y));
+  };
+  return { cameras: map.cameras.map(({ pose }) => off(pose)), poses: [answer.pose, answer.runner_up.pose].map(off) };
+}"""
+"""Where the cameras and the poses are in the window, whose edge is at 1."""
 LAPTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 WAIT = 120_000  # ms
 
@@ -121,7 +133,7 @@ def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> N
         page.set_input_files("#photo", photo)
         page.wait_for_selector(".outcome.good")
         until(page, "document.getElementById('note').textContent === ''")
-        assert page.text_content("#answer .name") == "a <b>photo.png"
+        assert page.text_content("#verdict .name") == "a <b>photo.png"
         assert page.evaluate("page.space.layers.answer.getObjectByName('ellipsoid') !== undefined")
         page.keyboard.press("v")
         until(page, "(page.live.shown ?? 0) > 1")
@@ -129,10 +141,10 @@ def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> N
         page.keyboard.press("v")
         page.keyboard.press("p")  # the image that the viewer was started with
         until(page, "page.answers.length === 2 && document.getElementById('note').textContent === ''")
-        assert page.text_content("#answer .name") == "photo"
+        assert page.text_content("#verdict .name") == "photo"
         page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "dropped.png"])
         until(page, "page.answers.length === 3 && document.getElementById('note').textContent === ''")
-        assert page.text_content("#answer .name") == "dropped.png"
+        assert page.text_content("#verdict .name") == "dropped.png"
         page.fill("#hfov", "58.19")
         page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "with field of view.png"])
         until(page, "page.answers.length === 4 && document.getElementById('note').textContent === ''")
@@ -144,13 +156,16 @@ def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> N
 
 def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Path) -> None:
     with opened(browser, saved.as_uri(), LAPTOP, offline=True) as page:
-        assert page.text_content("#answer .name") == "unseen"
+        assert page.text_content("#verdict .name") == "unseen"
         assert "Accepted" in page.text_content(".outcome")
-        before = page.evaluate("document.querySelector('.pictures img:nth-of-type(2)').style.clipPath")
-        page.locator("#wipe").fill("80")
-        assert (
-            page.evaluate("document.querySelector('.pictures img:nth-of-type(2)').style.clipPath") != before
+        for share, seen in (("0", "only rendered"), ("100", "only photo")):
+            page.locator("#wipe").fill(share)
+            shown = [page.evaluate(VISIBLE, side) for side in ("left", "right")]
+            assert shown == [seen == "only photo", seen == "only rendered"]
+        ends = page.evaluate(
+            "[...document.querySelector('.under').childNodes].map((node) => node.textContent)"
         )
+        assert ends == ["only rendered", "", "only photo"]  # from the least to the largest share of the photo
         for number, mode in enumerate(("Wipe", "Blink", "Difference", "Edges", "Depth", "Matches"), start=1):
             page.keyboard.press("Escape")
             page.evaluate("document.activeElement.blur()")
@@ -166,9 +181,13 @@ def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Pat
 def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path) -> None:
     with opened(browser, f"{saved.as_uri()}#frame={quote(viewed.HOSTILE)}", LAPTOP, offline=True) as page:
         assert page.title().startswith("room")  # no script of a name has run
-        assert page.text_content("#answer .name") == viewed.HOSTILE
+        assert page.text_content("#verdict .name") == viewed.HOSTILE
         assert page.text_content(".outcome b").startswith("Refused")
         assert page.locator("#figures tr.failed").count() > 0
+        assert page.text_content(".advice").count("What to try: ") == 1
+        assert page.is_disabled("#show-ellipsoid") is (page.evaluate("page.answer.ellipsoid") is None)
+        labels = page.locator("#labels span").all_text_contents()
+        assert {"pose found, refused", "runner-up"} <= {*labels}
         steps = int(page.get_attribute("#step", "max"))
         page.locator("#step").fill("0")
         assert page.text_content("#caption").startswith(f"1 of {steps + 1}")
@@ -179,6 +198,12 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
         page.click("#runner")
         assert page.get_attribute("#runner", "aria-pressed") == "true"
         assert "runner-up" in page.text_content(".pictures .tag.right")
+        assert "You are looking at the runner-up" in page.text_content(".banner")
+        page.keyboard.press("?")
+        page.wait_for_selector("#words dt")
+        keys = page.locator("#keys kbd").all_text_contents()
+        assert "r" in keys
+        assert "v" not in keys  # of the live viewer
 
 
 def test_rows_are_filtered_and_lead_to_their_frames(browser: Any, saved: Path) -> None:
@@ -187,19 +212,29 @@ def test_rows_are_filtered_and_lead_to_their_frames(browser: Any, saved: Path) -
         page.fill("#filter", "elsewhere")
         assert page.locator("#rows tbody tr").count() == 1
         page.click("#rows tbody tr")
-        assert page.text_content("#answer .name") == "elsewhere"
+        assert page.text_content("#verdict .name") == "elsewhere"
         page.fill("#filter", "")
         page.select_option("#kind", "accepted")
         page.click("#rows tbody tr")
-        assert page.text_content("#answer .name") == "unseen"
+        assert page.text_content("#verdict .name") == "unseen"
         page.locator("#time").fill("7")
         assert page.text_content("#place").startswith("8 of 12 · 0.70 s · t7 · converged")
+
+
+@pytest.mark.parametrize("size", [LAPTOP, {"width": 1280, "height": 1600}])
+def test_the_first_view_holds_the_map_and_the_poses(browser: Any, saved: Path, size: dict[str, int]) -> None:
+    with opened(browser, f"{saved.as_uri()}#frame={quote(viewed.HOSTILE)}", size, offline=True) as page:
+        seen = page.evaluate(FARTHEST)
+        assert 0.4 < max(seen["cameras"]) < 1.1
+        assert max(seen["poses"]) < 1
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_phone_shows_everything_in_its_width(browser: Any, saved: Path, scheme: str) -> None:
     with opened(browser, saved.as_uri(), PHONE, offline=True, color_scheme=scheme, has_touch=True) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+        verdict, stage = (page.evaluate(f"document.querySelector('{name}').getBoundingClientRect().top") for name in ("#verdict", "#stage"))  # fmt: skip
+        assert verdict < 100 < stage
         paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (int(paper[4:].split(",")[0]) > 127) == (scheme == "light")
 

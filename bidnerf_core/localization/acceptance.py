@@ -228,6 +228,15 @@ def rendered_verdict(found: RefinementResult, thresholds: RenderedThresholds) ->
     return found.support.rejection() or Verdict(Outcome.CONVERGED, share)
 
 
+@dataclass(frozen=True)
+class DescentDiagnostics:
+    """The measures by which the answer of a first-order descent is judged."""
+
+    mean_loss: float  # of its last steps
+    converged_loss: float  # below which it is accepted
+    support: Support
+
+
 def descent_verdict(
     mean_loss: float, threshold: float, finite: bool, reason: str, found: Support, least_explained: float
 ) -> Verdict:
@@ -237,7 +246,7 @@ def descent_verdict(
     """
     if not finite or not math.isfinite(mean_loss):
         return Verdict(Outcome.DIVERGED, reason)
-    reason = f"{reason}; mean loss {mean_loss:.3g}, accepted below {threshold:.3g}"
+    reason = f"{reason}; mean loss {mean_loss:.3g}, must be below {threshold:.3g}"
     if mean_loss >= threshold:
         return Verdict(Outcome.HIGH_LOSS, reason)
     rejection = found.rejection(least_explained)

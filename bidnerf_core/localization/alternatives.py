@@ -23,7 +23,7 @@ from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.depth_scale import corrected
-from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share
+from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share, probability_of
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.mirrored import mirror_evidence, mirror_image
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
@@ -45,6 +45,8 @@ SIGNIFICANT = -20.0
 """Largest logarithm of an image's number of false alarms with which that of its mirror image is compared: a few chance matches of
 the mirror image say nothing about an image with even fewer.
 """
+UNTOLD = 0.5
+"""Log odds below which two explanations are called equally likely: probabilities of 38 % to 62 %."""
 AT_COPIES = 6.0
 """Log odds by renderings that errors of the two poses alone may bring about, even at exact copies of a place."""
 COMPARED_RAYS = 8192
@@ -95,9 +97,17 @@ def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed
             return Decision(Verdict(Outcome.MIRRORED, other.reason))
         if odds < DECISIVE:
             better = other.rival if odds < -DECISIVE else None
-            how = "nothing tells the two apart" if better is None else "the other one is likelier"
-            return Decision(Verdict(Outcome.AMBIGUOUS, f"{other.reason}, and {how}"), better)
+            return Decision(Verdict(Outcome.AMBIGUOUS, f"{other.reason}, and {_in_words(odds)}"), better)
     return Decision()
+
+
+def _in_words(odds: float) -> str:
+    """Return what the log odds of a pose say about the other explanation."""
+    if abs(odds) < UNTOLD:
+        return "nothing tells the two apart"
+    if odds < -DECISIVE:
+        return "the other one is far likelier"
+    return f"the other one is {probability_of(-odds):.0%} likely"
 
 
 def pose_at(

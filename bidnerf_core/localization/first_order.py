@@ -17,7 +17,7 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.residuals import Objective
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.acceptance import descent_verdict
+from bidnerf_core.localization.acceptance import DescentDiagnostics, descent_verdict
 from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.rendered import RayCounts, RenderedCost, draw_weighted_rays
 from bidnerf_core.localization.costs.sampled import SampledLoss
@@ -79,7 +79,7 @@ def descended(
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),
         confidence=found.confidence,
-        diagnostics=found,
+        diagnostics=DescentDiagnostics(mean, adam.converged_loss, found),
     )
 
 

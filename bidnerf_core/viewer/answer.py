@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
 
@@ -15,12 +16,14 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.images import reduced, resampled
-from bidnerf_core.localization import Localization
+from bidnerf_core.localization import METHODS, Localization
+from bidnerf_core.localization.advice import ADVICE
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.registry import PluginError
 from bidnerf_core.results.errors import pose_error
-from bidnerf_core.viewer.explanations import ShownExplanation, explanations
+from bidnerf_core.viewer.explanations import Contest, contests
 from bidnerf_core.viewer.figures import Figure, acceptance_figures
 from bidnerf_core.viewer.packing import Packed, Picture, drawing, packed, photograph
 from bidnerf_core.viewer.rendering import quick_image
@@ -66,6 +69,9 @@ class ShownMatches:
     accepted: Packed  # uint8 (m)
     agreeing: int
     refused: int
+    by_appearance: (
+        int  # of the refused ones, matched by appearance alone; the others near where the pose has them
+    )
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,10 @@ class ShownAnswer:
     outcome: str
     accepted: bool
     reason: str
+    meaning: str = ""  # of the outcome, where it is a refusal
+    advice: str = ""
     method: str = ""
+    method_summary: str = ""
     seconds: float = 0.0
     loss: float | None = None
     unit: str = "units"
@@ -112,7 +121,7 @@ class ShownAnswer:
     path: tuple[tuple[float, float, float], ...] = ()  # positions from the start to the pose found
     matches: ShownMatches | None = None
     figures: tuple[Figure, ...] = ()
-    explanations: tuple[ShownExplanation, ...] = ()
+    contests: tuple[Contest, ...] = ()
     runner_up: RunnerUp | None = None
 
 
@@ -134,13 +143,17 @@ def shown_answer(
         if finite:
             rendered, depth = _compared(scene, camera, T, frame, quick)
     error = None if truth is None or not finite else pose_error(T, truth, found.unit)
+    advice = ADVICE.get(found.outcome)
     other = None if record is None or not finite else _runner_up(scene, T, record, frame, quick)
     return ShownAnswer(
         name=name,
         outcome=str(found.outcome),
         accepted=found.converged and finite,
         reason=found.reason,
+        meaning="" if advice is None else advice.meaning,
+        advice="" if advice is None else advice.first,
         method=found.method,
+        method_summary=_summary(found.method),
         seconds=found.seconds,
         loss=_finite(found.loss),
         unit=symbol(found.unit),
@@ -158,7 +171,7 @@ def shown_answer(
         path=_path(found.poses),
         matches=None if frame is None or record is None or not finite else _matches(frame, record),
         figures=acceptance_figures(found, record, given is not None and given.focal_is_approximate),
-        explanations=explanations(found, record),
+        contests=contests(found, record),
         runner_up=other,
     )
 
@@ -217,6 +230,13 @@ def _camera(frame: Frame | None, found: Localization) -> str:
     return frame.camera_source or "intrinsics as given"
 
 
+def _summary(method: str) -> str:
+    """Return what a method does, in a line; empty for one that is not installed, as in a file from elsewhere."""
+    with contextlib.suppress(PluginError):
+        return METHODS.load(method).summary
+    return ""
+
+
 def _steps(found: Localization, record: SearchRecord | None) -> tuple[ShownStep, ...]:
     steps = [] if record is None else list(record.steps)
     shown = [ShownStep(s.caption, _poses(s.T), _numbers(s.scores), s.kept) for s in steps]
@@ -249,7 +269,7 @@ def _matches(frame: Frame, record: SearchRecord) -> ShownMatches | None:
     if not record.landmarks:
         return None
     pose = record.landmarks[-1]
-    pixels, landmarks, agree = _matched(pose)
+    pixels, landmarks, agree, by_appearance = _matched(pose)
     every = max(1, math.ceil(len(pixels) / MOST_MATCHES))
     size = torch.tensor([frame.intrinsics.width, frame.intrinsics.height], dtype=torch.float64)
     camera = pose.intrinsics_of(frame.intrinsics) or frame.intrinsics
@@ -262,16 +282,20 @@ def _matches(frame: Frame, record: SearchRecord) -> ShownMatches | None:
         packed(agree[::every].to(torch.uint8).numpy()),
         int(agree.sum()),
         int((~agree).sum()),
+        by_appearance,
     )
 
 
-def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3"], Tensor]:
-    """Return keypoints (pixels), landmarks (world) and whether they agree: guided matches, and refused ones by appearance."""
+def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3"], Tensor, int]:
+    """Return keypoints (pixels), landmarks (world) and whether they agree: guided matches, and refused ones by appearance.
+
+    The number of the latter, which are the last, is returned too.
+    """
     last = pose.correspondences.view == pose.correspondences.view.max()
     agree = (torch.linalg.vector_norm(pose.normalized_residuals, dim=-1) <= 3)[last]
     pixels = pose.pixels[last].double()
     if pose.guided is None:
-        return pixels, torch.zeros((len(pixels), 3), dtype=torch.float64), agree
+        return pixels, torch.zeros((len(pixels), 3), dtype=torch.float64), agree, 0
     guided, query = pose.guided, pose.guided.query
     positions = query.landmarks.positions.double()
     landmarks = positions[pose.correspondences.landmark[last]]
@@ -282,6 +306,7 @@ def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m
         torch.cat([pixels, query.pixels(refused).double()]),
         torch.cat([landmarks, positions[refused.landmark]]),
         torch.cat([agree, torch.zeros(len(refused), dtype=torch.bool)]),
+        len(refused),
     )
 
 

@@ -1,14 +1,15 @@
-"""The explanations of an image that a localization weighed, with their probabilities."""
+"""The contests of explanations of an image that a localization weighed, with their probabilities."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import symbol
 from bidnerf_core.localization import Localization
-from bidnerf_core.localization.acceptance import SurfaceDiagnostics
+from bidnerf_core.localization.acceptance import DescentDiagnostics, LandmarkDiagnostics, SurfaceDiagnostics
 from bidnerf_core.localization.beyond_chance import DISPLACEMENT, NO_RIVAL, Support
-from bidnerf_core.localization.landmarks.chance import odds, probability_of
+from bidnerf_core.localization.landmarks.chance import DECISIVE, odds, probability_of
 from bidnerf_core.localization.landmarks.hypotheses import (
     APPROXIMATE,
     CROPPED_IMAGE,
@@ -21,91 +22,120 @@ from bidnerf_core.localization.landmarks.hypotheses import (
     Posterior,
     Whose,
 )
-from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
 from bidnerf_core.viewer.scene import rows_of
 
 LEAST_SHOWN = 0.001
 """Least probability of an explanation that is listed."""
 CAMERA_NAMES = {
-    STATED: "the camera as given",
-    INEXACT: "the camera as given, nearly",
+    STATED: "given camera",
+    INEXACT: "given camera (slightly off)",
     WRONG_FOCAL: "another focal length",
     WRONG_CAMERA: "another camera",
-    APPROXIMATE: "the camera as given, approximately",
+    APPROXIMATE: "given camera (approximate)",
     CROPPED_IMAGE: "a cropped image",
 }
 MOTIONS = {
     Motion.STILL: "",
-    Motion.MOVING: ", moving while rows were exposed",
-    Motion.TRANSPOSED: ", moving while columns were exposed",
+    Motion.MOVING: ", with rolling shutter",
+    Motion.TRANSPOSED: ", with rolling shutter along the other axis",
 }
+HERE = "the pose found"
 
 
 @dataclass(frozen=True)
 class ShownExplanation:
-    """An explanation, the question that it answers, and its probability among the answers."""
+    """An answer to the question of a contest, and its probability."""
 
-    question: str
     name: str
     probability: float
-    chosen: bool
     pose: tuple[float, ...] | None = None  # T_world_camera, 16 numbers by rows, of another pose
 
 
-def explanations(found: Localization, record: SearchRecord | None) -> tuple[ShownExplanation, ...]:
-    """Return what was weighed: whose camera it is, whether another pose or a mirror image fits, and rivals of the pose."""
-    shown = list[ShownExplanation]()
+@dataclass(frozen=True)
+class Contest:
+    """A question, its answers, whose probabilities add up to 1 but for unlikely ones that are left out, and a remark."""
+
+    question: str
+    answers: tuple[ShownExplanation, ...]
+    remark: str = ""
+
+
+def contests(found: Localization, record: SearchRecord | None) -> tuple[Contest, ...]:
+    """Return what was weighed: the pose against another or a mirror image, against its rivals, and whose camera it is."""
+    shown = list[Contest]()
     if record is not None:
-        if record.landmarks and record.landmarks[-1].guided is not None:
-            shown += _of_camera(record.landmarks[-1].guided.posterior)
-        for other in record.explanations:
-            shown += _two("which pose", other.reason, other.log_odds, other.T)
-    support = found.diagnostics
-    if isinstance(support, SurfaceDiagnostics):
-        support = support.support
-    if isinstance(support, Support):
-        shown += _of_support(support)
+        shown += [_against(found, other) for other in told(found, record)]
+    support = support_of(found)
+    if support is not None:
+        shown.append(_of_support(support))
+    if record is not None and record.landmarks and record.landmarks[-1].guided is not None:
+        shown.append(_of_camera(record.landmarks[-1].guided.posterior, found))
     return tuple(shown)
 
 
-def _of_camera(posterior: Posterior) -> list[ShownExplanation]:
-    weighed = list(zip(posterior.explanations, posterior.probabilities, strict=True))
-    question = "whose camera"
-    return sorted(
+def told(found: Localization, record: SearchRecord) -> list[ComparedExplanation]:
+    """Return the comparisons that tell something: that a refused pose beats its mirror image is no good news."""
+    return [
+        each
+        for each in record.explanations
+        if found.converged or each.T is not None or each.log_odds < DECISIVE
+    ]
+
+
+def support_of(found: Localization) -> Support | None:
+    """Return how well measurements distinguish a pose from its rivals, where they were compared."""
+    said = found.diagnostics
+    if isinstance(said, SurfaceDiagnostics | DescentDiagnostics):
+        return said.support
+    return said if isinstance(said, Support) else None
+
+
+def _against(found: Localization, other: ComparedExplanation) -> Contest:
+    p = probability_of(other.log_odds)
+    if other.T is None:
+        rival, question = ShownExplanation("its mirror image", 1 - p), "Pose or mirror image?"
+    else:
+        apart = float((other.T.translation - found.T_world_camera.to("cpu", other.T.translation.dtype).translation).norm())  # fmt: skip
+        name = f"a pose {apart:.3g} {symbol(found.unit)} away"
+        rival, question = ShownExplanation(name, 1 - p, rows_of(other.T)), "This pose or another?"
+    return Contest(question, (ShownExplanation(HERE, p), rival), other.reason)
+
+
+def _of_camera(posterior: Posterior, found: Localization) -> Contest:
+    answers = sorted(
         (
-            ShownExplanation(question, _name(each), p, each is posterior.best)
-            for each, p in weighed
-            if p >= LEAST_SHOWN or each is posterior.best
+            ShownExplanation(_name(each), p)
+            for each, p in zip(posterior.explanations, posterior.probabilities, strict=True)
+            if p >= LEAST_SHOWN
         ),
         key=lambda shown: -shown.probability,
     )
+    taken = isinstance(found.diagnostics, LandmarkDiagnostics)
+    remark = "" if taken else "Weighed at a pose by landmarks, which is not the one shown."
+    return Contest("Whose camera took it?", tuple(answers), remark)
 
 
 def _name(each: Explanation) -> str:
     name = each.hypothesis.name
-    known = (
-        "the camera of the map's images"
-        if each.hypothesis.whose is Whose.MAP
-        else CAMERA_NAMES.get(name, name)
-    )
-    return known + MOTIONS[each.motion]
-
-
-def _two(question: str, reason: str, log_odds: float, other: SE3 | None) -> list[ShownExplanation]:
-    p = probability_of(log_odds)
-    return [
-        ShownExplanation(question, "the pose found", p, log_odds >= 0),
-        ShownExplanation(question, reason, 1 - p, log_odds < 0, None if other is None else rows_of(other)),
+    is_maps = each.hypothesis.whose is Whose.MAP
+    return ("the camera of the map's images" if is_maps else CAMERA_NAMES.get(name, name)) + MOTIONS[
+        each.motion
     ]
 
 
-def _of_support(said: Support) -> list[ShownExplanation]:
+def _of_support(said: Support) -> Contest:
     rivals = [
-        (f"a pose displaced by {DISPLACEMENT:.0%} of the distance", said.displaced),
+        (f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene", said.displaced),
         ("another pose of the search", said.other),
-        ("any image of a single colour", said.plain),
+        ("an image of a single colour", said.plain),
     ]
     weights = [(name, odds(-against)) for name, against in rivals if against < NO_RIVAL]
     total = 1 + sum(weight for _, weight in weights)
-    shown = [ShownExplanation("which pose", "the pose found", 1 / total, True)]
-    return shown + [ShownExplanation("which pose", name, w / total, False) for name, w in weights]
+    answers = (ShownExplanation(HERE, 1 / total), *(ShownExplanation(name, w / total) for name, w in weights))
+    return Contest("What fits the image best?", answers, "".join(_worse_than_moved(said)))
+
+
+def _worse_than_moved(said: Support) -> Iterator[str]:
+    if said.displaced < min(0.0, said.other, said.plain):
+        yield "The image fits better when the pose is moved: it is not even a local optimum."

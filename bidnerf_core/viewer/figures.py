@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from bidnerf_core.localization import Localization
 from bidnerf_core.localization.acceptance import (
+    DescentDiagnostics,
     LandmarkDiagnostics,
     LandmarkThresholds,
     SurfaceDiagnostics,
@@ -18,6 +20,29 @@ from bidnerf_core.localization.confidence import least_confidence
 from bidnerf_core.localization.landmarks.chance import DECISIVE, probability_of
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
+from bidnerf_core.viewer.explanations import support_of, told
+
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+"""Digits of an exponent."""
+BEYOND = 1.1
+"""Length of a bar's scale, over the larger of the value and its threshold."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A value and its threshold on one linear scale from 0 to 1."""
+
+    value: float
+    threshold: float
+    at_least: bool  # whether values below the threshold fail, else those above
+
+    @staticmethod
+    def of(value: float, threshold: float, at_least: bool) -> Bar | None:
+        """Return the bar of a value and a threshold that are not negative; None where there is no scale for both."""
+        if not math.isfinite(value) or threshold <= 0:
+            return None
+        scale = BEYOND * max(value, threshold)
+        return Bar(max(0.0, value) / scale, threshold / scale, at_least)
 
 
 @dataclass(frozen=True)
@@ -28,7 +53,7 @@ class Figure:
     value: str
     threshold: str  # with "at least" or "at most"; empty for a measure that decides nothing by itself
     passed: bool | None  # None where there is no threshold
-    fulfilled: float | None  # value over threshold or its inverse: 1 at the threshold, more is better
+    bar: Bar | None
     meaning: str
 
 
@@ -45,13 +70,18 @@ def acceptance_figures(
         figures += _of_landmarks(said, by_landmarks)
     elif isinstance(said, SurfaceDiagnostics):
         figures += _of_surface(said)
+    elif isinstance(said, DescentDiagnostics):
+        figures += _of_descent(said)
     elif isinstance(said, Support):
         figures += _of_support(said)
-    if record is not None and record.explanations:
-        figures.append(_of_explanations(record.explanations))
+    if record is not None and (compared := told(found, record)):
+        figures.append(_of_explanations(compared))
     if by_landmarks is not None and not isinstance(said, LandmarkDiagnostics):
-        figures += _of_landmarks(landmark_diagnostics(by_landmarks), by_landmarks)
-    if found.confidence is not None:
+        figures += _of_landmarks(
+            landmark_diagnostics(by_landmarks, _by_appearance(by_landmarks)), by_landmarks
+        )
+    support = support_of(found)
+    if found.confidence is not None and (support is None or support.confidence != found.confidence):
         least = least_confidence(said, approximate)
         meaning = "probability that the pose is right, from all figures together"
         figures.insert(
@@ -61,36 +91,41 @@ def acceptance_figures(
     return tuple(sorted(figures, key=lambda figure: figure.passed is not False))  # what failed comes first
 
 
+def _by_appearance(pose: LandmarkPose) -> bool:
+    """Return whether the matches that a pose counts were made before there was a pose, by appearance alone."""
+    return pose.guided is not None and pose.matches == len(pose.guided.matches)
+
+
 def _times(count: float, chance: float) -> str:
     return "over 100 times" if count > 100 * chance else f"{count / chance:.1f} times"
 
 
 def _least(name: str, value: float, least: float, text: str, bound: str, meaning: str) -> Figure:
-    ratio = value / least if least > 0 else 2.0
-    return Figure(name, text, f"at least {bound}", value >= least, max(0.0, min(2.0, ratio)), meaning)
+    return Figure(name, text, f"at least {bound}", value >= least, Bar.of(value, least, True), meaning)
 
 
 def _most(name: str, value: float, most: float, text: str, bound: str, meaning: str) -> Figure:
-    ratio = 2.0 if value <= most / 2 else most / value
-    return Figure(name, text, f"at most {bound}", value <= most, max(0.0, min(2.0, ratio)), meaning)
+    return Figure(name, text, f"at most {bound}", value <= most, Bar.of(value, most, False), meaning)
 
 
 def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Iterator[Figure]:
     bounds = LandmarkThresholds()
     needed = bounds.inliers * (10 if said.estimated_calibration else 6) / 6
+    before = (
+        f"; before there was a pose, {said.agreeing} of {said.matches} matches by appearance alone agreed"
+    )
     yield _least(
         "landmarks that agree", said.inliers, needed, f"{said.inliers}", f"{needed:.0f}",
-        f"correspondences within three standard deviations; {said.agreeing} of {said.matches} matches by appearance agree",
+        f"matched near where the pose predicts them, within three standard deviations{before if said.searched else ''}",
     )  # fmt: skip
     chance = bounds.above_chance * said.chance
     yield _least(
         "more than by chance", said.inliers, chance, _times(said.inliers, said.chance),
-        f"{bounds.above_chance:g} times", f"about {said.chance:.0f} would agree at a wrong pose",
+        f"{bounds.above_chance:g} times", f"{said.inliers} agree, about {said.chance:.2g} would at a wrong pose",
     )  # fmt: skip
     yield Figure(
-        "log10 of false alarms", f"{said.log10_nfa:.0f}", f"at most {bounds.log10_nfa:.0f}",
-        said.log10_nfa <= bounds.log10_nfa, max(0.0, min(2.0, said.log10_nfa / bounds.log10_nfa)),
-        "how often chance would make as many matches agree",
+        "agreements this good by chance", _power(said.log10_nfa), f"at most {_power(bounds.log10_nfa)}",
+        said.log10_nfa <= bounds.log10_nfa, None, "expected number at wrong poses",
     )  # fmt: skip
     yield _least(
         "spread over the image", said.spread, bounds.spread, f"{said.spread:.0%}", f"{bounds.spread:.0%}",
@@ -102,8 +137,8 @@ def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Itera
     )  # fmt: skip
     if pose is not None:
         yield _most(
-            "shift by other intrinsics", pose.expected_shift, bounds.expected_shift, f"{pose.expected_shift:.3%}",
-            f"{bounds.expected_shift:.2%}", "probability that the camera is another one times how far that moves the position",
+            "shift by a wrong camera", pose.expected_shift, bounds.expected_shift, f"{pose.expected_shift:.2%}",
+            f"{bounds.expected_shift:.2%}", "how far doubts about the camera move the position, as a share of that distance",
         )  # fmt: skip
     yield Figure(
         "noise of keypoints", f"{said.noise_ratio:.1f} times", "", None, None,
@@ -116,13 +151,18 @@ def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Itera
         )  # fmt: skip
 
 
+def _power(log10: float) -> str:
+    """Return a small number of which the decimal logarithm is given."""
+    return f"{10**log10:.2g}" if log10 > -2 else "10" + f"{log10:.0f}".translate(RAISED)
+
+
 def _of_explanations(compared: list[ComparedExplanation]) -> Figure:
     nearest = min(compared, key=lambda each: each.log_odds)
-    bound = f"{probability_of(DECISIVE):.2%}"
+    name = "likelier than its mirror image" if nearest.T is None else "likelier than another pose"
+    p, least = probability_of(nearest.log_odds), probability_of(DECISIVE)
     return _least(
-        "likelier than other explanations", nearest.log_odds, DECISIVE, f"{probability_of(nearest.log_odds):.2%}", bound,
-        f"probability beside the closest of them: {nearest.reason}",
-    )  # fmt: skip
+        name, p, least, f"{p:.1%}", f"{least:.1%}", "probability beside the closest other explanation"
+    )
 
 
 def _of_surface(said: SurfaceDiagnostics) -> Iterator[Figure]:
@@ -148,6 +188,14 @@ def _of_surface(said: SurfaceDiagnostics) -> Iterator[Figure]:
         yield from _of_support(said.support)
 
 
+def _of_descent(said: DescentDiagnostics) -> Iterator[Figure]:
+    yield _most(
+        "mean loss", said.mean_loss, said.converged_loss, f"{said.mean_loss:.3g}", f"{said.converged_loss:.3g}",
+        "of the last steps of the descent",
+    )  # fmt: skip
+    yield from _of_support(said.support)
+
+
 def _of_support(said: Support) -> Iterator[Figure]:
     yield _least(
         "contrast explained", said.explained, LEAST_EXPLAINED, f"{said.explained:.0%}", f"{LEAST_EXPLAINED:.0%}",
@@ -155,5 +203,5 @@ def _of_support(said: Support) -> Iterator[Figure]:
     )  # fmt: skip
     yield _least(
         "distinguished from rivals", said.confidence, ACCEPTED, f"{said.confidence:.0%}", f"{ACCEPTED:.0%}",
-        "probability among displaced poses, the best different pose of the search and a plain image",
+        "its probability among poses moved a little, the best different pose of the search and a plain image",
     )  # fmt: skip

@@ -16,6 +16,7 @@ from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.evidence import described
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.planar_pose import second_pose
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
@@ -52,12 +53,16 @@ def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose)
     if there is None or _is_shared(there.correspondences, here):
         return None
     share = (len(there.correspondences) - there.visible_and_by_chance()[1]) / max(len(here) - found.chance, 1)
-    odds, many = log_odds_of_share(share), f"{min(share, 1):.0%} as many"
+    odds = log_odds_of_share(share)
     return (
-        Rival(there.fit.T_world_rig, odds, f"{many} landmarks match at another place")
-        if odds < DECISIVE
-        else None
+        Rival(there.fit.T_world_rig, odds, _two_places(found, described(there))) if odds < DECISIVE else None
     )
+
+
+def _two_places(here: LandmarkPose, there: LandmarkPose) -> str:
+    if here.inliers == there.inliers:
+        return f"the photo fits two places equally well ({here.inliers} landmarks at each)"
+    return f"the photo fits two places ({here.inliers} landmarks at one, {there.inliers} at the other)"
 
 
 def second_of_plane(query: LandmarkQuery, found: LandmarkPose) -> Rival | None:

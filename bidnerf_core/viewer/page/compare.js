@@ -69,17 +69,19 @@ export class Comparison {
     if (focused) modes.querySelector("[aria-pressed=true]").focus();
   }
 
-  tags(box) {
-    box.append(element("span", { class: "tag left" }, "photo"), element("span", { class: "tag right" }, this.shown.label ?? "rendered"));
-  }
+  tag(side, text) { return element("span", { class: `tag ${side}` }, text); }
 
+  // Two pictures side by side at the edge; the label of each ends with it.
   drawWipe(box, under) {
-    const top = this.image(this.shown.observed, "photo"), edge = element("div", { class: "edge" });
+    const label = this.shown.label ?? "rendered", edge = element("div", { class: "edge" });
+    const left = element("div", {}, this.image(this.shown.observed, "photo"), this.tag("left", "photo"));
+    const right = element("div", {}, this.image(this.shown.rendered, label), this.tag("right", label));
     const range = element("input", { type: "range", id: "wipe", min: "0", max: "100", "aria-label": "Share of the photo" });
     const move = (share) => {
       this.share = share;
       range.value = share;
-      top.style.clipPath = `inset(0 ${100 - share}% 0 0)`;
+      left.style.clipPath = `inset(0 ${100 - share}% 0 0)`;
+      right.style.clipPath = `inset(0 0 0 ${share}%)`;
       edge.style.left = `${share}%`;
     };
     range.addEventListener("input", () => move(Number(range.value)));
@@ -89,9 +91,8 @@ export class Comparison {
     };
     box.addEventListener("pointerdown", (event) => { box.setPointerCapture(event.pointerId); drag(event); });
     box.addEventListener("pointermove", (event) => { if (event.buttons) drag(event); });
-    box.append(this.image(this.shown.rendered, "rendered"), top, edge);
-    this.tags(box);
-    under.append("photo", range, this.shown.label ?? "rendered");
+    box.append(right, left, edge);
+    under.append(`only ${label}`, range, "only photo");
     move(this.share);
   }
 
@@ -103,7 +104,7 @@ export class Comparison {
     if (!still) this.timer = setInterval(() => set(!on), 700);
     box.addEventListener("click", () => set(!on));
     box.append(this.image(this.shown.rendered, "rendered"), top, label);
-    under.append(still ? "Click the picture to switch." : "What moves between the two is not where the map has it.");
+    under.append(still ? "Click the picture to switch." : "What seems to move is not where the map shows it.");
     set(true);
   }
 
@@ -120,6 +121,12 @@ export class Comparison {
     box.append(canvas);
     under.append("black where equal", range, "amplified");
     paint();
+  }
+
+  matchesText({ refused, by_appearance: looks }) {
+    const whose = this.shown.label === "runner-up" ? "Matches of the pose found, not of the runner-up. " : "";
+    const which = refused ? `Of those, ${looks} were matched by appearance alone, ${refused - looks} near where the pose predicts the landmark, but too far off. ` : "";
+    return `${whose}${which}Lines lead to where the landmark is.`;
   }
 
   async drawEdges(box, under) {
@@ -148,7 +155,7 @@ export class Comparison {
     box.append(this.image(depth.picture, "depth difference"));
     const end = lengthText(depth.range, unit);
     under.append(`map nearer by ${end}`, element("div", { class: "scale" }), `farther by ${end}`);
-    box.append(element("span", { class: "tag left" }, `median difference ${lengthText(depth.median, unit)}`));
+    box.append(this.tag("left", `median difference ${lengthText(depth.median, unit)}`));
   }
 
   drawMatches(box, under) {
@@ -176,8 +183,8 @@ export class Comparison {
     const box2 = (key, colour, text) => element("label", {},
       element("input", { type: "checkbox", checked: this[key], onchange: (event) => { this[key] = event.target.checked; draw(); } }),
       element("i", { class: "dot", style: `background:${colour};margin:0` }), text);
-    under.append(box2("agreeing", "#2fb872", `${matches.agreeing} agree`), box2("refused", "#ff7a52", `${matches.refused} refused`),
-      element("span", {}, "lines lead to where the landmark is"));
+    under.append(box2("agreeing", "#2fb872", `${matches.agreeing} agree`), box2("refused", "#ff7a52", `${matches.refused} do not`),
+      element("span", {}, this.matchesText(matches)));
     box.append(photo, svg);
     draw();
   }

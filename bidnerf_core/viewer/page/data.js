@@ -19,6 +19,11 @@ export function element(tag, attributes = {}, ...children) {
   return made;
 }
 
+// Text in which what stands between backticks is code.
+export function withCode(text) {
+  return text.split("`").map((part, i) => i % 2 ? element("code", {}, part) : part);
+}
+
 export const find = (id) => document.getElementById(id);
 
 // A length in the unit of the map: metres are shown as mm, cm or m.
@@ -30,8 +35,8 @@ export function lengthText(value, unit) {
 }
 
 export function percent(p) {
-  if (p > 0.9995) return "> 99.9 %";
-  return p < 0.001 ? "< 0.1 %" : `${Number((100 * p).toPrecision(p < 0.01 ? 1 : 3))} %`;
+  if (p > 0.9995) return ">\u00a099.9%";
+  return p < 0.001 ? "<\u00a00.1%" : `${Number((100 * p).toPrecision(p < 0.01 ? 1 : 3))}%`;
 }
 
 export function colourOf(name) {

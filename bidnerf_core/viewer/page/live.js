@@ -10,7 +10,7 @@ export class Live {
     this.page = page;
     this.queries = page.state.queries;
     this.on = false;
-    const choose = find("choose"), stage = find("stage"), drop = find("drop");
+    const choose = find("choose"), drop = find("drop");
     choose.hidden = find("fov").hidden = false;
     find("photo").addEventListener("change", (event) => { for (const file of event.target.files) this.upload(file); event.target.value = ""; });
     let inside = 0;
@@ -27,7 +27,7 @@ export class Live {
       find("toggles").append(element("button", { id: "show-field", "aria-pressed": "false", title: "Field from here (v)", onclick: () => this.toggleField() }, "Field"));
       page.space.moved = () => this.moved();
     }
-    new ResizeObserver(() => this.moved()).observe(stage);
+    new ResizeObserver(() => this.moved()).observe(find("scene"));
   }
 
   thumbnail(number) { return `/api/thumbnail/${number}`; }
@@ -116,7 +116,7 @@ export class Live {
     this.busy = true;
     this.fine = sizes.length > 0;
     for (const size of sizes.length ? sizes : [QUICK]) {
-      const box = find("stage").getBoundingClientRect(), scale = size / Math.max(box.width, box.height);
+      const box = find("scene").getBoundingClientRect(), scale = size / Math.max(box.width, box.height);
       this.abort = new AbortController();
       try {
         const reply = await fetch("/api/view", { method: "POST", signal: this.abort.signal, body: JSON.stringify({

@@ -1,17 +1,20 @@
 // Puts the page together: state, keys, slider, and what a server adds if there is one.
-import { colourOf, element, find, lengthText } from "./data.js";
+import { colourOf, element, find, lengthText, withCode } from "./data.js";
 import { Space } from "./space.js";
 import { Comparison } from "./compare.js";
-import { explanations, figures, outcomeOf, poseText, uncertainty } from "./panel.js";
+import { contests, figures, outcomeOf, poseText, uncertainty } from "./panel.js";
 import { Results } from "./table.js";
 import { Track } from "./track.js";
 import { Live } from "./live.js";
 
 const LAYERS = [["surface", "Surface", "s"], ["splats", "Splats", "x"], ["landmarks", "Landmarks", "l"], ["cameras", "Cameras", "c"], ["ellipsoid", "Ellipsoid", "e"]];
-const KEYS = [["← →", "step of the search"], ["space", "play the search"], ["n p", "next, previous image"], ["1 … 6", "way of comparing"],
-  ["w W", "wipe"], ["f", "whole map"], ["g", "go to the pose"], ["o", "from the photo"], ["r", "runner-up"],
-  ["s x l c e", "surface, splats, landmarks, cameras, ellipsoid"], ["v", "field from here (live)"]];
+const WORDS = [["accepted, refused", "whether the pose passed all tests; a refused one is shown so that you see why"],
+  ["landmark", "a point of the map that is recognised by its looks"], ["rendered", "what the map shows from the pose"],
+  ["runner-up", "the best pose that differs from the one found"], ["confidence", "probability that the pose is right"],
+  ["ellipsoid", "where the camera is: two standard deviations of the position"]];
 const ENLARGED = [1, 10, 100, 1000];
+
+const placeOf = (pose) => [pose[3], pose[7], pose[11]];
 
 class Page {
   constructor(state) {
@@ -20,7 +23,6 @@ class Page {
     document.title = state.title || `${this.map.name} – bidnerf view`;
     find("title").textContent = this.map.name;
     for (const [name, value] of this.map.facts) find("facts").append(element("dt", {}, name), element("dd", {}, value));
-    for (const [key, what] of KEYS) find("keys").append(element("dt", {}, element("kbd", {}, key)), element("dd", {}, what));
     try { this.space = new Space(find("space"), this.map); } catch (error) { this.note("This browser shows no WebGL; the pictures and figures beside are complete."); }
     this.hidden.add("landmarks");
     if (this.map.splats && this.map.surface) this.hidden.add("surface");
@@ -39,7 +41,22 @@ class Page {
     this.offerViews();
   }
 
-  offerViews() { for (const id of ["go", "from"]) find(id).hidden = !this.pose; }
+  // The words and the keys that have a use on this page as it is now.
+  fillHelp() {
+    const any = (has) => this.answers.some(has), pose = any((a) => a.pose), compared = any((a) => a.observed && a.rendered);
+    const layers = LAYERS.filter(([name]) => find(`show-${name}`) && !find(`show-${name}`).disabled);
+    const keys = [[any((a) => a.steps.length > 1), "← →", "step of the search"], [any((a) => a.steps.length > 1), "space", "play the search"],
+      [this.answers.length > 1 || this.live?.queries.length > 1, "n p", "next, previous image"], [compared, "1 … 6", "way of comparing"], [compared, "w W", "wipe"],
+      [this.space, "f", "whole map"], [pose, "g", "go to the pose"], [pose, "o", "from the photo"], [any((a) => a.runner_up), "r", "runner-up"],
+      [layers.length, layers.map(([, , key]) => key).join(" "), layers.map(([, label]) => label.toLowerCase()).join(", ")], [this.live, "v", "field from here"]];
+    const outcomes = new Map(this.answers.filter((a) => a.meaning).map((a) => [a.outcome, a.meaning]));
+    const methods = new Map(this.answers.filter((a) => a.method_summary).map((a) => [`method ${a.method}`, a.method_summary]));
+    const rows = (pairs, made) => pairs.flatMap(([name, what]) => [element("dt", {}, made(name)), element("dd", {}, ...withCode(what))]);
+    find("words").replaceChildren(...rows([...outcomes, ...methods, ...WORDS], (name) => name));
+    find("keys").replaceChildren(...rows(keys.filter(([use]) => use).map(([, key, what]) => [key, what]), (key) => element("kbd", {}, key)));
+  }
+
+  offerViews() { this.offerEllipsoid(); for (const id of ["go", "from"]) find(id).hidden = !this.pose; }
 
   placeOf(name) { return this.answers.findIndex((answer) => answer.name === name); }
 
@@ -65,10 +82,12 @@ class Page {
     find("timeline").hidden = true;
     this.space?.clear("search");
     const answer = { ...row, name: row.frame, seconds: 0, unit: this.map.unit };
-    find("answer").replaceChildren(...outcomeOf(answer), element("p", { class: "empty" }, row.sigma === null ? "" : `Standard deviation of the position: ${lengthText(row.sigma, this.map.unit)}.`));
+    find("verdict").replaceChildren(...outcomeOf(answer));
+    find("answer").replaceChildren(element("p", { class: "empty" }, row.sigma === null ? "" : `Standard deviation of the position: ${lengthText(row.sigma, this.map.unit)}.`));
     this.space?.clear("answer");
     this.space?.frustum("answer", row.pose, this.map.cameras[0]?.shape, colourOf(row.accepted ? "--good" : "--bad"));
     this.space?.near(row.pose);
+    this.offerViews();
   }
 
   note(text) { find("note").textContent = text; }
@@ -90,7 +109,7 @@ class Page {
   }
 
   toggle(name) {
-    if (!find(`show-${name}`)) return;
+    if (find(`show-${name}`)?.disabled !== false) return;
     if (!this.hidden.delete(name)) this.hidden.add(name);
     find(`show-${name}`).setAttribute("aria-pressed", String(!this.hidden.has(name)));
     if (name === "ellipsoid") this.drawAnswer(); else this.space?.show(name, !this.hidden.has(name));
@@ -129,6 +148,7 @@ class Page {
     find("space").addEventListener("pointerleave", () => { find("card").hidden = true; });
     addEventListener("keydown", (event) => this.key(event));
     addEventListener("hashchange", () => this.follow());
+    find("help").addEventListener("toggle", () => this.fillHelp());
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawAnswer());
   }
 
@@ -179,7 +199,8 @@ class Page {
     find("query").value = String(place);
     if (remember && location.protocol !== "about:") history.replaceState(null, "", `#frame=${encodeURIComponent(this.answer.name)}`);
     const { ellipsoid, steps } = this.answer;
-    const size = this.space?.size ?? 1;
+    const size = this.space?.size ?? 1, { answer } = this;
+    this.space?.frame([answer.pose, answer.truth, answer.runner_up?.pose].filter(Boolean).map(placeOf).concat(answer.path.slice(0, 1)));
     this.factor = ellipsoid ? ENLARGED.find((factor) => factor * ellipsoid.lengths[0] >= 0.3 * size) ?? 1000 : 1;
     find("timeline").hidden = steps.length < 2;
     find("step").max = String(Math.max(0, steps.length - 1));
@@ -191,17 +212,27 @@ class Page {
 
   drawPanel() {
     const answer = this.answer, other = answer.runner_up;
-    const runner = other ? element("button", { id: "runner", "aria-pressed": String(this.runner), onclick: () => this.toggleRunner(), title: "Runner-up (r)" },
-      this.runner ? "Back to the pose found" : "Show the runner-up") : null;
+    const runner = other ? element("p", { class: this.runner ? "row banner" : "row" },
+      this.runner ? element("span", {}, element("b", {}, "You are looking at the runner-up"), `, ${lengthText(this.apart, answer.unit)} from the pose found.`) : null,
+      element("button", { id: "runner", "aria-pressed": String(this.runner), onclick: () => this.toggleRunner(), title: "Runner-up (r)" },
+        this.runner ? "Back to the pose found" : "Show the runner-up"),
+      this.runner ? null : element("span", { class: "small" }, `${lengthText(this.apart, answer.unit)} away${answer.reason.includes(other.reason) ? "" : `: ${other.reason}`}`)) : null;
     const sizes = ENLARGED.map((factor) => element("option", { value: String(factor), selected: factor === this.factor }, `× ${factor}`));
     const enlarge = answer.ellipsoid ? element("p", { class: "row small" }, "Ellipsoid drawn", element("select", { id: "enlarge", "aria-label": "Size of the ellipsoid",
       onchange: (event) => { this.factor = Number(event.target.value); this.drawAnswer(); this.drawPanel(); } }, ...sizes)) : null;
     this.comparison.show({ ...answer, rendered: this.runner ? other?.rendered : answer.rendered, label: this.runner ? "runner-up" : "rendered",
       depth: this.runner ? null : answer.depth });
     const allPassed = answer.figures.every((figure) => figure.passed !== false);  // then an explanation tells why it was refused
-    find("answer").replaceChildren(...outcomeOf(answer), this.comparison.root,
-      ...(runner ? [element("p", { class: "row" }, runner, element("span", { class: "small" }, other.reason))] : []),
-      ...(allPassed && !answer.accepted ? [...explanations(answer), ...figures(answer)] : [...figures(answer), ...explanations(answer)]), ...uncertainty(answer, this.factor), ...(enlarge ? [enlarge] : []), ...poseText(answer).filter(Boolean));
+    const said = allPassed && !answer.accepted ? [...contests(answer), ...figures(answer)] : [...figures(answer), ...contests(answer)];
+    find("verdict").replaceChildren(...outcomeOf(answer));
+    find("answer").replaceChildren(...[this.runner ? runner : null, this.comparison.root, this.runner ? null : runner,
+      ...said, ...uncertainty(answer, this.factor), enlarge, ...poseText(answer)].filter(Boolean));
+  }
+
+  // How far the runner-up is from the pose found.
+  get apart() {
+    const [here, there] = [this.answer.pose, this.answer.runner_up.pose].map(placeOf);
+    return Math.hypot(...here.map((x, i) => x - there[i]));
   }
 
   toggleRunner() {
@@ -232,21 +263,37 @@ class Page {
 
   stop() { clearInterval(this.playing); this.playing = null; find("play").textContent = "▶"; }
 
+  offerEllipsoid() {
+    const button = find("show-ellipsoid"), known = Boolean(this.answer?.ellipsoid);
+    if (!button) return;
+    button.textContent = this.factor > 1 && known ? `Ellipsoid × ${this.factor}` : "Ellipsoid";
+    button.disabled = !known;
+    button.setAttribute("aria-pressed", String(known && !this.hidden.has("ellipsoid")));
+  }
+
   drawAnswer() {
     this.offerViews();
     const { space, answer } = this;
     if (!space || !answer) return;
     space.clear("answer");
-    const button = find("show-ellipsoid");
-    if (button) button.textContent = this.factor > 1 && answer.ellipsoid ? `Ellipsoid × ${this.factor}` : "Ellipsoid";
     if (!answer.pose) return;
     const colour = colourOf(answer.accepted ? "--good" : "--bad");
     space.frustum("answer", answer.pose, answer.shape, colour, { picture: answer.observed?.url });
     space.axes("answer", answer.pose, 0.4 * space.size);
     if (answer.ellipsoid && !this.hidden.has("ellipsoid")) space.ellipsoid("answer", answer.pose, answer.ellipsoid.axes, this.factor, colour);
-    if (answer.path.length > 1) space.lines("answer", answer.path, colour, { strip: true });
-    if (answer.truth) space.frustum("answer", answer.truth, answer.shape, colourOf("--soft"), { depth: 0.9 * space.size, opacity: 0.7 });
-    if (this.runner) space.frustum("answer", answer.runner_up.pose, answer.shape, colourOf("--accent"), { picture: answer.runner_up.rendered?.url });
+    const soft = colourOf("--soft"), accent = colourOf("--accent"), { runner_up: other, path } = answer;
+    space.label("answer", placeOf(answer.pose), answer.accepted ? "pose found" : "pose found, refused", colour);
+    if (path.length > 1) {
+      space.lines("answer", path, colour, { strip: true });
+      if (Math.hypot(...path[0].map((x, i) => x - placeOf(answer.pose)[i])) > space.size) space.label("answer", path[0], "start of the optimization", colour);
+    }
+    if (answer.truth) {
+      space.frustum("answer", answer.truth, answer.shape, soft, { depth: 0.9 * space.size, opacity: 0.7 });
+    }
+    if (other) {
+      space.frustum("answer", other.pose, answer.shape, accent, { picture: this.runner ? other.rendered?.url : null, opacity: this.runner ? 1 : 0.6 });
+      space.label("answer", placeOf(other.pose), this.runner ? "runner-up, shown" : "runner-up", accent);
+    }
   }
 }
 

@@ -1,17 +1,20 @@
-// What is said about an answer: outcome, uncertainty, figures, explanations.
-import { element, lengthText, percent } from "./data.js";
+// What is said about an answer: outcome, uncertainty, figures, contests of explanations.
+import { element, lengthText, percent, withCode } from "./data.js";
 
 export function outcomeOf(answer) {
   const facts = [];
   if (answer.accepted && answer.confidence !== null) facts.push(`${percent(answer.confidence)} likely to be right`);
-  if (answer.seconds) facts.push(`${answer.seconds.toFixed(2)} s`);
-  if (answer.method) facts.push(`method ${answer.method}`);
+  if (answer.seconds) facts.push(`${Number(answer.seconds.toPrecision(3))}\u00a0s`);
+  if (answer.method) facts.push(`method\u00a0${answer.method}`);
   const lines = [
     element("p", { class: "name" }, answer.name),
     element("p", { class: `outcome ${answer.accepted ? "good" : "bad"}` },
-      element("b", {}, answer.accepted ? "Accepted" : `Refused: ${answer.outcome}`), element("span", {}, facts.join(" · "))),
+      element("b", {}, answer.accepted ? "Accepted" : `Refused: ${answer.outcome}`), element("span", { title: answer.method_summary }, facts.join(" · "))),
     element("p", { class: "reason" }, answer.reason),
   ];
+  if (answer.advice) {
+    lines.push(element("p", { class: "advice" }, ...withCode(answer.meaning), element("br"), element("b", {}, "What to try: "), ...withCode(answer.advice)));
+  }
   if (answer.error) {
     lines.push(element("p", { class: "reason" }, `True error: ${lengthText(answer.error[0], answer.unit)} and ${answer.error[1].toFixed(2)}°`));
   }
@@ -29,38 +32,39 @@ export function uncertainty(answer, factor) {
   ];
 }
 
+// A bar from zero to the value, with a tick at the threshold; the side where values fail is tinted.
+function gauge({ value, threshold, at_least: least }) {
+  const fill = element("i"), tick = element("b"), bar = element("div", { class: `gauge ${least ? "least" : "most"}` }, fill, tick);
+  fill.style.width = `${100 * value}%`;
+  bar.style.setProperty("--tick", `${100 * threshold}%`);
+  return bar;
+}
+
 export function figures(answer) {
   if (!answer.figures.length) return [];
   const rows = answer.figures.map((figure) => {
-    const bar = element("div", { class: figure.fulfilled === null ? "" : "gauge threshold" });
-    if (figure.fulfilled !== null) {
-      const fill = element("i");
-      fill.style.width = `${50 * figure.fulfilled}%`;
-      bar.append(fill);
-    }
     const mark = figure.passed === null ? "" : figure.passed ? "✓" : "✗";
     return element("tr", { class: figure.passed === false ? "failed" : "" },
       element("td", { class: "mark", "aria-label": figure.passed === false ? "failed" : figure.passed ? "passed" : "" }, mark),
-      element("th", { scope: "row" }, figure.name, element("small", {}, figure.meaning), bar),
+      element("th", { scope: "row" }, figure.name, element("small", {}, figure.meaning), figure.bar ? gauge(figure.bar) : null),
       element("td", { class: "number" }, figure.value, element("small", {}, figure.threshold)));
   });
-  return [element("h2", {}, "Figures and thresholds"), element("table", { id: "figures" }, element("tbody", {}, ...rows))];
+  return [element("h2", {}, "Figures and thresholds"), element("p", { class: "small" }, "Each bar is the value, its tick the threshold; values in the tinted part fail."),
+    element("table", { id: "figures" }, element("tbody", {}, ...rows))];
 }
 
-export function explanations(answer) {
-  if (!answer.explanations.length) return [];
-  const questions = [...new Set(answer.explanations.map((each) => each.question))];
-  const titles = { "whose camera": "Whose camera took it?", "which pose": "Which pose is right?" };
-  return questions.flatMap((question) => {
-    const lines = answer.explanations.filter((each) => each.question === question).flatMap((each) => {
+export function contests(answer) {
+  return answer.contests.flatMap(({ question, answers, remark }) => {
+    const most = Math.max(...answers.map((each) => each.probability));
+    const lines = answers.flatMap(({ name, probability }) => {
       const fill = element("i");
-      fill.style.width = `${100 * each.probability}%`;
+      fill.style.width = `${100 * probability}%`;
       return [
-        element("p", { class: each.chosen ? "chosen" : "" }, element("span", {}, each.name), element("span", {}, percent(each.probability))),
+        element("p", { class: probability === most ? "likeliest" : "" }, element("span", {}, name), element("span", {}, percent(probability))),
         element("div", { class: "gauge plain" }, fill),
       ];
     });
-    return [element("h2", {}, titles[question] ?? question), element("div", { class: "weighed" }, ...lines)];
+    return [element("h2", {}, question), remark && !answer.reason.includes(remark) ? element("p", { class: "small" }, remark) : null, element("div", { class: "weighed" }, ...lines)];
   });
 }
 
@@ -68,5 +72,6 @@ export function poseText(answer) {
   if (!answer.pose) return [];
   const rows = [0, 4, 8, 12].map((i) => answer.pose.slice(i, i + 4).map((x) => x.toFixed(4).padStart(9)).join(" ")).join("\n");
   return [element("h2", {}, "Pose, camera to world (OpenCV axes)"), element("pre", {}, rows),
-    answer.camera ? element("p", { class: "small" }, `Camera: ${answer.camera}`) : null];
+    answer.camera ? element("p", { class: "small" }, `Camera of this pose: ${answer.camera}`) : null,
+    answer.method_summary ? element("p", { class: "small" }, `Method ${answer.method}: ${answer.method_summary}`) : null];
 }

@@ -3,6 +3,7 @@ import { colourOf, numbers, scaleColour } from "./data.js";
 
 const FOV = 55;
 const SPREAD = 2.2;  // radius of a point of the surface over that of its surfel, which closes gaps
+const SAMPLE = 2000, REACH = 3;  // points that a view is fitted to, and how far from the middle, in extents, what else it shows may be
 const SLOW = 45, REST = 180, LEAST_SHARE = 0.08;  // ms of a frame, ms without motion, share of the points
 
 const VERTEX = `
@@ -53,14 +54,15 @@ export class Space {
       this.layers[name] = new THREE.Group();
       this.scene.add(this.layers[name]);
     }
-    this.overview();
-    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
-    this.resize();
+    this.tags = []; this.places = []; this.sample = [];
     this.addMap();
+    this.resize();
+    this.overview();
+    new ResizeObserver(() => { this.resize(); if (!this.touched) this.overview(); }).observe(canvas.parentElement);
     const draw = (now) => {
       if (this.flight) this.fly(now);
       this.adapt(now);
-      if (this.dirty) { this.dirty = false; this.renderer.render(this.scene, this.camera); this.drawn = (this.drawn ?? 0) + 1; }
+      if (this.dirty) { this.dirty = false; this.renderer.render(this.scene, this.camera); this.placeLabels(); this.drawn = (this.drawn ?? 0) + 1; }
       requestAnimationFrame(draw);
     };
     requestAnimationFrame(draw);
@@ -105,6 +107,7 @@ export class Space {
     this.controls.zoomSpeed = 0.8;
     this.controls.target.copy(target);
     this.controls.update();
+    this.controls.addEventListener("start", () => { this.touched = true; });
     this.controls.addEventListener("change", () => { this.moving = performance.now(); this.changed(); this.moved(); });
     this.changed();
     this.moved();
@@ -122,15 +125,40 @@ export class Space {
     }
     behind.addScaledVector(up, -behind.dot(up));
     if (behind.length() > 0.25 * this.map.cameras.length) level.copy(behind.normalize());
-    const narrow = Math.min(1, this.camera.aspect || 1);
-    const from = centre.clone().addScaledVector(level, 1.25 * extent / narrow).addScaledVector(up, 0.8 * extent / narrow);
     this.camera.fov = FOV;
     this.camera.updateProjectionMatrix();
-    this.camera.position.copy(from);
-    this.control(up, centre);
+    const { target, distance, back } = this.fitted(centre, level.multiplyScalar(1.25).addScaledVector(up, 0.8).normalize(), up);
+    this.camera.position.copy(target).addScaledVector(back, distance);
+    this.control(up, target);
+  }
+
+  // From where, along a direction, the map but for a few points, its cameras and the places to see fill the window.
+  fitted(centre, back, up) {
+    const right = up.clone().cross(back).normalize(), above = back.clone().cross(right);
+    const seen = (points) => points.map((point) => { const v = point.clone().sub(centre); return [v.dot(right), v.dot(above), v.dot(back)]; });
+    const cameras = this.map.cameras.map(({ pose }) => new THREE.Vector3(pose[3], pose[7], pose[11]));
+    const near = this.places.map((place) => new THREE.Vector3(...place)).filter((place) => place.distanceTo(centre) < REACH * this.map.extent);
+    const around = near.flatMap((place) => [right, above].flatMap((axis) => [-1, 1].map((sign) => place.clone().addScaledVector(axis, sign * this.size))));
+    const groups = [[seen(this.sample), 0.01], [seen(cameras), 0.1], [seen(around), 0]].filter(([points]) => points.length);
+    const span = (values, beyond) => { const sorted = values.sort((a, b) => a - b), last = sorted.length - 1; return [sorted[Math.ceil(beyond * last)], sorted[Math.floor((1 - beyond) * last)]]; };
+    const middle = [0, 1].map((i) => {
+      const ends = groups.map(([points, beyond]) => span(points.map((point) => point[i]), beyond));
+      return groups.length ? (Math.min(...ends.map(([low]) => low)) + Math.max(...ends.map(([, high]) => high))) / 2 : 0;
+    });
+    const tall = Math.tan(FOV * Math.PI / 360), slopes = [tall * this.camera.aspect * 0.92, tall * 0.82];
+    const needed = ([x, y, z]) => z + Math.max(Math.abs(x - middle[0]) / slopes[0], Math.abs(y - middle[1]) / slopes[1]);
+    const distance = Math.max(0.1 * this.map.extent, ...groups.map(([points, beyond]) => span(points.map(needed), beyond)[1]));
+    return { target: centre.clone().addScaledVector(right, middle[0]).addScaledVector(above, middle[1]), distance, back };
+  }
+
+  // Show these places too in the view of the whole map, which is taken unless another one was chosen.
+  frame(places) {
+    this.places = places;
+    if (!this.touched) this.overview();
   }
 
   fit() {
+    this.touched = false;
     const from = this.where();
     this.overview();
     this.travel(from);
@@ -159,8 +187,34 @@ export class Space {
     this.changed();
   }
 
+  // Text at a place of a layer.
+  label(layer, place, text, colour) {
+    const tag = document.createElement("span");
+    tag.textContent = text;
+    tag.style.color = colour;
+    document.getElementById("labels").append(tag);
+    this.tags.push({ layer, tag, place: new THREE.Vector3(...place) });
+    this.changed();
+  }
+
+  // Put labels above their places; one that would lie on another moves up.
+  placeLabels() {
+    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement, v = new THREE.Vector3(), taken = [];
+    for (const { tag, place } of this.tags) {
+      v.copy(place).project(this.camera);
+      tag.hidden = v.z >= 1 || Math.abs(v.x) > 1 || Math.abs(v.y) > 1;
+      if (tag.hidden) continue;
+      const half = tag.offsetWidth / 2, x = Math.max(half + 4, Math.min(width - half - 4, (v.x + 1) / 2 * width));
+      let y = (1 - v.y) / 2 * height - 10;
+      while (taken.some((other) => Math.abs(other.y - y) < 18 && Math.abs(other.x - x) < other.half + half)) y -= 18;
+      taken.push({ x, y, half });
+      tag.style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
+    }
+  }
+
   // Look from a pose, with the field of view of its image.
   from(pose, shape) {
+    this.touched = true;
     const before = this.where(), m = pose;
     const up = new THREE.Vector3(-m[1], -m[5], -m[9]), forward = new THREE.Vector3(m[2], m[6], m[10]);
     const place = new THREE.Vector3(m[3], m[7], m[11]);
@@ -175,6 +229,7 @@ export class Space {
 
   // Look at a pose from behind and above, near enough to see what surrounds it.
   near(pose, distance = 6 * this.size) {
+    this.touched = true;
     const before = this.where(), up = new THREE.Vector3(...this.map.up).normalize();
     const place = new THREE.Vector3(pose[3], pose[7], pose[11]);
     const back = new THREE.Vector3(-pose[2], -pose[6], -pose[10]);
@@ -188,6 +243,8 @@ export class Space {
   show(name, visible) { this.layers[name].visible = visible; this.changed(); }
 
   clear(name) {
+    for (const { tag } of this.tags.filter(({ layer }) => layer === name)) tag.remove();
+    this.tags = this.tags.filter(({ layer }) => layer !== name);
     for (const child of [...this.layers[name].children]) {
       this.layers[name].remove(child);
       child.traverse((each) => { each.geometry?.dispose(); each.material?.map?.dispose(); each.material?.dispose(); });
@@ -232,6 +289,7 @@ export class Space {
       const positions = new Float32Array(places.length), { lower, size } = part.points;
       for (let i = 0; i < places.length; i++) positions[i] = lower[i % 3] + places[i] / 65535 * size;
       geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+      if (!this.sample.length) for (let i = 0; i < Math.min(count, SAMPLE); i++) this.sample.push(new THREE.Vector3().fromArray(positions, 3 * i));
       let tints;
       if (part.colours) tints = numbers(part.colours);
       else { tints = new Uint8Array(3 * count); for (let i = 0; i < count; i++) tints.set([222, 138, 26], 3 * i); }
