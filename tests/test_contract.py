@@ -412,7 +412,7 @@ def test_state_between_threads_is_told() -> None:
         return good(self, *self.kept)
 
     said = fault("test_query_serves_several_threads", with_query(careless))
-    assert "several threads" in said
+    assert "concurrent threads" in said
 
 
 # Where the field is asked.
@@ -722,7 +722,7 @@ def stale_save(report: Report) -> Any:
         (reporting(step=every_other), "report.step was called with [(1, 60), (3, 60)"),
         (reporting(step=nan_loss), "loss or PSNR that is not finite"),
         (reporting(due=lambda report: lambda step: False), "saved after steps [], expected [1, 30, 60]"),
-        (reporting(due=lambda report: lambda step: True), "and only then"),
+        (reporting(due=lambda report: lambda step: True), "exactly when"),
         (reporting(save=stale_save), "not that of the trained field"),
     ],
 )

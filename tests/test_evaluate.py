@@ -194,7 +194,7 @@ def test_folders_without_masks_are_refused(
 
 def test_frames_of_one_name_are_refused() -> None:
     views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
-    with pytest.raises(bn.InputError, match="2 frames called 'image'"):
+    with pytest.raises(bn.InputError, match="2 frames named 'image'"):
         bn.evaluate(BLOBS, views, trials=1, **QUICK)
 
 

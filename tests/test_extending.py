@@ -119,7 +119,7 @@ def test_photos_that_cannot_be_read_are_left_out(
     (photos / "b.png").write_bytes((photos / f"{known.name}.png").read_bytes()[:500])
     with caplog.at_level("INFO", "bidnerf"):
         assert len(bn.extend(scene, photos).info.cameras) == 7
-    assert "0 of 2 photos located, 1 already in the map, 1 left out" in caplog.text
+    assert "0 of 2 photos localized, 1 already in the map, 1 left out" in caplog.text
     (photos / f"{known.name}.png").unlink()
     with pytest.raises(InputError, match=r"none of 1 photo can be read: .*b\.png"):
         bn.extend(scene, photos)
@@ -143,5 +143,5 @@ def test_the_command(bidnerf: Run, map_folder: Path, tmp_path: Path) -> None:
     status, out, err = bidnerf("extend", map_folder, tmp_path / "new", "--steps", STEPS)
     assert status == 0, err
     assert "2 photos added, 9 images in all" in out
-    assert "2 of 2 photos located" in err
+    assert "2 of 2 photos localized" in err
     assert bidnerf("extend", map_folder, tmp_path / "new", "--steps", 0)[0] == 2

@@ -208,7 +208,7 @@ def test_cameras_are_scaled_to_images_that_were_resized(
         with Image.open(folder / f"{number}.png") as image:
             image.resize(size).save(folder / f"{number}.png")
     with pytest.warns(
-        InputWarning, match=r"0\.png is \d+x\d+, w and h say 200x160; cameras are scaled to the images"
+        InputWarning, match=r"0\.png is \d+x\d+, but w and h are 200x160; cameras are scaled to the images"
     ):
         (view,) = open_dataset(folder).views("test")
     expected = Intrinsics(60 * factor, 62 * factor, 100 * factor, 76 * factor, *size)

@@ -410,7 +410,7 @@ def test_more_than_can_be_drawn_is_in_the_tables(tmp_path: Path, monkeypatch: py
     many = [dataclasses.replace(r, trial=dataclasses.replace(r.trial, map=f"map {r.seed}")) for r in many]
     table = ResultTable(tuple(many))
     figures, whole = (Figures(groups, tmp_path, "5deg 0.05") for groups in (table.groups, table.groups[:3]))
-    assert "at most 3 of 8 groups" in figures.omitted
+    assert "At most 3 of 8 groups" in figures.omitted
     assert whole.omitted == ""
     heights = [iio.imread(each.rates().with_suffix(".png")).shape[0] for each in (figures, whole)]
     assert heights[0] == heights[1]

@@ -631,7 +631,7 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     ):
         with pytest.raises(InputError, match=part):
             named(maps)
-    with pytest.raises(InputError, match="expected 16 or more"):
+    with pytest.raises(InputError, match="expected at least 16"):
         service_app("MAP", token="short")
     with pytest.raises(InputError, match="timeout is 0"):
         ServiceConfig(timeout=0)

@@ -110,7 +110,8 @@ def _advice(report: CaptureReport) -> Iterator[str]:
         yield f"there are no photos in {_between(gap)}: take some there, every 10 to 15°"
     if covered.open_side is not None:
         yield (
-            f"nothing was photographed in {_between(covered.open_side)}: take more photos there if you expect queries from that side"
+            f"there are no photos from {_between(covered.open_side)}: take some there if you expect queries"
+            " from that side"
         )
     low, high = covered.heights_deg
     if covered.arrangement in ("around", "one side") and high - low < SAME_HEIGHT:

@@ -74,7 +74,7 @@ def _of_inverses() -> Iterator[Reading]:
         also = f", of cameras whose right, down and forward are {_named(axes)}"
         yield Reading(
             f"they are inverses (world to camera){'' if axes in (AS_GIVEN, Y_AND_Z_REVERSED) else also}",
-            f"invert each, and if they are then refused again, {SWAP}",
+            f"invert each, and if they are then rejected again, {SWAP}",
             partial(_inverse_with_axes, axes=_matrix(axes)), axes, True,
         )  # fmt: skip
 

@@ -94,7 +94,7 @@ class Record3DFrame:
         return (self.stem,)
 
     def file(self, kind: str) -> str:
-        """Return the name of its "jpg", "depth" or "conf"."""
+        """Return the name of the frame's "jpg", "depth" or "conf" file."""
         return f"rgbd/{self.number}.{kind}"
 
 

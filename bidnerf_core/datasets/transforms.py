@@ -152,7 +152,8 @@ class TransformsDataset(SplitDataset[FrameRecord]):
                 self._scaled.add((width, height, *expected))
                 remark(
                     frame.record.where,
-                    f"{path.name} is {width}x{height}, w and h say {expected[0]}x{expected[1]}; cameras are scaled to the images",
+                    f"{path.name} is {width}x{height}, but w and h are {expected[0]}x{expected[1]}; cameras are"
+                    " scaled to the images",
                 )
             return expected
         if (width, height) != expected:

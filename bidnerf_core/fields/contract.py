@@ -115,7 +115,7 @@ class HitField(RadianceField, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """The pieces of a field that consists of some, as points for drawing without ray casting."""
+    """The pieces of a field (splats, triangles, discs) as points, for drawing without ray casting."""
 
     positions: Float[Tensor, "n 3"]  # metres, world
     rgb: Float[Tensor, "n 3"]  # in [0, 1], independent of direction

@@ -277,7 +277,7 @@ class SplittingSampler(RaySampler, Protocol):
 def _split(
     sampler: RaySampler, rays: Rays, count: int, jitter: Generator | None
 ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
-    """Split any sampler's intervals, gathered, as a ``SplittingSampler`` does."""
+    """Gather any sampler's intervals and split them by count, as a ``SplittingSampler`` does."""
     if isinstance(sampler, SplittingSampler):
         few, many, rest = sampler.split_by_count(rays, count, jitter)
         return gathered(few), many, gathered(rest)

@@ -160,7 +160,7 @@ def photo_of(mask: str) -> str:
 def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
     """Return one sentence on how much of some images is hidden; None if nothing is.
 
-    Masks that hide most of most images may be inverted, and the sentence says so.
+    If most images are mostly hidden, the sentence adds that the masks may be inverted.
     """
     shares = [float(pixels.float().mean()) for pixels in hidden if pixels is not None]
     if not shares:

@@ -42,7 +42,7 @@ from bidnerf_core.training import TrainingState
 log = logging.getLogger("bidnerf")
 
 SMALLEST, LARGEST = 0.05, 500.0
-"""Metres: longest sides of a scene outside which its lengths are hardly in metres."""
+"""Range of plausible longest sides of a scene (metres); outside it, lengths are probably in another unit."""
 RAYS_WITH_DEPTH = 4096
 SAME_LENGTH = 0.03
 """Relative difference between rendered and measured depth that is not worth reporting."""

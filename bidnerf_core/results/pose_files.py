@@ -272,7 +272,7 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
     if len(poses) == 1:
         return next(iter(poses.values()))
     if name not in poses:
-        raise InputError(f"{path}: no pose of {name!r} among its {len(poses)}{spelling_hint(name, poses)}")
+        raise InputError(f"{path}: no pose named {name!r} among its {len(poses)}{spelling_hint(name, poses)}")
     return poses[name]
 
 

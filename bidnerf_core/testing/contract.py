@@ -71,7 +71,7 @@ class BackendContract(Subject):
 
     def test_build_gives_a_field(self) -> None:
         field = self._build()
-        who = f"{called(self._backend())}.build gives a {type(field).__name__}"
+        who = f"{called(self._backend())}.build returned a {type(field).__name__}"
         require_that(
             isinstance(field, nn.Module), f"{who}, expected an nn.Module, whose state_dict is what is saved"
         )
@@ -83,8 +83,8 @@ class BackendContract(Subject):
         for name, value in first.items():
             require_that(
                 torch.equal(value, second[name]),
-                f"{called(self._backend())}.build: {name!r} differs between two builds of one config, expected its chance"
-                " to come from a seed in the config",
+                f"{called(self._backend())}.build: {name!r} differs between two builds of one config,"
+                " expected all randomness to come from a seed in the config",
             )
 
     # The field's values, at each of its levels.

@@ -74,7 +74,8 @@ def check_steps(field: RadianceField) -> None:
                 _second_order(problem, number, mode)
         same = close(found, expected, 1e-3)
         require_that(
-            same, f"{who}: steps on another device lead elsewhere than on the CPU; is some state not moved?"
+            same,
+            f"{who}: steps on another device lead to a different pose than on the CPU; is some state not moved?",
         )
 
 

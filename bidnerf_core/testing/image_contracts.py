@@ -50,8 +50,8 @@ class FeaturesContract:
             )
             require_that(
                 found.descriptors.dtype == torch.uint8,
-                f"{who}: descriptors are {found.descriptors.dtype}, expected bytes; bidnerf_core.mapping.landmarks.features.quantized"
-                " makes them of numbers",
+                f"{who}: descriptors are {found.descriptors.dtype}, expected bytes;"
+                " bidnerf_core.mapping.landmarks.features.quantized converts numbers to bytes",
             )
             inside = (found.pixels >= 0).all() and (found.pixels <= torch.tensor([width, height])).all()
             require_that(bool(inside), f"{who}: keypoints lie outside the image")
@@ -136,7 +136,7 @@ class FaultContract:
         found = self._changed(frame, neutral)
         require_that(
             _close(found, frame) and found.intrinsics == frame.intrinsics,
-            f"fault {self.name!r}: its neutral size {neutral:g} changes the image, expected it as it was",
+            f"fault {self.name!r}: its neutral size {neutral:g} changes the image, expected it unchanged",
         )
 
     def test_other_sizes_change_something(self) -> None:
@@ -153,7 +153,7 @@ class FaultContract:
             first, second = (self._changed(_frame(), size) for _ in range(2))
             require_that(
                 _same(first, second),
-                f"fault {self.name!r}: two calls with one seed differ, expected all chance to come from the generator",
+                f"fault {self.name!r}: two calls with one seed differ, expected all randomness to come from the generator",
             )
 
     def test_image_stays_an_image(self) -> None:
@@ -194,7 +194,8 @@ class FaultContract:
         except InputError:
             return
         require_that(
-            False, f"fault {self.name!r} changes depth, but takes an image without, expected an InputError"
+            False,
+            f"fault {self.name!r} changes depth, but accepts an image without it, expected an InputError",
         )
 
     def _fault(self) -> Fault:

@@ -86,7 +86,8 @@ class MethodContract:
         first, second = (self._found(textured_map(surface=True)).T_world_camera.matrix() for _ in range(2))
         require_that(
             torch.equal(first, second),
-            f"method {self.name!r}: two calls with one seed give different poses, expected all chance to come from it",
+            f"method {self.name!r}: two calls with one seed give different poses, expected all randomness to"
+            " come from it",
         )
 
     def test_pose_moves_with_the_world(self) -> None:

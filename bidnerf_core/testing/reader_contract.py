@@ -85,7 +85,7 @@ class ReaderContract:
             frame, who = view.frame, f"reader {self.name!r}, {view.frame.name}"
             shape = frame.intrinsics.height, frame.intrinsics.width
             require_that(
-                tuple(frame.rgb.shape) == (*shape, 3), f"{who}: the intrinsics are of another size: {shape}"
+                tuple(frame.rgb.shape) == (*shape, 3), f"{who}: the intrinsics have another size: {shape}"
             )
             require_that(
                 bool((frame.rgb >= 0).all() and (frame.rgb <= 1).all()), f"{who}: colours are not from 0 to 1"
@@ -117,15 +117,17 @@ class ReaderContract:
         ratio = depth_ratio(seen.sightings, points, tracked.depth[seen.number])
         require_that(
             ratio is None or abs(ratio - 1) <= UNUSUAL_RATIO,
-            f"reader {self.name!r}: depth is {ratio or math.nan:.3g} times as long as the poses and the images say, expected"
-            " planar z (not the distance along the ray) in the unit of the poses, metres",
+            f"reader {self.name!r}: depth is {ratio or math.nan:.3g} times the depth that the poses and"
+            " images imply, expected planar z (not the distance along the ray) in the unit of the poses,"
+            " metres",
         )
 
     def test_sequence_is_in_order_of_time(self) -> None:
         sequence: FrameSequence = self._opened("open_sequence")
         times = [entry.time for entry in sequence]
         require_that(
-            len(times) == len(sequence), f"reader {self.name!r}: the sequence has another length than it says"
+            len(times) == len(sequence),
+            f"reader {self.name!r}: the sequence has a different length than it states",
         )
         known = [time for time in times if time is not None]
         require_that(
@@ -162,7 +164,9 @@ class ReaderContract:
 
     def _dataset(self) -> Dataset:
         data: Dataset = self._opened("open")
-        require_that(isinstance(data, Dataset), f"reader {self.name!r}: open gives a {type(data).__name__}")
+        require_that(
+            isinstance(data, Dataset), f"reader {self.name!r}: open returned a {type(data).__name__}"
+        )
         return data
 
     def _views(self, split: str | None = None) -> list[View]:

@@ -123,14 +123,15 @@ def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
     told = [(progress.step, progress.total) for progress in report.steps]
     require_that(
         told == [(i + 1, total) for i in range(total)],
-        f"{who}: report.step was called with {_shortly(told)}, expected (1, {total}) to ({total}, {total}), one a step",
+        f"{who}: report.step was called with {_shortly(told)}, expected (1, {total}) to ({total}, {total}),"
+        " once per step",
     )
     odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
     require_that(not odd, f"{who}: reported a loss or PSNR that is not finite: {odd[:1]}")
     saved = [state.step for state in report.saved]
     require_that(
         saved == due,
-        f"{who}: saved after steps {saved}, expected {due}: whenever report.due(step) says so, and only then",
+        f"{who}: saved after steps {saved}, expected {due}: exactly when report.due(step) is True",
     )
     _require_same(
         report.saved[-1].field,
@@ -177,7 +178,7 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
         _state_of(third),
         _state_of(first),
         f"{who}: a resumed training arrives elsewhere than an uninterrupted one, expected the same bits; is all state in"
-        " state_dict, and all chance from the generator that is saved?",
+        " state_dict, and all randomness from the saved generator?",
     )
 
 

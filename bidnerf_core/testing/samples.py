@@ -60,12 +60,13 @@ def check_repeatable(field: RadianceField) -> None:
     with torch.random.fork_rng(devices=[]):
         twice = [sample(field, rays, "rays") for _ in range(2)]
         require_that(
-            _same(*twice), f"{who}: two calls without jitter differ, expected no chance without a generator"
+            _same(*twice),
+            f"{who}: two calls without jitter differ, expected no randomness without a generator",
         )
         jittered = [sample(field, rays, "rays with jitter", _generator()) for _ in range(2)]
     require_that(
         _same(*jittered),
-        f"{who}: two calls with jitter of the same seed differ, expected all chance to come from the given generator",
+        f"{who}: two calls with jitter of the same seed differ, expected all randomness to come from the given generator",
     )
 
 

@@ -86,8 +86,8 @@ def check_threads(field: RadianceField) -> None:
         answers = list(pool.map(ask, range(THREADS * ROUNDS)))
     require_that(
         all(close(answer, alone[i % THREADS]) for i, answer in enumerate(answers)),
-        f"{type(field).__name__}.query: several threads that ask at once get other values than one; expected query"
-        " to keep nothing on self",
+        f"{type(field).__name__}.query: concurrent threads get different values from a single one; expected"
+        " query to store nothing on self",
     )
 
 

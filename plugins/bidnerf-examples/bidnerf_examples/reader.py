@@ -99,7 +99,7 @@ class PoseTable(Dataset):
 class PoseTableReader(Reader):
     """The object that the entry point names."""
 
-    expected = f"{TABLE} and {CAMERA} beside images"
+    expected = f"{TABLE} and {CAMERA} next to images"
 
     def recognises(self, path: Path) -> bool:
         return (path / TABLE).is_file() and (path / CAMERA).is_file()

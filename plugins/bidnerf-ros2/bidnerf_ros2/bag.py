@@ -160,7 +160,8 @@ def _topics(path: Path) -> Topics:
     if not colour:
         listed = ", ".join(sorted({*counts, *infos})) or "none"
         raise InputError(
-            f"{path}: no topic of colour images with a camera_info beside it, expected one; its images and infos: {listed}"
+            f"{path}: no topic of colour images with a matching camera_info, expected one; its images and"
+            f" infos: {listed}"
         )
     image = max(colour, key=lambda topic: (counts[topic], not hasattr(first[topic], "format")))
     info = _info_beside(image, infos)

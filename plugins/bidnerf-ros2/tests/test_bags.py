@@ -64,7 +64,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "junk.bag").write_bytes(b"junk")
     with pytest.raises(InputError, match=r"junk\.bag: not a readable bag"):
         open_sequence(tmp_path / "junk.bag")
-    with pytest.raises(InputError, match="no topic of colour images with a camera_info"):
+    with pytest.raises(InputError, match="no topic of colour images with a matching camera_info"):
         open_sequence(bags.write(tmp_path / "empty", [], CAMERA))
     (file,) = path.glob("*.mcap")
     file.write_bytes(file.read_bytes()[:3000])
