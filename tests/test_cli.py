@@ -424,7 +424,7 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
     )
     assert_refused(bidnerf(*resume, interrupted, "--split", "test"), 1, "'test'", "expected those of 'data'")
     assert_refused(bidnerf(*resume, interrupted, "--steps", "99"), 2, "started with steps 12, got 99")
-    assert_refused(bidnerf(*resume, interrupted, "--overwrite"), 2, "expected one of them")
+    assert_refused(bidnerf(*resume, interrupted, "--overwrite"), 2, "expected only one of them")
     assert_refused(
         bidnerf(*resume, interrupted, "--background", "black"),
         2,

@@ -338,7 +338,7 @@ def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -
     good = (tmp_path / "good.spz").read_bytes()
     unpacked = gzip.decompress(good)
     parts = sog_parts()
-    no_image = parts | {"quats.webp": b"no image"}
+    no_image = parts | {"quats.webp": b"not a readable image"}
     huge = json.loads(parts["meta.json"]) | {"count": 10**12}
     cases: dict[str, tuple[bytes, str]] = {
         "huge.ply": (inria(10**12), "too few"),
@@ -371,7 +371,7 @@ def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -
         write_sog(tmp_path / name, content)
         cases[name] = (
             (tmp_path / name).read_bytes(),
-            "no image" if name[0] == "n" else "declares 1000000000000",
+            "not a readable image" if name[0] == "n" else "declares 1000000000000",
         )
     for name, (content, message) in cases.items():
         path = tmp_path / name
