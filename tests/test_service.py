@@ -638,4 +638,4 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
     status, _, err = bidnerf("serve", place.folder / "data")
     assert status == 1
-    assert "no map.json in it" in err
+    assert "no map.json found" in err
