@@ -62,9 +62,13 @@ SOUND = SurfaceDiagnostics(
 @pytest.mark.parametrize(
     ("changed", "expected", "words"),
     [
-        ({}, Outcome.CONVERGED, "100% of the measured points have the surface's place and colour"),
+        ({}, Outcome.CONVERGED, "100% of the measured points match the surface in position and colour"),
         ({"on_surface": 0.8}, Outcome.OFF_SURFACE, "only 80% of the measured points lie on the surface"),
-        ({"colour_inliers": 0.3}, Outcome.COLOUR_MISMATCH, "only 30% of the measured points have the colour"),
+        (
+            {"colour_inliers": 0.3},
+            Outcome.COLOUR_MISMATCH,
+            "only 30% of the measured points have the surface's colour",
+        ),
         (
             {"free_space_violations": 0.2},
             Outcome.FREE_SPACE_VIOLATED,
@@ -103,14 +107,14 @@ def refined(
 @pytest.mark.parametrize(
     ("found", "expected", "words"),
     [
-        (refined(), Outcome.CONVERGED, "100% of fresh rays agree"),
+        (refined(), Outcome.CONVERGED, "100% of newly drawn rays agree"),
         (refined(inliers=0.93, step=0.02), Outcome.CONVERGED, "93%"),
-        (refined(inliers=0.9), Outcome.RENDERING_MISMATCH, "90% of fresh rays agree .*, expected 93%"),
+        (refined(inliers=0.9), Outcome.RENDERING_MISMATCH, "90% of newly drawn rays agree .*, expected 93%"),
         (refined(inliers=math.nan), Outcome.RENDERING_MISMATCH, "expected 93%"),
         (refined(step=0.03), Outcome.NOT_SETTLED, "a step of 0.03, expected 0.02 at most"),
         (refined(step=math.nan), Outcome.NOT_SETTLED, "expected 0.02 at most"),
-        (refined(covariance=math.inf), Outcome.UNDETERMINED, "does not determine the pose"),
-        (refined(support=replace(SUPPORTED, plain=0.5)), Outcome.UNDETERMINED, "of a single colour"),
+        (refined(covariance=math.inf), Outcome.UNDETERMINED, "do not determine the pose"),
+        (refined(support=replace(SUPPORTED, plain=0.5)), Outcome.UNDETERMINED, "a single-colour image"),
         (refined(support=replace(SUPPORTED, displaced=0.5)), Outcome.UNDETERMINED, "displaced by 10%"),
         (
             refined(support=replace(SUPPORTED, other=0.5)),

@@ -172,7 +172,7 @@ def test_a_field_that_does_not_show_the_surface_hardly_moves_the_pose() -> None:
     assert float(moved.rotation_deg) < 2.0
     assert not found.converged
     assert found.outcome is Outcome.RENDERING_MISMATCH
-    assert "of the rendered rays agree with what was measured" in found.reason
+    assert "of the rendered rays agree with the measurements" in found.reason
 
 
 def test_an_image_of_something_else_is_not_found() -> None:
@@ -264,4 +264,4 @@ def test_a_few_depth_rays_are_too_little_to_search_by() -> None:
     found = localize(problem, "auto", quick)
     alone = localize(problem.without_depth(), "auto", quick)
     assert torch.equal(found.T_world_camera.matrix(), alone.T_world_camera.matrix())
-    assert "fresh rays" in found.reason
+    assert "newly drawn rays" in found.reason

@@ -182,7 +182,7 @@ def test_depth_of_another_unit_is_left_out(scale: float) -> None:
     assert_within(found.T, 0.004, 0.1)
     problem = rig(textured_map(surface=True), (view,), None, matcher=matcher())
     reason = localization_by_landmarks(problem, found, 0.0).reason
-    assert f"without depth: it is {1 / found.found.depth_scale:.3g} times as long as by landmarks" in reason
+    assert f"without depth: it is {1 / found.found.depth_scale:.3g} times that of the landmarks" in reason
 
 
 def _at(found: FusedPose, T: SE3) -> FusedPose:
@@ -267,7 +267,7 @@ def test_auto_takes_landmarks_first_with_a_start_or_without() -> None:
     start = TRUTH.retract(torch.full((6,), 0.5, dtype=torch.float64))  # far off: it must not matter
     for found in (localized(without_depth(unseen())), localized(without_depth(unseen()), start=start)):
         assert found.outcome is Outcome.CONVERGED
-        assert "landmarks agree" in found.reason
+        assert "landmark inliers" in found.reason
         assert_within(found.T_world_camera, 0.02, 0.5)
 
 
@@ -354,7 +354,7 @@ def test_an_image_of_another_place_is_rejected(depth: bool) -> None:
     other = textured_field.view(TRUTH, "other", seed=1)
     found = localized(other if depth else without_depth(other), textured_map(surface=True))
     assert not found.converged
-    assert "landmarks agree within" not in found.reason
+    assert "landmark inliers within" not in found.reason
 
 
 def blank(grey: float = 0.5) -> View:
@@ -411,7 +411,7 @@ def test_an_answer_of_the_surface_is_refined_by_landmarks_near_it(monkeypatch: p
 
 
 def few_by_chance(problem: Problem, off: Tensor) -> LandmarkPose:
-    """Return a pose that is wrong, with which 20 landmarks agree."""
+    """Return a wrong pose with 20 landmark inliers."""
     found = propose(matcher(), problem.views, seed=0)
     assert found is not None
     few = slice(0, 20)

@@ -837,7 +837,7 @@ def test_no_start_is_refused_by_methods_that_need_one(bidnerf: Run, shared: Path
     found = bidnerf(
         "localize", shared / "map", shared / "data", "--frame", "t_0000", "--no-start", "--method", "bid"
     )
-    assert_refused(found, 1, "'bid' needs a start", "give one by --start, or take method 'auto'")
+    assert_refused(found, 1, "'bid' needs a start", "give one by --start, or use method 'auto'")
 
 
 def test_a_backend_whose_module_has_no_docstring_is_listed_with_its_own_summary(

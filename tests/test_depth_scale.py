@@ -122,7 +122,7 @@ def test_a_scale_is_plausible_as_far_as_sensor_and_landmarks_may_err() -> None:
         assert DepthScale(0.02, 1 + sign * 0.99 * most).objection is None
         assert DepthScale(0.02, 1 + sign * 1.01 * most).objection is not None
         assert DepthScale(0.06, 1 + sign * 1.01 * most).objection is None
-    assert DepthScale(0.02, 0.2).objection == "it is 5 times as long as by landmarks"
+    assert DepthScale(0.02, 0.2).objection == "it is 5 times that of the landmarks"
 
 
 def test_a_cost_of_the_pose_says_nothing_of_the_errors_of_depth(generator: Generator) -> None:

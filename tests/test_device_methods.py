@@ -99,7 +99,7 @@ def test_auto_by_colour(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
     monkeypatch.setattr(by_image_search, "IMAGE_STAGES", few)
     monkeypatch.setattr(by_image_search, "DETAILED_STAGES", few)
     here = on_both(blobs(), replace(frame, rgb=rgb), **BY_COLOUR | {"rounds": rounds})
-    assert "fresh rays" in here.reason
+    assert "newly drawn rays" in here.reason
 
 
 @pytest.mark.parametrize("depth", [True, False])

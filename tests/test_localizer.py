@@ -121,7 +121,7 @@ MIRRORED[:3, 0] *= -1
         (FRAME, "pose.json", "start is a str, expected an SE3 or a 4x4 matrix"),
         (FRAME, [[10**400] * 4] * 4, "start is a list, expected an SE3 or a 4x4 matrix"),
         (FRAME, SE3.stack([START, START]), "start holds 2 poses, expected one"),
-        (FRAME, None, "method 'bid' needs a start; give one, or take a method that needs none"),
+        (FRAME, None, "method 'bid' needs a start; give one, or use a method that needs none"),
         (
             [FRAME, FRAME],
             START,

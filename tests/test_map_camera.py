@@ -190,7 +190,7 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
     found = localized(replace(landmarks, calibration_scatter=scatter), with_focal(1.05))
     verdict = landmark_verdict(found)
     assert verdict.outcome is Outcome.MISCALIBRATED
-    assert "do not tell whether" in verdict.reason
+    assert "do not show whether" in verdict.reason
     assert found.guided is not None
     other = found.guided.posterior.riskiest
     assert other is not None

@@ -162,7 +162,7 @@ def test_a_pose_is_found_behind_something_of_which_more_was_measured(
     found = found_for(view)
     error = pose_error(found.T_world_camera, view.T_ref_camera)
     assert found.converged, found.reason
-    assert "which are on something in front" in found.reason
+    assert "which are on an occluder" in found.reason
     assert float(error.translation) < 0.05
     assert float(error.rotation_deg) < 1.5
     with monkeypatch.context() as patch:

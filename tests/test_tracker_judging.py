@@ -18,7 +18,7 @@ from bidnerf_core.localization.tracking.measuring import (
 from bidnerf_core.localization.tracking.surface import measured_cloud
 from flights import flight_frame, without_depth
 
-ACCEPTED = Verdict(Outcome.CONVERGED, "30 landmarks agree")
+ACCEPTED = Verdict(Outcome.CONVERGED, "30 landmark inliers")
 
 
 def covariance(translation: float) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Finding poses: ``Localizer`` and ``Tracker``, the methods by name, their settings, and the parts they are made of."""
+"""Localization: ``Localizer`` and ``Tracker``, the methods by name, their settings, and their building blocks."""
 
 from bidnerf_core.geometry.se3 import pose_from_matrix
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, answer_by_landmarks

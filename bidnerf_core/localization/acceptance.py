@@ -1,7 +1,7 @@
-"""Acceptance: decide whether to trust an answer, without knowledge of the true pose.
+"""Acceptance: decide whether to trust a pose, without ground truth.
 
-The answers of all methods are judged here. The code that finds an answer measures its diagnostics; thresholds turn these
-into an ``Outcome`` and a sentence.
+The poses of all methods are checked here. The code that finds a pose computes its diagnostics, from which thresholds give an
+``Outcome`` and a sentence.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from bidnerf_core.localization.settings import RenderedThresholds
 from bidnerf_core.mapping.surface.casting import trace
 
 WELL_BEFORE = 0.04
-"""Share of the extent by which a line of sight must meet the surface too early to count as a violation."""
+"""Fraction of the extent by which a line of sight must hit the surface too early to count as a violation."""
 SIGHT_LINES = 300
-"""Largest number of lines of sight that are traced."""
+"""Maximum number of lines of sight that are traced."""
 FLAT = 0.02
-"""Standard deviation of an image's colours, in [0, 1], below which a gain and a bias make any view fit it."""
-BLANK = Verdict(Outcome.UNDETERMINED, "the image is of a single colour, as if the lens were covered")
+"""Standard deviation of an image's colours, in [0, 1], below which a gain and a bias can fit any view to it."""
+BLANK = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
 AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
 
 
 @dataclass(frozen=True)
 class SurfaceThresholds:
-    """Thresholds for accepting an answer on the baked surface."""
+    """Thresholds for accepting a pose on the baked surface."""
 
-    on_surface: float = 0.85  # share of the measured points that lie on the surface, at least
-    colour_inliers: float = 0.42  # share that lies there and has its colour, at least
-    free_space_violations: float = 0.15  # share of lines of sight that pass through the surface, at most
-    runner_up_margin: float = 0.15  # by how much the next best answer must be worse
-    # share of rendered rays, those with depth if 5 % of them have it, that agree with what was measured, at least
+    on_surface: float = 0.85  # minimum fraction of the measured points on the surface
+    colour_inliers: float = 0.42  # minimum fraction of the measured points on the surface and with its colour
+    free_space_violations: float = 0.15  # maximum fraction of lines of sight that pass through the surface
+    runner_up_margin: float = 0.15  # margin by which the second-best pose must be worse
+    # minimum inlier fraction of the rendered rays, of those with depth if at least 5 % have it
     rendered_inliers: float = 0.8
 
 
 @dataclass(frozen=True)
 class SurfaceDiagnostics:
-    """Measures of how well a pose explains the measured points; all but the margin are shares between 0 and 1."""
+    """Measures of how well a pose explains the measured points; all but the margin are fractions between 0 and 1."""
 
     on_surface: float
     colour_inliers: float
     free_space_violations: float
     runner_up_margin: float
-    rendered_inliers: float = 1.0  # where nothing was rendered
+    rendered_inliers: float = 1.0  # 1 if nothing was rendered
     support: Support | None = None  # None: not compared with other poses
 
     def rejection(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict | None:
@@ -62,7 +62,7 @@ class SurfaceDiagnostics:
                 Outcome.OFF_SURFACE, f"only {self.on_surface:.0%} of the measured points lie on the surface"
             )
         if self.colour_inliers < thresholds.colour_inliers:
-            share = f"{self.colour_inliers:.0%} of the measured points have the colour of the surface"
+            share = f"{self.colour_inliers:.0%} of the measured points have the surface's colour"
             return Verdict(Outcome.COLOUR_MISMATCH, f"only {share}")
         if self.free_space_violations > thresholds.free_space_violations:
             share = f"{self.free_space_violations:.0%} of the lines of sight"
@@ -70,20 +70,20 @@ class SurfaceDiagnostics:
         if self.runner_up_margin < thresholds.runner_up_margin:
             return AMBIGUOUS
         if not self.rendered_inliers >= thresholds.rendered_inliers:
-            share = f"{self.rendered_inliers:.0%} of the rendered rays agree with what was measured"
+            share = f"{self.rendered_inliers:.0%} of the rendered rays agree with the measurements"
             return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}")
         return None if self.support is None else self.support.rejection()
 
     def verdict(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict:
-        share = f"{self.colour_inliers:.0%} of the measured points have the surface's place and colour"
+        share = f"{self.colour_inliers:.0%} of the measured points match the surface in position and colour"
         return self.rejection(thresholds) or Verdict(Outcome.CONVERGED, share)
 
 
 def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDiagnostics:
-    """Measure how well the points of ``judge``, placed by one pose, lie on the surface.
+    """Measure how well the points of ``judge``, transformed by one pose, fit the surface.
 
-    Each point counts by its inlier weight, so no hard threshold on single points is involved. Points without a colour are
-    left out of the colour inliers, unless no point has a colour.
+    Each point counts by its inlier weight, so there is no hard threshold on single points. Points without a colour do not count
+    for the colour inliers, unless no point has a colour.
     """
     near, alike = judge.inliers(judge.correspondences(T[None]))
     coloured = judge.cloud.coloured
@@ -94,32 +94,30 @@ def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDia
 
 @dataclass(frozen=True)
 class LandmarkDiagnostics:
-    """Measures of how well a pose explains the features of an image. None of them has a unit of length."""
+    """Measures of how well a pose explains the features of an image; none depends on the unit of length."""
 
     inliers: int  # correspondences within three standard deviations
     matches: int  # by descriptors alone
-    agreeing: int  # of these, those that agree with the pose
-    log10_nfa: float  # logarithm of the number of such agreements expected by chance
+    agreeing: int  # inliers among these matches
+    log10_nfa: float  # logarithm of the number of false alarms of this agreement
     chance: float  # correspondences expected at a wrong pose
     visible: int  # landmarks that should be visible
     keypoints: int  # in the images
-    spread: float  # share of the image's cells that hold a correspondence
-    noise_ratio: float  # reprojection noise over that of the map's own images
+    spread: float  # fraction of the image's cells that contain a correspondence
+    noise_ratio: float  # ratio of the reprojection noise to that of the map's own images
     miscalibration: float  # probability that the given intrinsics are wrong
-    precision: float  # standard deviation of the position by landmarks alone, over their distance
+    precision: float  # standard deviation of the position from landmarks alone, relative to their distance
     estimated_calibration: bool  # whether the intrinsics were estimated along with the pose
-    searched: bool  # whether landmarks found the pose, or only confirm one that was found on the surface
-    on_surface: float | None = None  # share of the measured points that lie on the surface
-    colour_inliers: float | None = None  # share that lies there and has its colour
-    rolling_shutter: bool = (
-        False  # whether the motion of the camera while its rows were exposed was estimated too
-    )
+    searched: bool  # whether landmarks found the pose, or only confirm one found on the surface
+    on_surface: float | None = None  # fraction of the measured points on the surface
+    colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
+    rolling_shutter: bool = False  # whether the camera's motion during the readout was estimated too
 
 
 def landmark_diagnostics(
     found: LandmarkPose, searched: bool = True, judge: SurfaceCost | None = None, T: SE3 | None = None
 ) -> LandmarkDiagnostics:
-    """Return the diagnostics of a pose by landmarks; ``judge`` holds measured points, if any, which ``T`` places."""
+    """Return the diagnostics of a pose by landmarks, and those of any measured points in ``judge`` at the pose ``T``."""
     near = both = None
     if judge is not None and T is not None:
         near_points, alike = judge.inliers(judge.correspondences(T[None]))
@@ -133,37 +131,35 @@ def landmark_diagnostics(
 
 @dataclass(frozen=True)
 class LandmarkThresholds:
-    """Thresholds for accepting a pose by landmarks. They have no units, so they suit every scene and image."""
+    """Thresholds for accepting a pose by landmarks. They are dimensionless, so they suit every scene and image."""
 
-    log10_nfa: float = -12.0  # logarithm of the number of such agreements expected by chance, at most
-    # correspondences within three standard deviations, at least; in proportion more if intrinsics are unknowns too
+    log10_nfa: float = -12.0  # maximum logarithm of the number of false alarms
+    # minimum number of correspondences within three standard deviations; proportionally more if intrinsics are estimated
     inliers: int = 15
-    above_chance: float = 3.0  # times as many as at a wrong pose, at least
-    spread: float = 0.06  # share of the image's cells that hold one, at least
-    # expected shift of the position by other intrinsics, probability times shift, as a share of the landmarks' distance, at most:
-    # the farther off a pose may be, the less probable that must be
+    above_chance: float = 3.0  # minimum ratio to the number expected at a wrong pose
+    spread: float = 0.06  # minimum fraction of the image's cells that contain a correspondence
+    # maximum expected shift of the position under other intrinsics (probability times shift), relative to the landmarks'
+    # distance: the larger the possible error, the less probable it must be
     expected_shift: float = 0.0025
-    precision: float = 0.03  # standard deviation of the position, as a share of that distance, at most
+    precision: float = 0.03  # maximum standard deviation of the position, relative to that distance
 
 
 def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
-    """Judge a pose by how many landmarks agree with it, compared with chance, and how much of the image they cover."""
-    share = f"{found.inliers} landmarks agree"
+    """Accept or reject a pose by its number of landmark inliers, compared with chance, and their coverage of the image."""
+    share = f"{found.inliers} landmark inliers"
     unknowns = 10 if found.estimates_calibration else 6
     if found.log10_nfa > thresholds.log10_nfa or found.inliers < thresholds.inliers * unknowns / 6:
         return Verdict(Outcome.TOO_FEW_MATCHES, f"only {share} ({found.agreeing} of {found.matches} matches)")
     if found.inliers < thresholds.above_chance * found.chance:
-        return Verdict(Outcome.AMBIGUOUS, f"{share}, about {found.chance:.0f} would by chance")
+        return Verdict(Outcome.AMBIGUOUS, f"{share}, but about {found.chance:.0f} are expected by chance")
     if found.spread < thresholds.spread:
         return Verdict(Outcome.UNDETERMINED, f"{share}, all in {found.spread:.0%} of the image")
     if not bool(found.covariance.isfinite().all()):
-        return Verdict(Outcome.UNDETERMINED, f"{share}, but do not determine the pose")
+        return Verdict(Outcome.UNDETERMINED, f"{share}, but they do not determine the pose")
     if found.expected_shift > thresholds.expected_shift:
         return Verdict(Outcome.MISCALIBRATED, f"{share}{_doubted(found)}")
     if found.better_camera is not None:
-        return Verdict(
-            Outcome.MISCALIBRATED, f"{share}, but far more would with {found.better_camera.sentence}"
-        )
+        return Verdict(Outcome.MISCALIBRATED, f"{share}, but far more with {found.better_camera.sentence}")
     if found.calibration.is_stretched and not found.takes_map_camera:
         return Verdict(Outcome.MISCALIBRATED, f"{share}, but only with {found.calibration.sentence}")
     deviation = position_deviation(found.stated_covariance + found.doubt.covariance)
@@ -184,47 +180,49 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
 
 
 def _doubted(found: LandmarkPose) -> str:
-    """Return what speaks for other intrinsics than those with which a pose was found."""
+    """Return the part of the reason that explains why other intrinsics may be right."""
     taken = " with the map's intrinsics" if found.takes_map_camera else ""
     taken = " with estimated intrinsics" if found.estimates_calibration else taken
     with_taken = f"{taken} ({found.calibration.sentence})" if taken else ""
     if not found.doubt.other_is_known:
         return f"{with_taken}, but they suggest {found.doubt.other.sentence}"
     if found.estimates_calibration:
-        return f"{with_taken}, but do not tell whether the given ones are right"
+        return f"{with_taken}, but they do not show whether the given ones are right"
     other = found.calibration if found.takes_map_camera else found.doubt.other
     choice = "the given intrinsics or those of the map's images"
-    return f", but do not tell whether {choice} are right: {other.sentence}"
+    return f", but they do not show whether {choice} are right: {other.sentence}"
 
 
 def is_blank(frame: Frame) -> bool:
-    """Return whether the image is of a single colour, as if the lens were covered, or the frame has no colours at all."""
+    """Return whether the image has a single colour, as if the lens were covered, or the frame has no colours at all."""
     shown = frame.rgb.flatten(0, 1) if frame.hidden is None else frame.rgb[~frame.hidden]
     return not frame.has_colour or float(shown.std(0, correction=0).max()) < FLAT
 
 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
-    """Return the share of lines of sight that meet the surface well before the point that was measured."""
+    """Return the fraction of lines of sight that hit the surface well before the measured point."""
     some, surface = cost.cloud.first(SIGHT_LINES), cost.surface
     T = T.to(surface.device)
     origins, ends = (T.apply(x.double()).to(some.points) for x in (some.origins, some.points))
     length = torch.linalg.vector_norm(ends - origins, dim=-1)
     met = trace(surface, origins, (ends - origins) / length.clamp(min=1e-9)[:, None])
-    # Grazing lines meet coarse cells early.
+    # Grazing rays hit coarse cells early.
     slack = max(WELL_BEFORE * surface.extent, 4 * surface.cell)
     return float((met < length - slack).float().mean())
 
 
 def rendered_verdict(found: RefinementResult, thresholds: RenderedThresholds) -> Verdict:
-    """Judge a pose by fresh rendered rays: how many agree, and how much better than with other poses or a single colour."""
+    """Accept or reject a pose by newly drawn rays: their inliers, and their support against rival poses and a plain image."""
     if not bool(found.covariance.isfinite().all()):
-        return Verdict(Outcome.UNDETERMINED, "what was measured does not determine the pose")
-    share = f"{found.inliers:.0%} of fresh rays agree with what was measured"
+        return Verdict(Outcome.UNDETERMINED, "the measurements do not determine the pose")
+    share = f"{found.inliers:.0%} of newly drawn rays agree with the measurements"
     if not found.inliers >= thresholds.converged_inliers:
         return Verdict(Outcome.RENDERING_MISMATCH, f"{share}, expected {thresholds.converged_inliers:.0%}")
     if not found.step <= thresholds.converged_step:
         most = f"expected {thresholds.converged_step:g} at most"
-        return Verdict(Outcome.NOT_SETTLED, f"fresh rays ask for a step of {found.step:.3g}, {most}")
+        return Verdict(
+            Outcome.NOT_SETTLED, f"newly drawn rays give a further step of {found.step:.3g}, {most}"
+        )
     return found.support.rejection() or Verdict(Outcome.CONVERGED, share)
 
 
@@ -240,9 +238,9 @@ class DescentDiagnostics:
 def descent_verdict(
     mean_loss: float, threshold: float, finite: bool, reason: str, found: Support, least_explained: float
 ) -> Verdict:
-    """Judge a first-order descent by the mean loss of its last steps, and by how well other rays support its answer.
+    """Accept or reject the result of a first-order descent by the mean loss of its last steps and its support by other rays.
 
-    ``reason`` explains why it ended. At a wrong pose, images of little contrast have a small loss too.
+    ``reason`` explains why it ended. Low-contrast images have a small loss even at a wrong pose.
     """
     if not finite or not math.isfinite(mean_loss):
         return Verdict(Outcome.DIVERGED, reason)

@@ -1,10 +1,10 @@
-"""Other explanations of an image than the pose that was found, and the decision between them.
+"""Alternative explanations of an image, and the decision between them and the pose that was found.
 
-Errors of a camera's intrinsics leave an image's keypoints matched to the same landmarks, and ``landmarks/hypotheses`` weighs
-them. Here are explanations with other matches or from another side: the image shows the scene as in a mirror, it shows another
-place that looks the same, or a plane from its other side of the line of sight. What is known for free comes first: a start, and
-how many landmarks match. Where this leaves it open, what the field renders for both is compared. Keypoints are few and in a few
-places; thousands of rendered rays cover the whole image.
+Wrong intrinsics leave keypoints matched to the same landmarks, and are handled by ``landmarks/hypotheses``. The explanations
+here have other matches or another viewpoint: the image is mirrored, it shows another place that looks the same, or the pose is
+the second solution of a planar scene. The start and the number of matching landmarks, which cost nothing, are used first. If
+they do not decide, renderings of both explanations are compared, because thousands of rays cover the whole image, whereas
+keypoints are few and clustered.
 """
 
 from __future__ import annotations
@@ -36,51 +36,51 @@ from bidnerf_core.localization.settings import ColourSettings, RefinementSetting
 from bidnerf_core.localization.solvers.pivots import pivot
 
 BY_START = 6.0
-"""Log odds for each factor e between the motions from a start: in six dimensions, a normal distribution of unknown width about
-the start has a density that falls with their sixth power.
+"""Log odds per factor e between the distances from a start: in six dimensions, the density of a normal distribution of unknown
+width about the start falls with the sixth power of the distance.
 """
 UNMISTAKABLE = -150.0
-"""Logarithm of the number of false alarms below which an image is not compared with its mirror image."""
+"""Log10 of the number of false alarms below which an image is not compared with its mirror image."""
 SIGNIFICANT = -20.0
-"""Largest logarithm of an image's number of false alarms with which that of its mirror image is compared: a few chance matches of
-the mirror image say nothing about an image with even fewer.
+"""Upper limit of an image's log10 number of false alarms in the comparison with its mirror image's: a few chance matches of the
+mirror image are no evidence against an image with even fewer.
 """
 UNTOLD = 0.5
 """Log odds below which two explanations are called equally likely: probabilities of 38 % to 62 %."""
 AT_COPIES = 6.0
-"""Log odds by renderings that errors of the two poses alone may bring about, even at exact copies of a place."""
+"""Log odds by rendering that errors of the two poses alone can produce, even at exact copies of a place."""
 COMPARED_RAYS = 8192
-"""Number of rays on which two explanations are compared; fewer if fewer pixels are not hidden."""
+"""Number of rays on which two explanations are compared; fewer if fewer pixels are visible."""
 FITTED = RefinementStage(steps=5, rays=1024)
-"""The steps to the pose that suits an explanation best. The comparison draws other rays."""
+"""The steps to the best pose for an explanation. The comparison draws other rays."""
 NOISIEST = 0.15
-"""Colour noise of a field on its own training images above which it provides no evidence: it has hardly been trained."""
+"""Colour noise of a field on its training images above which it provides no evidence, as it is hardly trained."""
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another explanation of images."""
+    """An alternative explanation of the images."""
 
-    log_odds: float  # of the pose that was found against it, by what is known for free
+    log_odds: float  # of the found pose against it, before rendering
     reason: str
-    # Returns the images and, as the start, the pose that explain them so, or None if there is no such pose.
+    # Returns the images and, as the start, the pose of this explanation; None if there is no such pose.
     problem: Callable[[], Problem | None]
     rival: Rival | None = None  # the other pose; None for a mirror image
 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """What other explanations mean for a pose."""
+    """The result of comparing a pose with its alternatives."""
 
-    rejection: Verdict | None = None  # None: it stays
-    better: Rival | None = None  # the pose that is right in its place
+    rejection: Verdict | None = None  # None: the pose is kept
+    better: Rival | None = None  # the pose that is right instead
 
 
 def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed: int) -> Decision:
-    """Decide between a pose of a problem, ``T``, and all other explanations.
+    """Decide between the pose ``T`` of a problem and all alternative explanations.
 
-    ``found``: what landmarks say about that pose, if they match there. The start of ``problem`` is what was known before. Where
-    that leaves it open, renderings of both explanations are compared, unless ``rays`` is 0.
+    ``found`` is the pose by the landmarks that match there, if any. The start of ``problem`` is prior knowledge. If these do not
+    decide, renderings of both explanations are compared, unless ``rays`` is 0.
     """
     here = replace(problem if found is None else corrected(problem, found), start=T)
     for other in _alternatives(problem, here, found, seed):
@@ -113,7 +113,7 @@ def _in_words(odds: float) -> str:
 def pose_at(
     problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, rival: Rival
 ) -> LandmarkPose | None:
-    """Return the pose by landmarks at a rival of ``found``, or None if too few match there or correct the camera once more."""
+    """Return the pose by landmarks at a rival of ``found``; None if too few match or the camera is corrected once more."""
     cameras = [view.frame.intrinsics for view in problem.views]
     seen = [
         replace(view, frame=replace(view.frame, intrinsics=found.intrinsics_of(camera) or camera))
@@ -122,7 +122,7 @@ def pose_at(
     there = confirm(matcher, seen, rival.T_world_rig, rival=found.T_world_camera).pose
     if there is None or found.intrinsics_of(cameras[-1]) is None:
         return there
-    if there.changes_camera:  # of two corrections, one after the other, nothing keeps account
+    if there.changes_camera:  # successive corrections are not composed
         return None
     return replace(
         there, calibration=found.calibration, calibration_deviations=found.calibration_deviations,
@@ -142,7 +142,7 @@ def _alternatives(
         T, there = found.T_world_camera, rival.T_world_rig
         apart = float((there.translation - T.translation).norm())
         if apart <= LandmarkThresholds().precision * found.distance:
-            continue  # the answer is as right as it has to be
+            continue  # the pose is accurate enough either way
         odds = rival.log_odds
         if problem.start is not None:
             odds += _log_odds_by_start(problem.start, T, there, found.distance)
@@ -150,7 +150,7 @@ def _alternatives(
 
 
 def _mirror(problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: int) -> Alternative:
-    """Return the mirror image of the last view; ``log10_nfa``: of the pose of the view itself."""
+    """Return the alternative that the last view is mirrored; ``log10_nfa`` is that of the pose of the view itself."""
     view = View(mirror_image(problem.views[-1].frame), SE3.identity())
     agreeing, mirror_nfa = mirror_evidence(matcher, view, seed)
 
@@ -159,11 +159,11 @@ def _mirror(problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: 
         return None if found is None else corrected(replace(problem, views=(view,)), found)
 
     odds = log_odds_of_share(mirror_nfa / min(log10_nfa, SIGNIFICANT))
-    return Alternative(odds, f"{agreeing} landmarks agree with the mirror image", mirrored)
+    return Alternative(odds, f"the mirror image has {agreeing} landmark inliers", mirrored)
 
 
 def _log_odds_by_start(start: SE3, T: SE3, rival: SE3, distance: float) -> float:
-    """Return the log odds of a pose against its rival by how far (metres) what is seen at a ``distance`` (metres) moves from a start."""
+    """Return the log odds of a pose against its rival by their distances from a start, for a scene at ``distance`` (metres)."""
 
     def motion(T: SE3) -> float:
         update = (start.to("cpu", T.translation.dtype).inverse() @ T).log()
@@ -173,10 +173,10 @@ def _log_odds_by_start(start: SE3, T: SE3, rival: SE3, distance: float) -> float
 
 
 def log_odds_by_rendering(one: Problem, other: Problem, seed: int, steps: int = FITTED.steps) -> float:
-    """Return the log odds, by rendered colours alone, of ``one`` against ``other``.
+    """Return the log odds of ``one`` against ``other`` by rendered colours alone.
 
-    Both hold images of the same size with intrinsics and, as the start, the pose found with them; ``steps`` steps lead from
-    there to the pose that suits them best. Returns 0 where the field is too noisy or renders values that are not finite.
+    Both contain images of the same size with intrinsics and, as the start, the pose found with them, which is first refined by
+    ``steps`` steps. Returns 0 if the field is too noisy or renders non-finite values.
     """
     if one.colour_noise is not None and one.colour_noise > NOISIEST:
         return 0.0
@@ -186,7 +186,7 @@ def log_odds_by_rendering(one: Problem, other: Problem, seed: int, steps: int = 
 
 
 def _ray_costs(problem: Problem, stage: RefinementStage, seed: int) -> Float[Tensor, "n"]:
-    """Return the cost of each ray from the pose near the start that suits the images best."""
+    """Return the cost of each ray at the pose near the start that fits the images best."""
     problem = problem.without_depth()
     assert problem.start is not None
     settings = RenderedCostSettings(ColourSettings(), None, RefinementSettings(exposure=True))

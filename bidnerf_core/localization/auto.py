@@ -1,9 +1,8 @@
-"""Method ``auto``: find the pose with or without a start, from whatever was measured, and decide whether to trust it.
+"""Method ``auto``: find the pose with or without a start, from all available measurements, and decide whether to trust it.
 
-The order of its proposals is decided here; each part judges its own. If the map has landmarks, they are matched first, and
-their pose is fused with measured depth and rendered rays. If that pose is not accepted, the surface is searched: measured
-points are aligned with it where there is enough depth, and otherwise the images are compared with its renderings. A map
-without a surface needs a start, from which ``auto`` descends as ``bid`` does.
+If the map has landmarks, they are matched first, and their pose is fused with measured depth and rendered rays. If that pose is
+not accepted, the surface is searched: measured points are aligned with it if there is enough depth; otherwise, the images are
+compared with its renderings. In a map without a surface, ``auto`` needs a start, from which it descends as ``bid`` does.
 """
 
 from __future__ import annotations
@@ -49,27 +48,27 @@ from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
-"""Outcomes of a pose by landmarks that no other measurement can put right: with wrong intrinsics, aligning points with the
-surface goes wrong too.
+"""Outcomes of a pose by landmarks that no other measurement can correct: with wrong intrinsics, aligning points with the surface
+fails too.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
-"""Outcomes of a pose that landmarks determine, but not accurately enough or not with enough confidence."""
+"""Outcomes of a pose that landmarks determine with too little accuracy or confidence."""
 MOST_POINTS_LOST = 0.05
-"""Largest share of the measured points that landmarks may move off the surface."""
+"""Maximum fraction of the measured points that landmarks may move off the surface."""
 IN_FRONT = 0.9
-"""Least share of the points of an occluder that must lie before the surface."""
+"""Minimum fraction of an occluder's points that must lie in front of the surface."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=math.inf)
 """Thresholds for landmarks that match near a pose found by other means."""
 LEAST_SUPPORT, LEAST_TO_MOVE = 0.5, 0.8
-"""Least confidence with which landmarks support a pose accepted on the surface, and with which they may move one by depth."""
+"""Minimum confidences for landmarks to support a pose accepted on the surface, and to move a pose by depth."""
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
-    """Find the pose by landmarks, else by depth on the surface, else by colour on it, else by descent from a start.
+    """Find the pose by landmarks, or else by depth or colour on the surface, or else by descent from a start.
 
-    An image whose pose is not accepted, or doubtful with something in front, is tried once more without the nearest thing that
-    was measured, which may hide the scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all,
-    and there is no start.
+    If the pose is rejected, or doubtful because of an occluder, the image is tried again without the nearest measured object,
+    which may hide the scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose, and there is no
+    start.
     """
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     found = _found_behind_occluders(problem, config, seed)
@@ -89,9 +88,7 @@ def _found_behind_occluders(problem: Problem, config: AutoConfig, seed: int) -> 
     seconds = found.seconds + rest.seconds
     if not rest.converged or occluder.share_in_front(problem.surface, rest.T_world_camera) < IN_FRONT:
         return replace(found, seconds=seconds)
-    hidden = (
-        f"without the nearest {occluder.share:.0%} of the measured points, which are on something in front"
-    )
+    hidden = f"without the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
     return replace(rest, reason=f"{rest.reason}, {hidden}", seconds=seconds)
 
 
@@ -100,12 +97,12 @@ class _Proposal:
     """A pose that may be the answer."""
 
     found: Localization
-    near: LandmarkPose | None = None  # what landmarks say about a pose that was found by other means
-    decided: bool = False  # whether it was compared with other explanations
+    near: LandmarkPose | None = None  # pose by the landmarks that match near a pose found by other means
+    decided: bool = False  # whether it was compared with alternative explanations
 
 
 def _localized(problem: Problem, config: AutoConfig, seed: int) -> Localization:
-    """Return the best pose, rejected if another explanation of the images may be right."""
+    """Return the best pose, rejected if an alternative explanation of the images may be right."""
     began, rays = time.perf_counter(), config.fused_rays
     proposal = _proposed(problem, config, seed, began)
     before = without_ambiguous_intrinsics(proposal.found, problem)
@@ -158,14 +155,14 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
 
 
 def _without_landmarks(found: Localization) -> Localization:
-    """Return an answer in a map without landmarks, with a hint at this where landmarks might have led to a pose."""
+    """Add a hint to a rejected answer that the map has no landmarks, if they might have given a pose."""
     if found.converged or found.outcome is Outcome.UNDETERMINED:
         return found
     return replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
 
 
 def _is_settled(found: Localization) -> bool:
-    """Return whether a pose is accepted and nothing suggests that something in front hides part of the scene."""
+    """Return whether a pose is accepted and shows no sign of an occluder."""
     said = found.diagnostics
     if not found.converged or not isinstance(said, LandmarkDiagnostics) or said.on_surface is None:
         return found.converged
@@ -173,7 +170,7 @@ def _is_settled(found: Localization) -> bool:
 
 
 def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
-    """Return whether landmarks in a partly hidden scene gave a pose that places the measured points off the surface."""
+    """Return whether landmarks of a partly hidden scene gave a pose at which the measured points are off the surface."""
     if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
         return False
     if not _partly_hidden(problem) or not _keeps_points(problem, answer.found):
@@ -183,12 +180,12 @@ def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
 
 
 def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
-    """Return whether the surface has nothing to add to what landmarks found.
+    """Return whether the surface cannot improve the pose by landmarks.
 
     Colours do not determine a position that landmarks leave imprecise because the intrinsics are unknown.
     """
     if answer.has_rival:
-        return True  # the surface, too, is taken to look the same there
+        return True  # the surface is assumed to look the same there, too
     outcome = answer.verdict.outcome
     unknown_camera = outcome is Outcome.IMPRECISE and answer.found.estimates_calibration
     if outcome is Outcome.UNCERTAIN or unknown_camera:
@@ -197,7 +194,7 @@ def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
 
 
 def _rejected(found: Localization, why: Verdict) -> Localization:
-    """Return a localization as rejected, and without its confidence, which follows from how well the pose fits."""
+    """Reject a localization, and drop its confidence, which only measures how well the pose fits."""
     return replace(found, outcome=why.outcome, reason=f"{why.reason}; {found.reason}", confidence=None)
 
 
@@ -209,10 +206,10 @@ def _compared_with_landmarks(
     seed: int,
     began: float,
 ) -> _Proposal:
-    """Refine a pose found on the surface by the landmarks that match there, or reject it if they should match and do not.
+    """Refine a pose found on the surface by the landmarks that match there, or reject it if too few of the visible ones match.
 
-    Landmarks with less confidence than ``LEAST_TO_MOVE`` confirm an accepted pose by depth, but do not move it if the measured points
-    determine it better.
+    Landmarks with a confidence below ``LEAST_TO_MOVE`` confirm an accepted pose by depth, but do not move it if the measured
+    points determine it better.
     """
     near = confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True)
     if near.pose is not None and (record := current_record()) is not None:
@@ -238,12 +235,12 @@ def _compared_with_landmarks(
 
 
 def _is_misled(near: Verdict, problem: Problem) -> bool:
-    """Return whether landmarks contradict the intrinsics of a pose by colour, which fits wrong ones at a wrong pose."""
+    """Return whether landmarks contradict the intrinsics of a pose by colour, as wrong intrinsics fit at a wrong pose."""
     return near.outcome is Outcome.MISCALIBRATED and _measured_points(problem) < LEAST_POINTS
 
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:
-    """Return whether landmarks would move a pose found on the surface to where fewer of the measured points lie on it."""
+    """Return whether landmarks would move a pose found on the surface so that fewer measured points lie on it."""
     if problem.surface is None or not _partly_hidden(problem) or _measured_points(problem) < LEAST_POINTS:
         return False
     before = share_on_surface(problem, problem.surface, found.T_world_camera)
@@ -259,15 +256,15 @@ def _is_surer(found: Localization, answer: LandmarkAnswer) -> bool:
 
 
 def _keeps_points(problem: Problem, found: LandmarkPose) -> bool:
-    """Return whether there are measured points, and landmarks do not correct the intrinsics that place them."""
+    """Return whether there are measured points, and landmarks do not correct the intrinsics used to back-project them."""
     kept = found.intrinsics_of(problem.views[-1].frame.intrinsics) is None
     return kept and _measured_points(problem) >= LEAST_POINTS
 
 
 def _partly_hidden(problem: Problem) -> bool:
-    """Return whether something hides part of the scene, so that few landmarks are left and measured points weigh more.
+    """Return whether part of the scene is hidden, so that few landmarks are left and measured points matter more.
 
-    Elsewhere landmarks are trusted more than the scale of a depth sensor.
+    Otherwise, landmarks are trusted more than the scale of a depth sensor.
     """
     return any(view.frame.hidden is not None for view in problem.views)
 
@@ -280,7 +277,7 @@ def _measured_points(problem: Problem) -> int:
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:
     if problem.start is None:
-        raise InputError(f"{why}: method 'auto' needs a start then; give one")
+        raise InputError(f"{why}: method 'auto' then needs a start; give one")
     found = bid(problem, BidConfig(), seed)
     return replace(found, reason=f"{why}; {found.reason}")
 

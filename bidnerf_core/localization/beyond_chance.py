@@ -1,9 +1,9 @@
-"""Agreement beyond chance: whether what was measured distinguishes a pose from its rivals.
+"""Support of a pose: whether the measurements distinguish it from its rivals.
 
-A plain wall agrees with a plain wall from anywhere. How much agrees therefore says little by itself: it counts as far as a
-pose explains the measurements better than its rivals do. These are poses displaced from it by more than an answer may be off,
-the best different pose of a search, and images rendered in their mean colour. One test serves colours, depths and points on
-the surface: each measurement's cost with the rival, less that with the pose.
+A plain wall looks the same from everywhere, so agreement alone is weak evidence: a pose must explain the measurements better
+than its rivals. These are poses displaced from it by more than the tolerated error, the best different pose of a search, and
+images rendered in their mean colour. One test serves colours, depths and points on the surface: the difference of each
+measurement's cost between the rival and the pose.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.solvers.pivots import Pivot
 
 ACCEPTED = 0.8
-"""Least confidence with which a pose is accepted."""
+"""Minimum confidence of an accepted pose."""
 DISPLACEMENT = 0.1
-"""Displacement of rivals: a share of the distance of what is seen, and an angle in radians about it.
+"""Displacement of rivals: a fraction of the distance to the scene, and an angle about it in radians.
 
-It is three times the largest standard deviation of an accepted position by landmarks.
+It is three times the maximum standard deviation of an accepted position by landmarks.
 """
 LOG_ODDS_PER_DEVIATION = 0.5
-"""Log odds for each standard error of the difference between two costs.
+"""Log odds per standard error of the difference between two costs.
 
 Independent measurements would justify more, but the errors of a field's rays are correlated. Chosen on frames held out for
 tuning.
 """
 NO_RIVAL = 1000.0
-"""Log odds against a rival that does not exist; finite, since records hold finite numbers."""
+"""Log odds against a rival that does not exist; finite, since records contain finite numbers."""
 LEAST_EXPLAINED = 0.5
-"""Least share of an image's contrast that an accepted pose explains."""
+"""Minimum fraction of an image's contrast that an accepted pose explains."""
 
 Costs = Callable[[SE3], Float[Tensor, "h n"]]
 """Returns each of n measurements' part of the cost, from each of h poses."""
@@ -46,10 +46,10 @@ Costs = Callable[[SE3], Float[Tensor, "h n"]]
 class Support:
     """How well measurements distinguish a pose from its rivals."""
 
-    explained: float  # share of the images' contrast: 1 less the ratio of the cost to that of the mean colour
-    plain: float  # log odds against the mean colour; ``NO_RIVAL`` where more than colours was compared
+    explained: float  # fraction of the images' contrast: 1 - the ratio of the cost to that of the mean colour
+    plain: float  # log odds against the mean colour; ``NO_RIVAL`` if more than colours was compared
     displaced: float  # log odds against the best of the displaced poses
-    other: float  # log odds against the best different pose of a search; ``NO_RIVAL`` where there was none
+    other: float  # log odds against the best different pose of a search; ``NO_RIVAL`` if there was none
 
     @property
     def confidence(self) -> float:
@@ -57,13 +57,13 @@ class Support:
         return 1 / (1 + sum(odds(-against) for against in (self.plain, self.displaced, self.other)))
 
     def rejection(self, least_explained: float = LEAST_EXPLAINED) -> Verdict | None:
-        """Return why the measurements do not support the pose, or None."""
+        """Return the reason why the measurements do not support the pose, or None."""
         if self.confidence < ACCEPTED:
             if self.plain <= min(self.displaced, self.other):
-                return Verdict(Outcome.UNDETERMINED, "an image of a single colour fits about as well")
+                return Verdict(Outcome.UNDETERMINED, "a single-colour image fits about as well")
             if self.other < self.displaced:
                 return Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
-            share = f"{DISPLACEMENT:.0%} of the distance of what is seen"
+            share = f"{DISPLACEMENT:.0%} of the distance to the scene"
             return Verdict(Outcome.UNDETERMINED, f"poses displaced by {share} fit about as well")
         if not self.explained >= least_explained:
             share = f"{max(self.explained, 0):.0%} of the contrast of the image"
@@ -84,9 +84,9 @@ def support(
 ) -> Support:
     """Compare a pose with its rivals.
 
-    ``middle``: the middle of what is seen (metres, last camera's frame), about which rivals are displaced. ``plain``: each
-    measurement's cost in images rendered in their mean colour; None where more than colours is compared. ``others``: poses (h)
-    found by a search; those within the displacement are no rivals.
+    ``middle`` is the middle of the visible scene (metres, last camera's frame), about which rivals are displaced. ``plain`` is
+    each measurement's cost in images rendered in their mean colour; None if more than colours is compared. ``others`` are
+    poses (h) found by a search; those within the displacement do not count as rivals.
     """
     here, about = costs(T[None])[0], Pivot.at_point(middle)
     reach = float(torch.linalg.vector_norm(middle))
@@ -104,7 +104,7 @@ def support(
 
 
 def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Tensor, "h"]:
-    """Return the log odds against each rival, from each measurement's cost with it and that with the pose; 0 where not finite."""
+    """Return the log odds against each rival, from the costs of each measurement for it and the pose; 0 where not finite."""
     difference = rivals - here
     error = difference.std(-1) * difference.shape[-1] ** 0.5
     odds = LOG_ODDS_PER_DEVIATION * difference.sum(-1) / error.clamp(min=1e-12)
@@ -112,14 +112,14 @@ def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Te
 
 
 def _displaced(T: SE3, about: Pivot, reach: float) -> SE3:
-    """Return twelve poses: displaced to both sides along and about each axis."""
+    """Return twelve poses, displaced in both directions along and about each axis."""
     size = torch.tensor([DISPLACEMENT * reach] * 3 + [DISPLACEMENT] * 3, dtype=torch.float64)
     steps = torch.cat([torch.diag(size), -torch.diag(size)]).to(T.translation)
     return about.to(T.translation.device).moved(_repeated(T, len(steps)), steps)
 
 
 def _apart(T: SE3, others: SE3, about: Pivot, reach: float) -> Bool[Tensor, "h"]:
-    """Return which poses are farther from the pose than the displaced ones."""
+    """Return a mask of the poses that are farther from ``T`` than the displaced ones."""
     here = about.to(T.translation.device).at(T)
     there = about.to(T.translation.device).at(others.to(T.translation.device, T.translation.dtype))
     motion = (_repeated(here.inverse(), len(there.translation)) @ there).log()

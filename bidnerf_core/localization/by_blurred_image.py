@@ -1,7 +1,7 @@
-"""Poses of blurred images: the whole image is compared with renderings that are blurred to match.
+"""Poses of blurred images, by comparing whole images with renderings of the same blur.
 
-Keypoints are inaccurate in blurred images, and rendered rays are as sharp as the field, so the edges, which constrain the pose
-most, count as outliers. A rendering blurred like the image has the same edges.
+Keypoints are inaccurate in blurred images. Rendered rays are as sharp as the field, so the edges, which constrain the pose most,
+become outliers. A rendering blurred like the image has the same edges.
 """
 
 from __future__ import annotations
@@ -36,32 +36,32 @@ from bidnerf_core.localization.solvers.levenberg_marquardt import Descent, desce
 from bidnerf_core.localization.solvers.pivots import Pivot, pivot
 
 WIDTH = 100
-"""Pixels of the longer side of the images that are compared."""
+"""Longer side of the compared images, pixels."""
 BLURS = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
-"""Standard deviations that are tried, pixels of these images."""
+"""Standard deviations of the blur that are tried, in pixels of these images."""
 NOTICEABLE_BLUR = 0.7
-"""The least of them with which an image counts as blurred. A sharp image is averaged over its pixels, while rays are single."""
+"""The smallest of them for a blurred image. Even a sharp image is averaged over its pixels, unlike single rays."""
 CLEARLY_LESS = 0.85
-"""Cost with the best blur, as a share of that without, below which an image counts as blurred."""
+"""Ratio of the cost with the best blur to that without, below which an image counts as blurred."""
 ROUNDS, STEPS = 3, 4
-"""Number of times that the blur is estimated, and number of steps after each estimate."""
+"""Number of estimates of the blur, and number of steps after each."""
 HALF_AN_INLIER = 0.1
-"""Norm of a colour difference at which a pixel's inlier weight is one half."""
+"""Norm of the colour difference at which a pixel's inlier weight is one half."""
 LEAST_EXPLAINED_BLURRED = 0.75
-"""Least share of the image's contrast that an accepted pose explains."""
+"""Minimum fraction of the image's contrast that an accepted pose explains."""
 PRECISE = 0.01
-"""Largest standard deviation of an accepted position, as a share of the distance of what is seen."""
+"""Maximum standard deviation of an accepted position, relative to the distance to the scene."""
 UNSUITABLE = (
     Outcome.AMBIGUOUS, Outcome.DIVERGED, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.TOO_FEW_MATCHES
 )  # fmt: skip
-"""Outcomes of poses that a closer comparison cannot put right."""
+"""Outcomes of poses that a closer comparison cannot correct."""
 
 
 def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
-    """Return a doubtful pose refined and judged anew if the images are blurrier than what the field renders from there.
+    """Refine a doubtful pose and check it again if the images are blurrier than the field's renderings there.
 
-    A pose is returned as it is where depth was measured, part of an image is hidden, the intrinsics were corrected, are
-    approximate or differ a little from those of the map's images, the field itself is not sharp, or the map has no surface.
+    The pose is returned unchanged if depth was measured, part of an image is hidden, the intrinsics were corrected, are
+    approximate or differ slightly from those of the map's images, the field itself is not sharp, or the map has no surface.
     """
     if not _is_eligible(problem, found):
         return found
@@ -75,7 +75,7 @@ def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
         return found
     plain = plain_pixel_costs(sharp.thumbnails, HALF_AN_INLIER).double()
     if not bool(plain.any()):
-        return found  # an image of one colour, which any pose explains
+        return found  # an image with a single colour, which any pose explains
     done = _descents(replace(sharp, blur=BLURS[best]), start, about)
     cost_at_end = float(done[-1].equations.cost[0])
     if not math.isfinite(cost_at_end):
@@ -105,12 +105,12 @@ def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
 
 
 def _is_eligible(problem: Problem, found: Localization) -> bool:
-    """Return whether an answer is doubtful and whole images, with the given intrinsics, can be compared with renderings."""
+    """Return whether a pose is doubtful and whole images with the given intrinsics can be compared with renderings."""
     hidden = any(view.frame.hidden is not None for view in problem.views)
     unsuited_map = problem.surface is None or not is_sharp(problem)
     if problem.has_depth or hidden or unsuited_map or found.intrinsics is not None:
         return False
-    # Support by sharp renderings does not tell that a blurred comparison would be better.
+    # Support by sharp renderings does not mean that a blurred comparison would not be better.
     by_colour = isinstance(found.diagnostics, Support)
     doubtful = (by_colour or (found.confidence or 0.0) < TRUSTED) and found.outcome not in UNSUITABLE
     return doubtful and not may_be_miscalibrated(problem)
@@ -126,7 +126,7 @@ def _cost(problem: Problem, about: Pivot) -> ImageCost:
 
 
 def _descents(cost: ImageCost, T: SE3, about: Pivot) -> list[Descent]:
-    """Take the steps of all rounds, each with the blur that suits its first pose; ``cost`` has that of the first round."""
+    """Take the steps of all rounds, each with the best blur at its first pose; ``cost`` has that of the first round."""
     found = [descend(cost, T[None], STEPS, about.moved, damping=1e-2)]
     for _ in range(ROUNDS - 1):
         T = found[-1].T[0]
@@ -135,13 +135,13 @@ def _descents(cost: ImageCost, T: SE3, about: Pivot) -> list[Descent]:
 
 
 def _covariance(done: Descent, views: int) -> Float[Tensor, "6 6"]:
-    """Return the covariance of an update at the pivot; not finite where the images do not determine it."""
+    """Return the covariance of an update at the pivot; not finite if the images do not determine it."""
     variance = done.equations.cost[0].clamp(min=LEAST_VARIANCE) / (USUAL.blurred * views)
     return torch.linalg.inv_ex(done.equations.hessian[0] / variance).inverse.cpu()
 
 
 def _verdict(found: Support, precision: float) -> Verdict:
-    """Judge a pose by its support, and by its deviation as a share of the distance of what is seen."""
+    """Accept or reject a pose by its support and by its standard deviation relative to the distance to the scene."""
     share = f"{max(found.explained, 0):.0%} of the contrast of the blurred image agrees with renderings blurred to match"
     rejection = found.rejection(LEAST_EXPLAINED_BLURRED)
     if rejection is not None:
@@ -149,6 +149,6 @@ def _verdict(found: Support, precision: float) -> Verdict:
             rejection, reason=f"{rejection.reason}: only {share}, expected {LEAST_EXPLAINED_BLURRED:.0%}"
         )
     if not precision <= PRECISE:
-        why = f"the image is blurred, so the position is uncertain by {precision:.1%} of the distance of what is seen"
+        why = f"the image is blurred, so the position is uncertain by {precision:.1%} of the distance to the scene"
         return Verdict(Outcome.IMPRECISE, f"{why}, expected at most {PRECISE:.0%}")
     return Verdict(Outcome.CONVERGED, share)

@@ -1,4 +1,4 @@
-"""Poses by colour alone: search with small images, refine with second-order steps on rendered rays, then judge."""
+"""Poses by colour alone: search with small images, refine by second-order steps on rendered rays, then accept or reject."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import ByColourConfig, RefinementStage
 
 TYPICAL_ERRORS = 4.5
-"""Largest standard deviation of a position, in median errors of the map's own images, with which a pose is accepted."""
+"""Maximum standard deviation of an accepted position, in median errors of the map's own images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def refine_by_colour(
     generator: Generator,
     stages: Sequence[RefinementStage] = (),
 ) -> ColourAnswer:
-    """Refine the poses found by a search, on colour alone, and judge the result; ``stages`` replace the usual ones."""
+    """Refine the poses found by a search on colour alone, and accept or reject the result; ``stages`` replace the usual ones."""
     stages = stages or usual_stages(config, len(search.T.translation))
     settings = RenderedCostSettings(config.colour, None, config.refinement)
     refined = refine(problem, search.T, stages, settings, generator)
@@ -59,15 +59,15 @@ def usual_stages(config: ByColourConfig, count: int) -> tuple[RefinementStage, .
 def localization_of(
     problem: Problem, answer: ColourAnswer, config: ByColourConfig, began: float, method: str
 ) -> Localization:
-    """Return an answer as a localization.
+    """Convert an answer to a localization.
 
-    Its path joins those of the search and of the refinement. If there is a start, the path begins there, since choosing a
+    Its path joins those of the search and the refinement. If there is a start, the path begins there, since the choice of a
     hypothesis is part of the first step.
     """
     refined, search = answer.refined, answer.search
     path = [T[i] for T in (search.path[:-1], refined.poses) for i in range(len(T.translation))]
     path[0] = problem.start or path[0]
-    # The errors of neighbouring rays are correlated, so the rays of a view count as a few independent ones only.
+    # The errors of neighbouring rays are correlated, so the rays of a view count as only a few independent ones.
     covariance = refined.covariance * max(
         1.0, config.steps.fine_rays / (USUAL.rays_alone * len(problem.views))
     )
@@ -88,14 +88,14 @@ def localization_of(
 
 
 def without_the_imprecise(found: Localization, typical: float) -> Localization:
-    """Reject an accepted answer whose position is far less certain than usual: blurred images fit many poses.
+    """Reject an accepted pose whose position is far less certain than usual, since blurred images fit many poses.
 
-    ``typical`` is the median error of the map's own images, metres; 0 where it is not known.
+    ``typical`` is the median error of the map's own images (metres); 0 if unknown.
     """
     if not found.converged or found.covariance is None or typical <= 0:
         return found
     deviation = position_deviation(found.covariance)
     if deviation <= TYPICAL_ERRORS * typical:
         return found
-    why = f"the position is uncertain by {deviation:.3g}, the map's own images by {typical:.3g}"
+    why = f"the position is uncertain by {deviation:.3g}, against {typical:.3g} for the map's own images"
     return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")

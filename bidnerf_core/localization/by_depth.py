@@ -33,9 +33,9 @@ from bidnerf_core.localization.settings import (
 from bidnerf_core.mapping import SurfaceMap
 
 WORSE = 0.05
-"""Largest increase in the cost on the surface due to refinement; beyond it, field and surface contradict each other."""
+"""Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict each other."""
 JUDGED_POINTS = 1000
-"""Number of points by which two poses are compared."""
+"""Number of points on which two poses are compared."""
 LOSS_POINTS = 200
 """Number of points on which the losses along the path are computed."""
 
@@ -80,7 +80,7 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
 def _searched(
     problem: Problem, search: PointSearch, config: AutoConfig, generator: Generator
 ) -> tuple[SearchResult, PointSearch]:
-    """Search in rounds until an answer is acceptable; return the best one, and the search with the image's exposure there."""
+    """Search in rounds until a pose is acceptable; return the best one and the search with the image's exposure there."""
     answers: list[SearchResult] = []
     while True:
         answers.append(search(problem.start, config.hypotheses, generator))
@@ -90,7 +90,7 @@ def _searched(
 
 
 def _with_exposure(search: PointSearch, found: SearchResult) -> tuple[SearchResult, PointSearch]:
-    """Return an answer aligned once more, and the search, with the points' colours as the map's exposure would show them."""
+    """Align a pose again with the points' colours converted to the map's exposure; return it and the new search."""
     cloud = cloud_with_exposure_of_map(search.judge(), found.T[0])
     if cloud is search.cloud:
         return found, search
@@ -107,10 +107,10 @@ def _diagnostics(search: PointSearch, found: SearchResult) -> SurfaceDiagnostics
 def _refined(
     problem: Problem, search: PointSearch, found: SearchResult, config: AutoConfig, generator: Generator
 ) -> tuple[SearchResult, float]:
-    """Return a refined pose, and the share of rendered rays that agree with the measurements there.
+    """Return a refined pose and the fraction of rendered rays that agree with the measurements there.
 
-    The surface is as coarse as its cells, and the field as its training: both count as far as they agree with what was
-    measured.
+    The surface is limited by its cells, and the field by its training: each is weighted by how well it agrees with the
+    measurements.
     """
     scale = rendered_depth_scale(problem.bounds)
     stage = RefinementStage(
@@ -129,7 +129,7 @@ def _refined(
 
 @torch.no_grad()
 def share_on_surface(problem: Problem, surface: SurfaceMap, T_world_camera: SE3) -> float:
-    """Return the share of the measured points that a pose places on the surface."""
+    """Return the fraction of the measured points that lie on the surface at a pose."""
     cloud = PointCloud.measured(problem.views, problem.depth_rays, JUDGED_POINTS, Generator().manual_seed(0))
     judge = finest_cost(surface, cloud)
     return float(judge.inliers(judge.correspondences(T_world_camera[None]))[0].mean())

@@ -1,4 +1,4 @@
-"""Poses by comparing images with renderings of the baked surface: rounds of search, each refined on rendered rays."""
+"""Poses by comparing images with renderings of the baked surface, in rounds of search and refinement on rendered rays."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from bidnerf_core.localization.settings import AutoConfig, ByColourConfig
 from bidnerf_core.mapping import SurfaceMap
 
 COMPARED_WIDTH = 96
-"""Longer side (pixels) of the thumbnails on which answers of all rounds are compared: that of the first round's last stage."""
+"""Longer side (pixels) of the thumbnails on which the rounds' answers are compared: that of the first round's last stage."""
 MANY_RAYS = 4
-"""Factor by which more rays are rendered where something may hide part of the scene."""
+"""Factor by which more rays are rendered if part of the scene may be hidden."""
 MANY_LANDMARKS = 500
-"""Least number of landmarks of a scene that counts as textured."""
+"""Minimum number of landmarks of a textured scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """A search by images, and the function that refines and judges the poses it finds."""
+    """A search by images, and the function that refines the poses found and accepts or rejects the best."""
 
     search: ImageSearch
     stages: Sequence[ImageStage]
@@ -50,8 +50,8 @@ class _Round:
 def localized_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer.
 
-    The first round is quick. The others suppose that something hides part of the scene. If no answer is accepted, the one that
-    explains most of the images is returned.
+    The first round is fast. The others assume that part of the scene is hidden. If no answer is accepted, the one that explains
+    most of the images is returned.
     """
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search = ImageSearch.on_surface(problem, surface)
@@ -80,7 +80,7 @@ def localized_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfi
 def _refined_robustly(
     problem: Problem, search: SearchResult, config: ByColourConfig, generator: Generator
 ) -> ColourAnswer:
-    """Refine the best pose of a search on many rays, with a loss that ignores outliers, and judge it as any other pose.
+    """Refine the best pose of a search on many rays with a redescending loss, then accept or reject it like any other pose.
 
     If half of the rays are outliers, refinement on few rays or at a coarse level drifts away from the true pose.
     """
@@ -94,13 +94,13 @@ def _refined_robustly(
 
 
 def _is_hopeless(problem: Problem) -> bool:
-    """Return whether an image without recognised landmarks cannot be found: the scene is textured, and its field blurred."""
+    """Return whether an image without recognised landmarks cannot be localized, as the scene is textured but the field blurred."""
     textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
     return textured and not is_sharp(problem)
 
 
 def _unrecognised(problem: Problem) -> Verdict:
-    """Return why an image without recognised landmarks is rejected in a blurred field."""
+    """Return the rejection of an image without recognised landmarks in a blurred field."""
     causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
     focal = ", or its focal length may be too far off" if problem.focal_is_approximate else ""
     why = f"too few landmarks were recognised, and the field is not sharp enough to compare images with it: {causes}{focal}"
@@ -108,7 +108,7 @@ def _unrecognised(problem: Problem) -> Verdict:
 
 
 def _unrefined(found: SearchResult, verdict: Verdict, began: float) -> Localization:
-    """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
+    """Return the best pose of a search by images as rejected, without refinement, which would take many seconds."""
     return Localization(
         T_world_camera=found.T[0].normalized(),
         outcome=verdict.outcome,

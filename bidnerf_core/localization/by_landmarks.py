@@ -1,4 +1,4 @@
-"""Poses by landmarks: match the query's features with the map's, then fuse with measured depth and rendered rays."""
+"""Poses by landmarks: match the query's features with the map's, then fuse the pose with measured depth and rendered rays."""
 
 from __future__ import annotations
 
@@ -43,47 +43,47 @@ from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.mapping import SurfaceMap
 
 POINTS = 2000
-"""Largest number of measured points that are fused."""
+"""Maximum number of measured points that are fused."""
 STEPS = 8
-"""Largest number of steps on the sum of all terms."""
+"""Maximum number of steps on the sum of all terms."""
 FEW_STEPS = 2
-"""Number of steps from a pose by landmarks to the one that suits other intrinsics best."""
+"""Number of steps from a pose by landmarks to the best pose under other intrinsics."""
 BASIN = 1.0
-"""Deviation of a pose by landmarks, in pixels, beyond which rays may lead from there to a wrong pose."""
+"""Standard deviation of a pose by landmarks, in pixels, beyond which rays may converge to a wrong pose."""
 THOROUGHLY = 4
-"""Factor on the number of rays from there."""
+"""Factor on the number of rays for such a pose."""
 COMPARED_RAYS = 512
-"""Largest number of rays by which they are compared."""
+"""Maximum number of rays on which starts are compared."""
 STARTS = 64
-"""Number of poses, drawn from the landmarks' prior, from which the best one is refined then."""
+"""Number of starts, drawn from the landmarks' prior, of which the best is refined."""
 CONTRADICTORY = 30.0
-"""Squared Mahalanobis distance from the landmarks' pose beyond which the fused measurements contradict the landmarks."""
+"""Squared Mahalanobis distance from the landmarks' pose beyond which fused measurements contradict the landmarks."""
 SHARPEST = 0.04
-"""Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
+"""Colour noise (root mean square) of a field on its training images above which rendering adds nothing to landmarks."""
 MOSTLY_ON_SURFACE = 0.5
-"""Least share of the measured points on the surface with which a scene is not taken to be partly hidden."""
+"""Minimum fraction of the measured points on the surface for a scene to count as not partly hidden."""
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkAnswer:
-    """A pose by landmarks, the pose after fusing it with the other measurements, and whether to accept it."""
+    """A pose by landmarks, its fusion with the other measurements, and whether to accept it."""
 
     found: LandmarkPose
     verdict: Verdict
     T: SE3
     covariance: Float[Tensor, "6 6"]
     diagnostics: LandmarkDiagnostics
-    terms: tuple[str, ...] = ()  # what was fused with the landmarks
-    depth_factor: float = 1.0  # by which the fused pose lengthens depths beyond what ``corrected`` does
-    left_out: str = ""  # what was not fused because it contradicts them
+    terms: tuple[str, ...] = ()  # the measurements fused with the landmarks
+    depth_factor: float = 1.0  # the fused pose's factor on depths, in addition to that of ``corrected``
+    left_out: str = ""  # measurements not fused because they contradict the landmarks
     confidence: float | None = None  # probability that the pose is right
-    has_rival: bool = False  # whether it is rejected because another explanation may be the right one
+    has_rival: bool = False  # whether it is rejected because an alternative explanation may be right
 
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
-        """The covariance, including that due to errors of the intrinsics that the image does not rule out.
+        """The covariance, including that due to errors in the intrinsics that the image does not rule out.
 
-        These errors mislead landmarks and rendered colours alike, and the scale of measured depth is no better known.
+        These errors affect landmarks and rendered colours alike, and the scale of measured depth is no better known.
         """
         return self.covariance + self.found.doubt.covariance
 
@@ -91,10 +91,10 @@ class LandmarkAnswer:
 def answer_by_landmarks(
     problem: Problem, matcher: LandmarkMatcher, rays: int, seed: int, fused: bool = True
 ) -> LandmarkAnswer | None:
-    """Find the pose by landmarks, decide between it and other explanations, and refine it on all terms at once if it is accepted.
+    """Find the pose by landmarks, compare it with alternative explanations, and, if accepted, refine it on all terms jointly.
 
-    Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 disables rendering,
-    even where it would show which intrinsics or which pose are right. ``fused``: whether rays are part of the refinement.
+    Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 disables all rendering,
+    including that which decides between intrinsics or poses. ``fused`` is whether rays are part of the refinement.
     """
     found = propose(matcher, problem.views, seed=seed, seek_rivals=True)
     if found is None:
@@ -116,7 +116,7 @@ def answer_by_landmarks(
 
 
 def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> LandmarkPose:
-    """Return a pose with evidence from renderings if landmarks leave open which intrinsics are right."""
+    """Add evidence from renderings to a pose if landmarks do not decide which intrinsics are right."""
     if found.guided is None or found.expected_shift <= LandmarkThresholds().expected_shift:
         return found
     posterior = found.guided.posterior
@@ -138,10 +138,10 @@ def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> L
 def fused_answer(
     problem: Problem, found: LandmarkPose, verdict: Verdict, rays: int, seed: int, searched: bool = True
 ) -> LandmarkAnswer:
-    """Return a pose by landmarks, refined on all terms at once if it is accepted or merely imprecise.
+    """Return a pose by landmarks, refined on all terms jointly if it is accepted or merely imprecise.
 
-    An imprecise one stays rejected, but is a better place from which to search. ``searched`` is false if landmarks only confirm a
-    pose that was found by other means.
+    An imprecise pose stays rejected, but is a better starting point for a search. ``searched`` is false if landmarks only
+    confirm a pose found by other means.
     """
     diagnostics = landmark_diagnostics(found, searched)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.stated_covariance, diagnostics)
@@ -182,12 +182,12 @@ def _cost_of_points(problem: Problem, surface: SurfaceMap, generator: Generator)
 def _fused(
     problem: Problem, answer: LandmarkAnswer, points: SurfaceCost | None, rays: int, seed: int
 ) -> LandmarkAnswer:
-    """Return the answer fused with measured points and rendered rays.
+    """Fuse an answer with measured points and rendered rays.
 
-    Where there are points, rays compare colours alone: depth is measured once, and its scale is not exact. Errors in the poses
-    of the map's images affect its surface and its field as they do its landmarks, and errors in the motion of a rolling shutter
-    affect rays and points too, so fusion does not reduce them. Where the sum leaves the landmarks' pose by more than their
-    errors explain, renderings of both poses decide which is right.
+    With points, rays compare colours alone, since the same depth must not count twice, and its scale is not exact. Errors in the
+    poses of the map's images affect its surface and field like its landmarks, and errors in the motion during a rolling
+    shutter's readout affect rays and points too, so fusion does not reduce them. If the fused pose differs from the landmarks'
+    by more than their errors explain, renderings at both poses decide which is right.
     """
     scale = DepthScale.of(answer.found, problem.sensor)
     if points is not None and scale.objection is not None:
@@ -218,7 +218,7 @@ def _fused(
 def _vague_start(
     problem: Problem, measurements: Measurements, rays: int, by_depth: bool, seed: int
 ) -> FusedPose:
-    """Return where to start from a vague prior: the best of several poses, refined with a loss that reaches farther."""
+    """Return a start for a vague prior: the best of several poses, refined with a loss with a wider basin of convergence."""
     few, many = (
         drawn_rays(
             problem, count, measurements.prior.pivot, Generator().manual_seed(seed), by_depth, loss="huber"
@@ -230,7 +230,7 @@ def _vague_start(
 
 
 def _apparent_deviation(problem: Problem, answer: LandmarkAnswer) -> float:
-    """Return by how many pixels, about, what is seen may be off at a pose by landmarks."""
+    """Return the approximate standard deviation, in pixels, of the scene's projection at a pose by landmarks."""
     focal = max(view.frame.intrinsics.fx for view in problem.views)
     return focal * position_deviation(answer.covariance) / answer.found.distance
 
@@ -250,7 +250,7 @@ def _measurements(
 
 
 def _is_likelier(problem: Problem, T: SE3, answer: LandmarkAnswer, seed: int) -> bool:
-    """Return whether a pose is likelier than that of landmarks, by renderings and by the confidence in these landmarks."""
+    """Return whether a pose is more likely than that by landmarks, given renderings and the confidence in the landmarks."""
     sure = min(max(answer.confidence or 0.5, 1e-12), 1 - 1e-12)
     odds = log_odds_by_rendering(replace(problem, start=T), replace(problem, start=answer.T), seed, steps=0)
     return odds > math.log(sure / (1 - sure))
@@ -259,14 +259,14 @@ def _is_likelier(problem: Problem, T: SE3, answer: LandmarkAnswer, seed: int) ->
 def _elsewhere(
     problem: Problem, answer: LandmarkAnswer, other: FusedPose, names: tuple[str, ...]
 ) -> LandmarkAnswer:
-    """Return the answer at a pose where landmarks, if any, do not contradict the other measurements."""
+    """Return the answer at the pose of the other measurements, which contradict the landmarks."""
     verdict = Verdict(Outcome.UNCERTAIN, f"{enumeration(names)} contradict the landmarks")
     covariance = other.covariance + answer.found.shared_covariance
     return replace(answer, T=other.T, covariance=covariance, verdict=verdict, confidence=None, terms=names)
 
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
-    """Return an answer as a localization of method ``auto``."""
+    """Convert an answer to a localization of method ``auto``."""
     found = answer.found
     poses = [found.T_world_camera, answer.T]
     if problem.start is not None:

@@ -18,17 +18,17 @@ from bidnerf_core.localization.landmarks.chance import probability_of
 from bidnerf_core.localization.result import Outcome, Verdict
 
 ACCEPTED_ESTIMATED = 0.6
-"""Least confidence of a pose whose intrinsics were estimated too because landmarks contradict the given ones.
+"""Minimum confidence of a pose whose intrinsics were also estimated, because landmarks contradict the given ones.
 
-The contradiction takes evidence of its own, which the model does not count.
+The contradiction requires evidence of its own, which the model does not take into account.
 """
 TRUSTED = 0.95
-"""Least confidence at which a pose by landmarks is trusted without further measurements."""
+"""Minimum confidence at which a pose by landmarks is trusted without further measurements."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict with the probability that the pose is right; None where it is not known."""
+    """A verdict with the probability that the pose is right; None if unknown."""
 
     verdict: Verdict
     confidence: float | None
@@ -51,9 +51,9 @@ class LogisticModel:
 def judged(
     verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics, approximate: bool = False
 ) -> Judgement:
-    """Return the confidence in a pose, and the verdict, which it can turn into a rejection.
+    """Return the verdict with the confidence in the pose, which can turn it into a rejection.
 
-    ``approximate``: whether the focal length was given as approximate, so that it was estimated in any case.
+    ``approximate`` is whether the focal length was given as approximate, and was therefore estimated in any case.
     """
     value = confidence(diagnostics)
     if value is not None and verdict.accepted and value < least_confidence(diagnostics, approximate):
@@ -71,7 +71,7 @@ def least_confidence(diagnostics: object, approximate: bool = False) -> float:
 def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float | None:
     """Return the probability that a pose with these diagnostics is right.
 
-    Where no model was learned, it is the probability of the pose among its rivals; None if it was not compared with any.
+    Without a learned model, it is the probability of the pose among its rivals; None if it was not compared with any.
     """
     if isinstance(diagnostics, LandmarkDiagnostics):
         name, features = "landmarks", landmark_features(diagnostics)
@@ -86,7 +86,7 @@ def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float |
 
 @lru_cache(maxsize=1)
 def models() -> dict[str, LogisticModel]:
-    """Return the models by how a pose was found."""
+    """Return the models by the way in which a pose was found."""
     stored = json.loads((files(__package__) / "confidence.json").read_text())["models"]
     return {
         name: LogisticModel(tuple(model["features"]), tuple(model["weights"]), model["bias"])
@@ -95,7 +95,7 @@ def models() -> dict[str, LogisticModel]:
 
 
 def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
-    """Return the features of a pose by landmarks; none depends on units of length or on the image's size."""
+    """Return the features of a pose by landmarks; none depends on the unit of length or the image's size."""
     possible = min(found.visible, found.keypoints)
     return {
         "inliers": math.log10(1 + found.inliers),
@@ -108,7 +108,7 @@ def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
         "miscalibration": found.miscalibration,
         "estimated_calibration": float(found.estimated_calibration),
         "confirmed_only": 0.0 if found.searched else 1.0,
-        # Without measured points the surface neither supports nor contradicts a pose.
+        # Without measured points, the surface neither supports nor contradicts a pose.
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
         "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
     }

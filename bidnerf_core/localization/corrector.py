@@ -1,4 +1,4 @@
-"""``Corrector``: localizes in a thread of its own, behind a loop at the rate of a camera, and corrects its odometry."""
+"""``Corrector``: localizes in a background thread, next to a loop at camera rate, and corrects the loop's odometry."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from bidnerf_core.localization.result import Localization
 
 
 class Corrector:
-    """Localizes frames in a background thread, and keeps ``T_world_odom``, which corrects the drift of an odometry.
+    """Localizes frames in a background thread and maintains ``T_world_odom``, which corrects odometry drift.
 
-    A loop hands over frames with ``give``, which never waits: a localization takes longer than a frame, so a frame is dropped if
-    another one waits already. Each accepted answer replaces the correction, which belongs to the odometry of the frame that was
-    localized, so that it may arrive late. From then on, localizations start from the corrected odometry. An error of the
-    localizer is raised by the next ``give`` or ``close``, once; the thread goes on with the frames after it. All methods may be
-    called from any thread. Use it as a context manager, or call ``close``.
+    A loop passes frames to ``give``, which never blocks: a localization takes longer than a frame, so a frame is dropped if
+    another is already waiting. Each accepted pose gives a new correction, computed with the odometry of the localized frame, so
+    it may arrive late. From then on, localizations start from the corrected odometry. An error of the localizer is raised once,
+    by the next ``give`` or ``close``; the thread continues with later frames. All methods may be called from any thread. Use it
+    as a context manager, or call ``close``.
     """
 
     def __init__(self, localizer: Localizer) -> None:
@@ -36,7 +36,7 @@ class Corrector:
 
     @property
     def T_world_odom(self) -> SE3 | None:
-        """The correction by the last accepted answer; None until there is one."""
+        """The correction from the last accepted answer; None until there is one."""
         return self._T_world_odom
 
     @property
@@ -45,19 +45,19 @@ class Corrector:
         return self._found
 
     def corrected(self, T_odom_camera: SE3) -> SE3 | None:
-        """Return T_world_camera of a pose in the odometry's frame; None until an answer was accepted."""
+        """Return T_world_camera for a pose in the odometry's frame; None until an answer has been accepted."""
         T_world_odom = self._T_world_odom
         return None if T_world_odom is None else T_world_odom @ T_odom_camera
 
     def give(self, frame: Frame, T_odom_camera: SE3) -> bool:
-        """Hand over a frame and its pose by odometry; return False if it was dropped, since another one waits already.
+        """Submit a frame and its pose by odometry; return False if it was dropped because another is already waiting.
 
         Raises the error of an earlier frame's localization, and ``InputError`` after ``close``.
         """
         with self._changed:
             self._raise_error()
             if self._closed:
-                raise InputError("the corrector is closed, expected no more frames")
+                raise InputError("the corrector is closed and takes no more frames")
             if self._waiting is not None:
                 return False
             self._waiting = frame, T_odom_camera
@@ -65,9 +65,9 @@ class Corrector:
             return True
 
     def close(self) -> None:
-        """End the thread after the localization at work, whose answer still counts; a frame that waits is dropped.
+        """End the thread after the current localization, whose answer still counts; a waiting frame is dropped.
 
-        Raises the error of a localization that was not raised yet.
+        Raises the error of a localization that has not been raised yet.
         """
         with self._changed:
             self._closed, self._waiting = True, None
@@ -94,7 +94,7 @@ class Corrector:
             frame, T_odom_camera = taken
             try:
                 found = self._localizer(frame, start=self.corrected(T_odom_camera))
-            except BaseException as error:  # for the caller, whose thread is another one
+            except BaseException as error:  # raised in the caller's thread
                 with self._changed:
                     self._error = error
                 continue

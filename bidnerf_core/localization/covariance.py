@@ -1,4 +1,4 @@
-"""Covariances of poses, for right updates in the camera frame: translation (metres) before rotation (radians)."""
+"""Covariances of poses, of right updates in the camera frame: translation (metres) before rotation (radians)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from bidnerf_core.localization.costs.surface import PointCloud, PointScales, Sur
 from bidnerf_core.mapping import SurfaceMap
 
 LEAST_VARIANCE = 1e-9
-"""Lower limit of the variance of residuals, in units of their scale; below it there are only rounding errors."""
+"""Lower limit of the variance of residuals, in units of their scale; smaller values are rounding errors."""
 FINEST = 2.0
-"""Scale of distances at the end of a search, in cells of the surface's grid."""
+"""Scale of the distance residuals at the end of a search, in cells of the surface's grid."""
 
 
 def weight(measurements: float, variance: float) -> float:
-    """Return the factor of a mean squared residual in a sum of terms, given the number of independent measurements it stands for."""
+    """Return the weight of a mean squared residual in a sum of terms, from its number of independent measurements."""
     return measurements / max(variance, LEAST_VARIANCE)
 
 
@@ -39,7 +39,9 @@ def sandwich_covariance(
         return torch.full_like(hessian, torch.inf)
     unit = hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
     scaled = unit[..., None] * hessian * unit[..., None, :]
-    finite = scaled.isfinite().all(-1).all(-1)  # slopes of a field may overflow, and eigh would fail on those
+    finite = (
+        scaled.isfinite().all(-1).all(-1)
+    )  # a field's gradients may overflow, and eigh would fail on them
     values, axes = torch.linalg.eigh(
         torch.where(finite[:, None, None], scaled, torch.eye(6, dtype=scaled.dtype, device=scaled.device))
     )
@@ -51,7 +53,7 @@ def sandwich_covariance(
 
 
 def finest_cost(surface: SurfaceMap, cloud: PointCloud) -> SurfaceCost:
-    """Return the cost of measured points at the finest scale of distances that the surface's cells allow."""
+    """Return the cost of measured points at the finest distance scale that the surface's cells allow."""
     return SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
 
 
@@ -64,10 +66,9 @@ def surface_covariance(
 ) -> Float[Tensor, "6 6"]:
     """Return the covariance of a pose that aligns measured points with the surface; positive definite.
 
-    It is the inverse of the Hessian divided by the variance of the residuals; the points of a view count as ``points``
-    independent ones. Directions that the points do not determine,
-    such as the way along a bare wall, have the size of the scene or half a turn as standard deviation. The uncertainties
-    of the sensor's scale and offset are added, which all its points share.
+    It is the inverse of the Hessian divided by the variance of the residuals, with the points of a view counting as ``points``
+    independent ones. Along directions that the points do not determine, such as that of a bare wall, the standard deviation is
+    the size of the scene or half a turn. The uncertainties of the sensor's scale and offset, which all points share, are added.
     """
     cost = finest_cost(cost.surface, cost.cloud)
     variance = cost.residual_variance(T[None])[0].clamp(min=LEAST_VARIANCE) / (points * views)
@@ -81,12 +82,12 @@ def surface_covariance(
 
 
 def scale_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
-    """Return the update about the cloud's pivot that keeps it in place while depths grow by 100 %, metres."""
+    """Return the update about the cloud's pivot that compensates for depths larger by 100 %, metres."""
     return torch.cat([-cloud.middle.double().cpu(), torch.zeros(3, dtype=torch.float64)])
 
 
 def offset_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
-    """Return the update about the cloud's pivot that keeps it in place while distances grow by a metre, metres per metre."""
+    """Return the update about the cloud's pivot that compensates for an offset of distances, metres per metre."""
     sight = torch.nn.functional.normalize((cloud.points - cloud.origins).double(), dim=-1)
     return torch.cat([-sight.mean(0).cpu(), torch.zeros(3, dtype=torch.float64)])
 

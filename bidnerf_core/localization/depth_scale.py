@@ -1,4 +1,4 @@
-"""What is known about the errors that all depths of an image share, a factor and an offset, and measured points with them."""
+"""The scale and offset errors that all depths of an image share: priors on them, and measured points under them."""
 
 from __future__ import annotations
 
@@ -18,42 +18,42 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.solvers.pivots import Pivot
 
 LANDMARK_SCALE_NOISE = 0.01
-"""Relative standard deviation of the depth scale that a few landmarks give, from the right pose."""
+"""Relative standard deviation of the depth scale from a few landmarks, at the right pose."""
 PRIOR_WIDTH = 2.0
-"""Ratio of the standard deviation of the depth scale's prior to that of the sensor model: some sensors are off by far more."""
+"""Ratio of the standard deviation of the depth scale's prior to the sensor model's, since some sensors are off by far more."""
 UNKNOWNS = 8
-"""Number of unknowns: six of the pose, the factor and the offset."""
+"""Number of unknowns: six for the pose, the factor and the offset."""
 PLAUSIBLE = 5.0
-"""Deviation of the depth scale by landmarks, in standard deviations, beyond which the depth has another unit or is wrong."""
+"""Deviation of the landmarks' depth scale, in standard deviations, beyond which the depth has another unit or is wrong."""
 LEAST_SCALE_DEVIATION = 1e-4
-"""Least standard deviation of the factor, and of the offset in units of the distance, so that exact depth can be fused."""
+"""Minimum standard deviation of the factor, and of the offset relative to the distance, so that exact depth can be fused."""
 
 
 @dataclass(frozen=True)
 class DepthScale:
-    """What a sensor's tolerance and landmarks imply for the factor and the offset that correct measured depth."""
+    """Constraints from the sensor's tolerance and the landmarks on the scale and offset of measured depth."""
 
     deviation: float  # standard deviation of the factor about 1, from the sensor's tolerance
-    # Factor from the pose at which landmarks were matched; None if too little was measured.
+    # Factor at the pose where landmarks were matched; None if too little depth was measured.
     by_landmarks: float | None = None
     offset: float = 0.0  # metres: standard deviation of the offset
 
     @staticmethod
     def of(found: LandmarkPose, sensor: DepthSensorModel) -> DepthScale:
-        """Return what is known about the scale of a sensor's depths, given a pose by landmarks."""
+        """Return the constraints on the scale of a sensor's depths, given a pose by landmarks."""
         return DepthScale(PRIOR_WIDTH * sensor.scale, found.depth_scale, PRIOR_WIDTH * sensor.offset)
 
     @property
     def objection(self) -> str | None:
-        """Why sensor and landmarks cannot both be right, so that the depth should be left out; None if they can."""
+        """Contradiction between sensor and landmarks, because of which depth should not be used; None if there is none."""
         deviation = math.hypot(self.deviation, LANDMARK_SCALE_NOISE)
         if self.by_landmarks is None or abs(self.by_landmarks - 1) <= PLAUSIBLE * deviation:
             return None
-        return f"it is {1 / self.by_landmarks:.3g} times as long as by landmarks"
+        return f"it is {1 / self.by_landmarks:.3g} times that of the landmarks"
 
     @property
     def estimate(self) -> float:
-        """The factor that landmarks give, shrunk towards 1 by the sensor's prior; 1 if they give none."""
+        """The factor from landmarks, shrunk towards 1 by the sensor's prior; 1 if they give none."""
         if self.by_landmarks is None:
             return 1.0
         weight = self.deviation**2 / (self.deviation**2 + LANDMARK_SCALE_NOISE**2)
@@ -61,9 +61,9 @@ class DepthScale:
 
 
 def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Problem:
-    """Return the problem with a pose as its start, that pose's intrinsics and motion, and measured depth on the map's scale.
+    """Return the problem with a pose as its start, the pose's intrinsics and motion, and depth corrected to the map's scale.
 
-    ``factor`` is the fused pose's correction of that scale.
+    ``factor`` is the fused pose's further correction of that scale.
     """
     scale, views = factor * DepthScale.of(found, problem.sensor).estimate, []
     for view in problem.views:
@@ -76,24 +76,24 @@ def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Pro
 
 @dataclass(frozen=True, eq=False)
 class PoseAndDepth:
-    """A pose, and the factor and the offset (metres) that correct the distances of measured points."""
+    """A pose, with the factor and the offset (metres) that correct the distances of measured points."""
 
     T: SE3
     factor: float = 1.0
     offset: float = 0.0
 
     def moved(self, about: Pivot, update: Float[Tensor, "8"]) -> PoseAndDepth:
-        """Return the state after an update of the pose about a pivot, the factor and the offset."""
+        """Return the state after an update of the pose (about a pivot), the factor and the offset."""
         T = about.moved(self.T[None], update[None, :6])[0].normalized()
         return PoseAndDepth(T, self.factor + float(update[6]), self.offset + float(update[7]))
 
 
 @dataclass(frozen=True, eq=False)
 class ScaledPoints:
-    """Measured points on the surface, whose depths share an unknown factor and an unknown offset.
+    """Measured points on the surface, whose depths share an unknown factor and offset.
 
-    The factor is relative to ``scale.estimate``, by which the points of ``cost`` were corrected from the pose ``start``.
-    Equations are of eight unknowns: an update of the pose about the middle of those points, the factor and the offset.
+    The factor is relative to ``scale.estimate``, by which the points of ``cost`` were corrected at the pose ``start``. The
+    equations have eight unknowns: an update of the pose about the middle of those points, the factor and the offset.
     """
 
     cost: SurfaceCost
@@ -101,20 +101,20 @@ class ScaledPoints:
     start: SE3
 
     def at(self, here: PoseAndDepth) -> SurfaceCost:
-        """Return the cost of the points with their depths corrected, about their own middle."""
+        """Return the cost of the points with their depths corrected, with their own middle as the pivot."""
         return replace(self.cost, cloud=self.cost.cloud.corrected(here.factor, here.offset))
 
     def about_middle(self, cost: SurfaceCost, equations: NormalEquations) -> NormalEquations:
-        """Convert equations about the middle of the points of ``cost`` to ones about the middle of those of ``self.cost``."""
+        """Convert equations about the middle of the points of ``cost`` to the middle of those of ``self.cost``."""
         updates = torch.eye(UNKNOWNS, dtype=torch.float64)
         updates[:6, :6] = cost.cloud.pivot.adjoint_from(self.cost.cloud.pivot)
         return equations.of_others(updates)
 
     def assumed(self, at: PoseAndDepth) -> NormalEquations:
-        """Return the equations of what the sensor's tolerance and the landmarks imply for the factor and the offset.
+        """Return the equations of the priors on the factor and the offset, from the sensor's tolerance and the landmarks.
 
-        Landmarks give the ratio of their depths to the measured ones. With the pose, it changes in proportion to the distances
-        of the points of the scene that were measured.
+        Landmarks give the ratio of their depths to the measured ones. It changes with the pose in proportion to the distances
+        of the measured points.
         """
         applied, distance = self.scale.estimate, self._distance
         by_factor, by_offset = applied * _unit(6), _unit(7)
@@ -152,7 +152,7 @@ class ScaledPoints:
 
 
 def residual_equations(residual: float, jacobian: Float[Tensor, "k"], deviation: float) -> NormalEquations:
-    """Return the normal equations of a single residual whose standard deviation is ``deviation``."""
+    """Return the normal equations of a single residual with standard deviation ``deviation``."""
     whitened, value = jacobian / deviation, residual / deviation
     return NormalEquations(
         whitened.new_tensor([value**2]), value * whitened[None], torch.outer(whitened, whitened)[None]

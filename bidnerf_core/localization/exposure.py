@@ -1,4 +1,4 @@
-"""The exposure of an image relative to the map: a gain and a bias for each colour channel."""
+"""Exposure of an image relative to the map: a gain and a bias per colour channel."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torch import Tensor
 from bidnerf_core.geometry.robust import Robust
 
 EXPOSURE_ROUNDS = 6
-"""Rounds of robust reweighting in which the exposure is fitted."""
+"""Number of iterations of robust reweighting for the fit of the exposure."""
 EXPOSURE_PRIOR = 0.001
-"""Precision of the gain's prior, relative to all weights. It matters only if everything in view has one colour."""
+"""Precision of the gain's prior, relative to the sum of weights. It matters only if everything in view has one colour."""
 NEARLY_CLIPPED = 0.01
-"""Distance from black and from white, in [0, 1], within which an image's colours may be clipped."""
+"""Distance from black or white, in [0, 1], within which an image's colours may be clipped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """The model ``measured = gain * rendered + bias``, of each channel from each of h poses."""
+    """The model ``measured = gain * rendered + bias`` of each channel, for each of h poses."""
 
     gain: Float[Tensor, "h c"]
     bias: Float[Tensor, "h c"]
@@ -30,9 +30,9 @@ class Exposure:
 
 
 def clipped(seen: Float[Tensor, "*s"], measured: Float[Tensor, "#*s"]) -> Bool[Tensor, "*s"]:
-    """Return which colours are black or white in the image while the exposure takes the rendered ones, ``seen``, even further.
+    """Return a mask of the colours clipped in the image for which the exposed rendering ``seen`` is out of range too.
 
-    Such colours agree with the exposure, whatever the difference, but do not determine it.
+    Such colours agree with the exposure whatever the difference, but do not constrain it.
     """
     return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
 
@@ -44,10 +44,10 @@ def fit_exposure(
     gain_precision: Float[Tensor, "*#h"] | float,
     bias_precision: float = 0.0,
 ) -> Exposure:
-    """Return the gain and the bias of weighted least squares with Gaussian priors about 1 and 0.
+    """Return the gain and the bias by weighted least squares, with Gaussian priors about 1 and 0.
 
-    A precision is the inverse variance of its prior, in the unit of ``weights``. The prior decides where the data do not,
-    as in a channel that is constant over the image.
+    A precision is the inverse variance of a prior, in the unit of ``weights``. The prior matters where the data are not
+    sufficient, as in a channel that is constant over the image.
     """
     off = measured - rendered
     total = weights.sum(-1).expand(rendered.shape[:2]) + bias_precision
@@ -62,10 +62,10 @@ def fit_exposure(
 def robust_exposure(
     rendered: Float[Tensor, "h c n"], measured: Float[Tensor, "c n"], weights: Float[Tensor, "c n"], robust: Robust
 ) -> Exposure:  # fmt: skip
-    """Fit the exposure at each pose by iteratively reweighted least squares; colours that it clips have no weight.
+    """Fit the exposure at each pose by iteratively reweighted least squares; clipped colours have no weight.
 
-    The rounds begin at a gain of 1. With a redescending loss, they succeed for images up to two stops darker, but only one stop
-    brighter.
+    The iteration starts at a gain of 1. With a redescending loss, it converges for images up to two stops darker, but only one
+    stop brighter.
     """
     rendered = torch.where(weights > 0, rendered, 0)
     exposure = Exposure(torch.ones_like(rendered[..., 0]), torch.zeros_like(rendered[..., 0]))

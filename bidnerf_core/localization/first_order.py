@@ -1,10 +1,10 @@
-"""First-order methods: Adam on the loss of sampled rays, of which ``bid`` and ``inerf`` are two configurations.
+"""First-order methods: Adam on the loss of sampled rays, with the configurations ``bid`` and ``inerf``.
 
-``bid`` takes colour and depth of one or several images, at the coarse level (BID-NeRF, Alg. 1); ``inerf`` the colours of one
-image, in full detail (Yen-Chen et al. 2021, iNeRF). "In full detail" is the field itself, which a NeRF renders hierarchically
-with its coarse and its fine network. iNeRF optimizes the magnitude and the axis of one screw motion from the start; here each
-step is an update of its own in the same frame, the world's. The two differ to second order, and updates have no axis that
-would be undefined at magnitude 0.
+``bid`` uses colour and depth of one or several images at the coarse level (BID-NeRF, Alg. 1), and ``inerf`` the colours of one
+image in full detail (Yen-Chen et al. 2021, iNeRF). "In full detail" means the field itself, which a NeRF renders hierarchically
+with its coarse and fine networks. iNeRF optimizes the magnitude and axis of one screw motion from the start; here, each step is
+a separate update in the same frame, the world's. The two differ to second order, and updates have no axis that is undefined at
+magnitude 0.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.settings import Settings
 
 SUPPORTING_RAYS = 1024
-"""Number of rays by which an answer is compared with its rivals."""
+"""Number of rays on which a pose is compared with its rivals."""
 PAPERS_REACH = ReachSettings()
-"""The paper's objective, with nothing added."""
+"""The paper's objective, without additions."""
 WIDE_REACH = ReachSettings(candidates=3, box_weight=1.0)
-"""Pixels on matter and measured points in the box of the scene. On Lego this helped most (``benchmarks/bid_variants.py``)."""
+"""Favour pixels on matter, and keep measured points in the scene's box: the best variant on Lego (``benchmarks/bid_variants.py``)."""
 PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
 """The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is provisional."""
 
@@ -54,7 +54,7 @@ def descended(
     problem: Problem, rays: DescentSettings, adam: AdamSettings, objective: Objective, depth_rays: int, seed: int,
     method: str, reach: ReachSettings = PAPERS_REACH,
 ) -> Localization:  # fmt: skip
-    """Descend with Adam from ``problem.start`` (Alg. 1) and judge the answer."""
+    """Descend with Adam from ``problem.start`` (Alg. 1), then accept or reject the pose."""
     began = time.perf_counter()
     start, device = problem.start_for(method), problem.device
     generator = torch.Generator(device).manual_seed(seed)
@@ -86,7 +86,7 @@ def descended(
 def _support(
     problem: Problem, rays: DescentSettings, objective: Objective, depth_rays: int, T: SE3, seed: int
 ) -> Support:
-    """Return how well rays to which the answer was not fitted distinguish it from its rivals."""
+    """Return how well rays not used in the fit distinguish the pose from its rivals."""
     problem, about = problem.on_device(), pivot("camera", problem).to(problem.device)
     counts = RayCounts(SUPPORTING_RAYS, min(depth_rays, SUPPORTING_RAYS))
     drawn = draw_weighted_rays(problem, objective, counts, "uniform", 1, torch.Generator().manual_seed(seed))
@@ -110,7 +110,7 @@ BID_PRESETS = {
     "paper": BidConfig(DescentSettings(level=0, pivot="camera"), PAPER_STEPS, reach=PAPERS_REACH),
     "paper-scene": BidConfig(DescentSettings(level=0, pivot="scene"), PAPER_STEPS, reach=PAPERS_REACH),
 }
-"""The paper's settings with updates as in its Alg. 1, in the camera's frame, and with ours, about the middle of the scene."""
+"""The paper's settings, with updates in the camera's frame as in its Alg. 1, and about the middle of the scene as by default."""
 
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
@@ -139,7 +139,7 @@ class InerfConfig(Settings):
 
 
 INERF_PRESETS = {"paper": replace(InerfConfig(), adam=AdamSettings(max_steps=1000))}
-"""The settings with which BID-NeRF compares: iNeRF's own learning rate, 1000 steps of 2048 rays."""
+"""The settings of BID-NeRF's comparison: iNeRF's own learning rate, and 1000 steps of 2048 rays."""
 
 
 def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:

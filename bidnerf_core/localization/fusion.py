@@ -1,4 +1,4 @@
-"""The pose that best explains landmarks, measured points on the surface and rendered rays together."""
+"""Estimation of a pose jointly from landmarks, measured points on the surface and rendered rays."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.progress import check_stopped
 
 LEAST_DECREASE = 0.1
-"""Predicted decrease of the sum, which is a squared Mahalanobis distance, below which a step is the last."""
+"""Predicted decrease of the sum (a squared Mahalanobis distance) below which a step is the last."""
 VAGUE = 1e3
-"""Factor on the deviations of a prior that is to have no influence."""
+"""Factor on the standard deviations of a prior that should have no influence."""
 UNSURE = 2.0
-"""Factor on the deviation of the prior, with which rays are weighed first."""
+"""Factor on the prior's standard deviation for the initial weights of the rays."""
 FIRST_DAMPING = 1e-3
 """Damping of the first step."""
 
@@ -45,7 +45,7 @@ FIRST_DAMPING = 1e-3
 def drawn_rays(
     problem: Problem, rays: int, about: Pivot, generator: Generator, by_depth: bool = False, loss: RobustName = "geman-mcclure",
 ) -> RenderedCost:  # fmt: skip
-    """Return the cost of rays; its usual colour loss is redescending, so what hides the scene counts as outliers."""
+    """Return the cost of drawn rays; the default colour loss is redescending, so occluders become outliers."""
     depth = DepthSettings() if problem.has_depth and by_depth else None
     colour = ColourSettings(colour_loss=loss)
     settings = RenderedCostSettings(colour, depth, RefinementSettings(exposure=True))
@@ -55,16 +55,16 @@ def drawn_rays(
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What is fused, each with the number of independent measurements that it counts as."""
+    """The measurements to fuse, with the number of independent ones of each kind."""
 
     prior: GaussianPrior  # on the pose, by landmarks
     points: ScaledPoints | None = None  # about the prior's pivot
-    rays: RenderedCost | None = None  # about that pivot too
+    rays: RenderedCost | None = None  # about the same pivot
     independent_points: float = 0.0
     independent_rays: float = 0.0
 
     def at(self, state: PoseAndDepth, deviation: float) -> Fit:
-        """Compare with the measurements from a state; what is seen from it is uncertain by ``deviation`` (metres)."""
+        """Evaluate the measurements at a state, for which the scene's position is uncertain by ``deviation`` (metres)."""
         points, rays = None, None
         if self.points is not None:
             cost = self.points.at(state)
@@ -76,7 +76,7 @@ class Measurements:
         return Fit(self, state, self._assumed(state), points, rays).weighed(deviation)
 
     def without_landmarks(self, start: SE3) -> Measurements:
-        """Return the measurements without what landmarks imply, about another pose."""
+        """Return the measurements without the landmarks' constraints, with a vague prior about another pose."""
         vague = replace(self.prior, mean=start, covariance=VAGUE**2 * self.prior.covariance)
         points = self.points
         if points is not None:
@@ -84,7 +84,7 @@ class Measurements:
         return replace(self, prior=vague, points=points)
 
     def _assumed(self, at: PoseAndDepth) -> NormalEquations:
-        """Return the equations of what is known besides the measurements; without points, the errors of depth are tied to 0."""
+        """Return the equations of the priors; without points, the errors of depth are fixed at 0."""
         by_prior = of_pose(self.prior(at.T[None]))
         if self.points is not None:
             return by_prior + self.points.assumed(at)
@@ -94,7 +94,7 @@ class Measurements:
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A kind of measurement at one state: the equations of its cost, the variance of its residuals, and how much it counts."""
+    """A kind of measurement at one state: the equations of its cost, the variance of its residuals, and its weight."""
 
     equations: NormalEquations
     variance: float
@@ -118,7 +118,7 @@ class Fit:
     rays: Term | None = None
 
     def weighed(self, deviation: float) -> Fit:
-        """Return the fit with rays as uncertain as what is seen from here, in metres."""
+        """Return the fit with the rays weighted for a position of the scene uncertain by ``deviation`` (metres)."""
         if self.residuals is None:
             return self
         residuals = replace(self.residuals, surface_sigma=deviation)
@@ -136,7 +136,7 @@ class Fit:
         return sum((term.equations.scaled(term.weight) for term in self.terms), start=self.assumed)
 
     def cost(self, weighed: Fit) -> float:
-        """Return the sum of all terms with the weights that they have in another fit."""
+        """Return the sum of all terms with the weights of another fit."""
         total = float(self.assumed.cost[0])
         pairs = zip(self.terms, weighed.terms, strict=True)
         return total + sum(there.weight * float(here.equations.cost[0]) for here, there in pairs)
@@ -144,7 +144,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class FusedPose:
-    """A pose estimated from several measurements with its covariance, and the errors of depth estimated with it."""
+    """A pose estimated from several kinds of measurements, its covariance, and the errors of depth estimated with it."""
 
     state: PoseAndDepth
     covariance: Float[Tensor, "6 6"]  # metres, radians; of a right update
@@ -157,7 +157,7 @@ class FusedPose:
 def nearby_start(
     measurements: Measurements, rays: RenderedCost, count: int, generator: Generator
 ) -> FusedPose:
-    """Return the pose that explains prior and rays best among the prior's mean and ``count`` draws from it.
+    """Return the pose that explains prior and rays best, among the prior's mean and ``count`` draws from it.
 
     Refinement on rays converges only if rendered and observed edges overlap already, which the mean of a vague prior does not
     guarantee.
@@ -175,13 +175,12 @@ def nearby_start(
 
 
 def fused_pose(measurements: Measurements, most_steps: int, start: FusedPose | None = None) -> FusedPose:
-    """Return the pose that explains all terms best.
+    """Return the pose that minimizes the sum of all terms.
 
-    The terms are weighed anew by how well they fit after each step: with weights from a start that is far off, they would
-    count for little until the end. Rays whose rendering changes steeply over the distance by which what is seen may be off
-    count less, since their linearization does not hold that far. A step that does not lower the sum is not taken; the steps
-    end with one that is short beside the pose's deviation, and where equations are not finite. The covariance allows for the
-    last step.
+    The terms are reweighted by their residuals after each step, since weights from a distant start would remain too small. Rays
+    whose rendering changes steeply within the uncertainty of the scene's position have less weight, since their linearization
+    does not hold that far. A step that does not lower the sum is not taken. The iteration ends with a step that is short
+    compared with the pose's standard deviation, or when the equations are not finite. The covariance includes the last step.
     """
     prior, damping = measurements.prior, torch.full((1,), FIRST_DAMPING, dtype=torch.float64)
     covariance = prior.at_pivot if start is None else start.covariance

@@ -1,4 +1,4 @@
-"""``Localizer``: prepares a map once, and is then called with frames."""
+"""``Localizer``: prepares a map once, then localizes frames in it."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from bidnerf_core.localization.settings import ByColourConfig
 WARM_UP_RAYS = 64
 
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
-"""A pose T_world_camera: an ``SE3``, or a 4x4 matrix of any kind, by rows."""
+"""A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
 
 
 class Localizer:
-    """Finds the poses of frames in one map, by one method.
+    """Localizes frames in one map by one method.
 
-    The map, the method and its settings are checked once, when the localizer is made. It keeps no state between calls, so
-    threads may share it; the same seed gives the same answer on the same machine.
+    The map, the method and its settings are checked once, on construction. It keeps no state between calls, so threads may share
+    it; the same seed gives the same answer on the same machine.
     """
 
     def __init__(
@@ -53,11 +53,10 @@ class Localizer:
     ) -> None:
         """Prepare ``map`` for ``method``.
 
-        ``config``: an instance of the method's settings (``METHODS[method].config_type``), by default with its defaults.
-        ``preset``: the name of other settings (``METHODS[method].presets``), in place of ``config``.
-        ``device``: where the field, the surface and the landmarks lie, by default where they are; the parts of a map that lie
-        elsewhere are copied. ``warm_up``: do now what the first call would otherwise have to wait for. Raises ``InputError``
-        for what does not fit.
+        ``config`` is an instance of the method's settings (``METHODS[method].config_type``), by default with its defaults.
+        ``preset`` is the name of other settings (``METHODS[method].presets``) in place of ``config``. ``device`` is that of the
+        field, the surface and the landmarks, by default where they are; parts of the map on another device are copied.
+        ``warm_up``: initialize now, so that the first call is not delayed. Raises ``InputError`` for unsuitable arguments.
         """
         map = checked_map(map, "Localizer")
         self.method = method
@@ -76,13 +75,13 @@ class Localizer:
         depth_rays: Observations | None = None,
         seed: int = 0,
     ) -> Localization:
-        """Find T_world_camera of a frame, or of the last of several views.
+        """Estimate T_world_camera of a frame, or of the last of several views.
 
-        ``query``: a frame, or views with known relative poses (``T_ref_camera`` in any common frame): a rig, or a window of
-        a sequence. ``start``: a guess at T_world_camera of the last view, which some methods do without.
-        ``depth_rays``: distances that another sensor measured, such as a lidar, in the frame of the last camera; methods
-        that use colour alone refuse them. Raises ``InputError`` for a query that cannot be localized at all; a pose that is
-        merely doubtful is returned, with an ``outcome`` other than ``CONVERGED``.
+        ``query`` is a frame, or views with known relative poses (``T_ref_camera`` in any common frame): a rig, or a window of a
+        sequence. ``start`` is a guess at T_world_camera of the last view, which some methods do not need. ``depth_rays`` are
+        distances measured by another sensor, such as a lidar, in the frame of the last camera; methods that use colour alone
+        reject them. Raises ``InputError`` for a query that cannot be localized at all; a doubtful pose is returned with an
+        ``outcome`` other than ``CONVERGED``.
         """
         if depth_rays is not None:
             require_use_of_depth(self.method)
@@ -94,12 +93,12 @@ class Localizer:
         start: Start | None = None,
         depth_rays: Observations | None = None,
     ) -> Problem:
-        """Return what ``__call__`` solves, which may be solved several times: the images' keypoints are found once."""
+        """Return the problem that ``__call__`` solves; solving it several times detects the images' keypoints only once."""
         T_world_camera = None if start is None else start_pose(start)
         return rig(self.map, _views(query), T_world_camera, depth_rays, self.matcher)
 
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
-        """Return the answer to a ``problem`` that this localizer made."""
+        """Solve a ``problem`` created by this localizer."""
         found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
             raise InputError(
@@ -115,22 +114,22 @@ class Localizer:
 
     @property
     def depth_sensor_name(self) -> str:
-        """The name of the sensor that measures depth, as the settings say."""
+        """The name of the depth sensor in the settings."""
         return self._method.depth_sensor(self.config)
 
     @property
     def risk(self) -> float | None:
-        """The tolerated share of wrong answers among the accepted ones; None: answers are accepted as usual."""
+        """The tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance."""
         return self._method.risk(self.config)
 
     @property
     def by_colour(self) -> ByColourConfig:
-        """The settings of refinement by colour alone; methods without such settings have the usual ones."""
+        """The settings of refinement by colour alone; the defaults for methods without such settings."""
         return self._method.by_colour(self.config)
 
     @property
     def rays(self) -> int:
-        """The number of rays that may be rendered to tell explanations of an image apart; 0 where nothing is rendered."""
+        """The number of rays that may be rendered to compare explanations of an image; 0 if nothing is rendered."""
         return self._method.rays(self.config)
 
     @property
@@ -140,7 +139,7 @@ class Localizer:
 
     @property
     def matches_landmarks(self) -> bool:
-        """Whether the map has landmarks and the method matches them, with its settings."""
+        """Whether the map has landmarks and the method, with its settings, matches them."""
         return self.matcher is not None and self._method.matches_landmarks(self.config)
 
     @torch.no_grad()
@@ -157,7 +156,7 @@ class Localizer:
 
 
 def map_with_distances(localizer: Localizer) -> SceneMap:
-    """Return the localizer's map. Raises ``InputError`` where it was made from one place: nothing has a position in it."""
+    """Return the localizer's map. Raises ``InputError`` if its photos are from one place, as it then has no positions."""
     if not localizer.map.has_distances:
         raise InputError(
             f"tracking needs positions, but {NO_DISTANCES}; expected a map of photos from several places"
@@ -166,7 +165,7 @@ def map_with_distances(localizer: Localizer) -> SceneMap:
 
 
 def checked_map(given: object, where: str) -> SceneMap:
-    """Return a map. Raises ``InputError``, which begins with ``where``, for anything else, such as its folder."""
+    """Return ``given`` if it is a map. Raises ``InputError``, prefixed with ``where``, for anything else, such as its folder."""
     if isinstance(given, SceneMap):
         return given
     is_path = isinstance(given, str | bytes) or hasattr(given, "__fspath__")
@@ -179,7 +178,7 @@ def _checked_config(method: Method, name: str, config: Any, preset: str | None) 
         return method.settings(preset)
     if preset is not None:
         raise InputError(
-            f"preset {preset!r} and a config are given; expected one, or settings_of({name!r}, ..., preset={preset!r})"
+            f"got both preset {preset!r} and a config; give one, or use settings_of({name!r}, ..., preset={preset!r})"
         )
     if not isinstance(config, method.config_type):
         expected, found = method.config_type.__name__, type(config).__name__
@@ -215,9 +214,9 @@ def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
 
 
 def start_pose(start: Start, what: str = "start") -> SE3:
-    """Return a pose given in any form as a rigid transform; float64.
+    """Convert a pose in any form to a rigid transform in float64.
 
-    Raises ``InputError``, which begins with ``what``, for anything that is not one pose.
+    Raises ``InputError``, prefixed with ``what``, for anything that is not a single pose.
     """
     if isinstance(start, SE3):
         found, count = start.translation.shape, start.translation.numel() // 3

@@ -1,4 +1,4 @@
-"""``Method``, what a stranger registers to find poses in a way of their own, and the methods by name."""
+"""``Method``, by which plugins register their own localization methods, and the methods by name."""
 
 from __future__ import annotations
 
@@ -40,28 +40,28 @@ def _usual_colour(config: Any) -> ByColourConfig:
 class Method:
     """A localization method: how it finds poses, its settings, what it needs and what it offers.
 
-    The functions of a config return what the settings say about a question that is asked outside of the method.
+    The functions of a config return settings that are needed outside the method.
     """
 
     solve: Callable[[Problem, Any, int], Localization]
-    """Returns the pose for a problem, by settings of ``config_type``; all random choices are drawn from the seed."""
+    """Solves a problem with settings of ``config_type``; all random choices are drawn from the seed."""
     config_type: type  # a frozen dataclass of settings, with a default for every field
     needs_start: bool  # whether it needs a guess at the pose
     uses_depth: bool = True  # whether it uses measured depth
-    presets: Mapping[str, Any] = field(default_factory=dict)  # other settings than the defaults, by name
+    presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
-    matches_landmarks: Callable[[Any], bool] = _always  # whether it matches images with them, by its settings
+    matches_landmarks: Callable[[Any], bool] = _always  # whether its settings make it match images with them
     depth_sensor: Callable[[Any], str] = _unknown_sensor  # the name of the sensor that measured the depth
     by_colour: Callable[[Any], ByColourConfig] = _usual_colour  # how a tracker refines poses by colour alone
     rays: Callable[[Any], int] = (
-        _none_rendered  # how many may be rendered to tell explanations of an image apart
+        _none_rendered  # how many may be rendered to compare explanations of an image
     )
-    # the share of wrong answers among the accepted ones that is tolerated; None: accepted as usual
+    # the tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance
     risk: Callable[[Any], float | None] = _no_risk
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:
-        """Return the default settings or those of a preset. Raises ``InputError`` for an unknown one."""
+        """Return the default settings or those of a preset. Raises ``InputError`` for an unknown preset."""
         if preset is None:
             return self.config_type()
         if preset not in self.presets:
@@ -80,33 +80,33 @@ def _defects(method: Any) -> Iterator[str]:
 METHODS: Plugins[Method] = Plugins("methods", _defects, first=("auto", "bid", "inerf", "bid-lm", "inerf-lm"))
 """The methods by name."""
 USUAL_METHOD = "auto"
-"""The method that is used where none is named."""
+"""The name of the default method."""
 
 RENAMED = {"play": "surface_sigma"}
 """Current names of renamed settings, by the names under which earlier versions stored them."""
 
 
 def find_method(name: str) -> Method:
-    """Return a method by name. Raises ``PluginError``, an ``InputError``, for an unknown name and a broken plugin."""
+    """Return a method by name. Raises ``PluginError`` (an ``InputError``) for an unknown name or a broken plugin."""
     return METHODS.load(name)
 
 
 def require_use_of_depth(method: str) -> None:
-    """Raise ``InputError`` for a method that would ignore depth points, which were given on purpose."""
+    """Raise ``InputError`` for a method that would ignore explicitly given depth points."""
     if not find_method(method).uses_depth:
         others = _names_of(lambda other: other.uses_depth)
-        raise InputError(f"method {method!r} uses colour alone, got depth points; take method {others}")
+        raise InputError(f"method {method!r} uses colour alone, got depth points; use method {others}")
 
 
 def require_start(method: str, given: bool) -> None:
-    """Raise ``InputError`` for a method that needs a start where none is given."""
+    """Raise ``InputError`` for a method that needs a start if none is given."""
     if find_method(method).needs_start and not given:
         others = _names_of(lambda other: not other.needs_start)
-        raise InputError(f"method {method!r} needs a start; give one by --start, or take method {others}")
+        raise InputError(f"method {method!r} needs a start; give one by --start, or use method {others}")
 
 
 def _names_of(wanted: Callable[[Method], bool]) -> str:
-    """Return the names of the methods that have a property, leaving out those that cannot be loaded."""
+    """Return the names of the methods with a property, except those that cannot be loaded."""
     found = []
     for name in METHODS:
         with contextlib.suppress(PluginError):
@@ -121,8 +121,8 @@ def matches_landmarks(method: str, config: Any) -> bool:
 
 
 def settings_of(method: str, values: dict[str, Any], where: str = "config", preset: str | None = None) -> Any:
-    """Return a method's settings; ``values`` are those that differ from its defaults or from a preset, by their flat names.
+    """Return a method's settings; ``values`` are those that differ from its defaults or a preset, by their flat names.
 
-    Raises ``InputError``, which begins with ``where``, for an unknown method or name, or a value that is not allowed.
+    Raises ``InputError``, prefixed with ``where``, for an unknown method or name, or a value that is not allowed.
     """
     return from_flat(find_method(method).settings(preset), values, where, RENAMED)

@@ -1,4 +1,4 @@
-"""The costs of poses and their quadratic models, which costs compute and solvers use."""
+"""Costs of poses and their quadratic models: the interface between costs and solvers."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 from bidnerf_core.geometry.se3 import SE3
 
 ROUNDING = 1e-9
-"""Damping that is always added; along a direction on which the cost does not depend, the step is then 0."""
+"""Damping that is always added, so that the step is 0 along directions on which the cost does not depend."""
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """A cost and its Gauss-Newton model ``cost + 2 g.xi + xi.H.xi``, for each of h poses; float64.
 
-    The k unknowns are the six of a pose's update, after which others may follow.
+    The k unknowns are the six of a pose's update, possibly followed by others.
     """
 
     cost: Float[Tensor, "h"]
@@ -50,7 +50,7 @@ class NormalEquations:
     def solve(self, damping: Float[Tensor, "h"]) -> Float[Tensor, "h k"]:
         """Return the step of ``(H + damping diag H) xi = -g``, by Cholesky; 0 where the equations cannot be solved."""
         diagonal = self.hessian.diagonal(dim1=-2, dim2=-1)
-        unit = torch.where(diagonal > 0, diagonal, 1).rsqrt()  # makes the diagonal 1, whatever the units
+        unit = torch.where(diagonal > 0, diagonal, 1).rsqrt()  # scales the diagonal to 1, whatever the units
         scaled = unit[..., None] * self.hessian * unit[..., None, :]
         eye = torch.eye(scaled.shape[-1], dtype=scaled.dtype, device=scaled.device)
         factor, failed = torch.linalg.cholesky_ex(scaled + (damping[:, None, None] + ROUNDING) * eye)
@@ -61,7 +61,7 @@ class NormalEquations:
 
 @runtime_checkable
 class Cost(Protocol):
-    """Computes how badly each pose of a batch explains the measurements, with the normal equations of that cost."""
+    """Computes the cost of each pose of a batch, with its normal equations."""
 
     def __call__(self, T: SE3) -> NormalEquations: ...
 
@@ -79,7 +79,7 @@ class Sum:
 
 @dataclass(frozen=True)
 class Scaled:
-    """A cost multiplied by a constant, its weight relative to others."""
+    """A cost multiplied by a constant weight."""
 
     cost: Cost
     factor: float

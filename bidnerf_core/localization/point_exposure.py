@@ -1,4 +1,4 @@
-"""The colours of measured points, brought to the exposure of the map."""
+"""Conversion of measured points' colours to the exposure of the map."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.exposure import clipped, robust_exposure
 
 STRONGEST, MOST_BIAS = 4.0, 0.25
-"""Largest gain (the least is its inverse) and largest bias of an exposure: two stops, and a quarter of the range."""
+"""Maximum gain (its inverse is the minimum) and maximum bias of an exposure: two stops, and a quarter of the range."""
 LEAST_COLOURED = 0.2
-"""Least share of the points whose colours the camera did not clip."""
+"""Minimum fraction of the points whose colours the camera did not clip."""
 CLEARLY_MORE = 0.05
-"""Share of all points that an exposure must add to those that agree in colour, for it to be applied.
+"""Minimum increase of the colour inliers by an exposure, as a fraction of all points, for it to be applied.
 
-Blur lowers contrast too, but restoring that contrast only enlarges the differences.
+Blur also lowers contrast, but restoring that contrast only enlarges the differences.
 """
 
 
 def cloud_with_exposure_of_map(cost: SurfaceCost, T: SE3) -> PointCloud:
-    """Return the points of ``cost`` with the colours that they would have with the map's exposure.
+    """Return the points of ``cost`` with their colours converted to the map's exposure.
 
-    The exposure, one gain and bias for each channel, is fitted to the points that pose T places on the surface. Points count as
-    uncoloured where the camera clipped a colour, and the exposure takes the surface's colour beyond black or white. The points
-    are returned as they are if the exposure is too far from the map's, too few keep their colour, or the exposure makes hardly
-    any more of them agree with the surface's colour.
+    The exposure, a gain and a bias per channel, is fitted to the points that lie on the surface at the pose T. Points count as
+    uncoloured if the camera clipped a colour and the exposure maps the surface's colour beyond black or white. The points are
+    returned unchanged if the exposure is too far from the map's, too few points keep their colour, or hardly any more become
+    colour inliers.
     """
     found, cloud = cost.correspondences(T[None]), cost.cloud
     near, alike = cost.inliers(found)

@@ -1,4 +1,4 @@
-"""The localization problem: images with known relative poses, a map, and what is known about the pose to find."""
+"""The localization problem: images with known relative poses, a map, and prior knowledge of the pose."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ class SceneMap(Protocol):
 
     @property
     def surface(self) -> SurfaceMap | None:
-        """The baked surface; None where there is none."""
+        """The baked surface; None if there is none."""
         ...
 
     @property
     def landmarks(self) -> LandmarkMap | None:
-        """The landmarks; None where there are none."""
+        """The landmarks; None if there are none."""
         ...
 
     @property
     def colour_noise(self) -> float | None:
-        """Root mean square difference of the field's colours from its own training images; None where unknown."""
+        """Root mean square difference between the field's colours and its training images; None if unknown."""
         ...
 
     @property
@@ -59,14 +59,14 @@ class SceneMap(Protocol):
 
 
 def unit_of(scene: SceneMap) -> LengthUnit:
-    """Return the unit of a map's lengths; maps that do not say it, such as fields of others, have a unit of their own."""
+    """Return the unit of a map's lengths; "units" for maps that do not state it, such as other projects' fields."""
     return getattr(scene, "unit", "units")
 
 
 def on_device(scene: _Map, device: torch.device | str) -> _Map:
-    """Return a map whose field, surface and landmarks lie on ``device``; the one given is left as it is.
+    """Return a map with field, surface and landmarks on ``device``; the given map is not modified.
 
-    Raises ``InputError`` for a device that does not work here, and where the field cannot be moved.
+    Raises ``InputError`` for an unavailable device, and if the field cannot be moved.
     """
     field = scene.field
     if not isinstance(field, nn.Module):
@@ -86,21 +86,21 @@ def on_device(scene: _Map, device: torch.device | str) -> _Map:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """K images with known relative poses in a map; the pose to find is that of the last image's camera.
+    """K images with known relative poses in a map; the unknown is the pose of the last image's camera.
 
-    ``views[i].T_ref_camera`` is T_K_i, camera i in the frame of the last camera K, so the last view's is the identity.
+    ``views[i].T_ref_camera`` is T_K_i, the pose of camera i in the frame of the last camera K, so the last is the identity.
     """
 
     field: RadianceField
     bounds: SceneBounds
     views: tuple[View, ...]
-    start: SE3 | None  # T_world_K; None where nothing is known about it
-    depth_rays: Observations | None = None  # from a lidar or the like, in the frame of the last camera
+    start: SE3 | None  # guess at T_world_K; None if there is none
+    depth_rays: Observations | None = None  # from a lidar or similar, in the frame of the last camera
     surface: SurfaceMap | None = None  # baked from the field
     matcher: LandmarkMatcher | None = (
-        None  # of the map's landmarks, with the keypoints of the images: see ``for_query``
+        None  # of the map's landmarks, with a cache of the images' keypoints, see ``for_query``
     )
-    # Root mean square difference of the field's colours from its own training images; None where unknown.
+    # Root mean square difference between the field's colours and its training images; None if unknown.
     colour_noise: float | None = None
     sensor: DepthSensorModel = UNKNOWN  # model of the sensor that measured the depth
 
@@ -113,9 +113,9 @@ class Problem:
                 raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
 
     def start_for(self, method: str) -> SE3:
-        """Return the start. Raises ``InputError``, which names ``method``, if there is none."""
+        """Return the start. Raises ``InputError``, naming ``method``, if there is none."""
         if self.start is None:
-            raise InputError(f"method {method!r} needs a start; give one, or take a method that needs none")
+            raise InputError(f"method {method!r} needs a start; give one, or use a method that needs none")
         return self.start
 
     @property
@@ -129,11 +129,11 @@ class Problem:
 
     @property
     def device(self) -> torch.device:
-        """The device on which the field computes; rays are moved there."""
+        """The field's device, to which rays are moved."""
         return device_of(self.field)
 
     def level(self, number: int | None) -> RadianceField:
-        """Return a level of the field: 0 is the coarsest, -1 the finest, None the field itself."""
+        """Return a level of the field: 0 for the coarsest, -1 for the finest, None for the field itself."""
         if number is None:
             return self.field
         offered = levels(self.field)
@@ -142,7 +142,7 @@ class Problem:
         return offered[number]
 
     def on_device(self) -> Problem:
-        """Return the problem with images, poses and depth rays where the field computes."""
+        """Return the problem with images, poses and depth rays on the field's device."""
         device = self.device
         rays = self.depth_rays
         return replace(
@@ -170,7 +170,7 @@ def rig(
     depth_rays: Observations | None = None,
     matcher: LandmarkMatcher | None = None,
 ) -> Problem:
-    """Return the problem of ``views`` whose poses are known in any common frame.
+    """Return the problem of localizing ``views`` with known poses in any common frame.
 
     ``start`` and ``depth_rays`` belong to the last view.
     """
@@ -187,12 +187,12 @@ def rig(
 
 
 def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:
-    """Return the ``size`` items up to item ``last``, ``stride`` apart; fewer at the sequence's beginning.
+    """Return ``size`` items up to item ``last``, ``stride`` apart; fewer at the beginning of the sequence.
 
     Views in temporal order give the paper's moving window. Raises ``InputError`` if there is no such item.
     """
     if size < 1 or stride < 1:
-        raise InputError(f"a window of {size} with stride {stride}, expected 1 or more of both")
+        raise InputError(f"the window has size {size} and stride {stride}, expected 1 or more for both")
     if not 0 <= last < len(sequence):
-        raise InputError(f"a window up to item {last} of {len(sequence)}")
+        raise InputError(f"the window ends at item {last}, expected 0 to {len(sequence) - 1}")
     return tuple(sequence[i] for i in range(last, -1, -stride)[:size][::-1])

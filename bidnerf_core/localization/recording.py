@@ -1,4 +1,4 @@
-"""Records of how a pose was found, for programs that show it. Nothing is kept, or computed, unless a record is asked for."""
+"""Records of the search for a pose, for visualization. Nothing is kept or computed unless a record is requested."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ if TYPE_CHECKING:
     from bidnerf_core.localization.landmarks.pose import LandmarkPose
 
 MOST_POSES = 400
-"""Number of poses of a step that are kept, the best ones."""
+"""Maximum number of poses kept per step, the best ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedStep:
-    """Poses that were considered at the same time."""
+    """Poses considered in one step of a search."""
 
     caption: str
     T: SE3  # T_world_camera (h), best first, on the CPU
     scores: Float[Tensor, "h"]  # lower is better; only those of one step can be compared
-    kept: int  # how many of them went on to the next step
-    compared: bool = True  # whether they are rivals, with scores, rather than a step towards one pose
+    kept: int  # number of poses passed on to the next step
+    compared: bool = True  # whether they are scored rivals, instead of a step towards one pose
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedExplanation:
-    """Another explanation of the images, and how it compares with the pose that was found."""
+    """An alternative explanation of the images, and its comparison with the pose that was found."""
 
     reason: str
-    log_odds: float  # of the pose that was found against it
+    log_odds: float  # of the found pose against it
     T: SE3 | None  # its pose T_world_camera; None for a mirror image
 
 
 @dataclass(eq=False)
 class SearchRecord:
-    """The steps of a search, what landmarks said about poses, and the explanations that were compared, in order."""
+    """The steps of a search, the poses by landmarks, and the compared explanations, in order."""
 
     steps: list[RecordedStep] = field(default_factory=list)
     landmarks: list[LandmarkPose] = field(default_factory=list)
     explanations: list[ComparedExplanation] = field(default_factory=list)
 
     def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:
-        """Keep poses T (h) or a single one; without scores they are in order, best first."""
+        """Record poses T (h) or a single one; without scores, they must be in order, best first."""
         T = T if T.translation.ndim == 2 else T[None]
         compared = scores is not None
         if scores is None:
@@ -66,7 +66,7 @@ _RECORD: ContextVar[SearchRecord | None] = ContextVar("record", default=None)
 
 @contextmanager
 def recorded() -> Iterator[SearchRecord]:
-    """Yield a record that is filled by the localizations of this thread within the block."""
+    """Yield a record, to which this thread's localizations within the block add."""
     token = _RECORD.set(record := SearchRecord())
     try:
         yield record
@@ -75,5 +75,5 @@ def recorded() -> Iterator[SearchRecord]:
 
 
 def current_record() -> SearchRecord | None:
-    """Return the record to add to; None where nobody asked for one."""
+    """Return the record to add to; None if none was requested."""
     return _RECORD.get()

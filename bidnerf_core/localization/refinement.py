@@ -1,7 +1,7 @@
-"""Second-order refinement on rendered rays, for any differentiable field, from coarse to fine.
+"""Coarse-to-fine second-order refinement on rendered rays, for any differentiable field.
 
-Each stage draws rays once and keeps them, so that a step that does not lower the cost can be detected and undone. Poses form
-a batch axis: several are refined at once, and each stage continues with the best of them.
+Each stage draws its rays once, so that a step that does not lower the cost can be detected and undone. Poses are refined in
+batches, and each stage continues with the best of them.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.solvers.pivots import pivot
 
 RIVALS = 3
-"""Largest number of poses found besides the best one with which that is compared."""
+"""Maximum number of other poses found with which the best one is compared."""
 
 
 @dataclass(frozen=True, eq=False)
 class RefinementResult:
-    """The best pose, and its assessment on rays to which it was not fitted."""
+    """The best pose, and its assessment on rays not used in the fit."""
 
     T: SE3
-    loss: float  # as the last stage measures it
-    inliers: float  # share of the rays that render what was measured
+    loss: float  # by the last stage's measure
+    inliers: float  # inlier fraction of the rays
     covariance: Float[
         Tensor, "6 6"
     ]  # of a right update at the camera: translation (metres), rotation (radians)
     step: float  # length of the Gauss-Newton step on these rays (metres, radians)
-    poses: SE3  # (steps + 1): the first pose given, then the best one after each step
+    poses: SE3  # (steps + 1): the first given pose, then the best one after each step
     losses: Float[Tensor, "s"]  # before each step
-    fresh: RenderedCost  # of these rays
+    fresh: RenderedCost  # cost of these rays
     rivals: SE3 | None  # other poses that were found
 
     @cached_property
     def support(self) -> Support:
-        """How well these rays distinguish the pose from its rivals, for which they are rendered at many poses."""
+        """How well these rays distinguish the pose from its rivals, at which they are rendered too."""
         return rendered_support(self.fresh, self.T, self.rivals)
 
 
@@ -62,10 +62,10 @@ def refine(
     settings: RenderedCostSettings,
     generator: Generator,
 ) -> RefinementResult:
-    """Refine poses (h), of which each stage keeps the best; ``problem.start`` is not used.
+    """Refine poses (h), keeping the best in each stage; ``problem.start`` is not used.
 
-    The answer is the better of the last two stages' poses, compared on rays to which neither was fitted. Its rivals are the next
-    best poses of the last stage that had several.
+    The result is the better of the last two stages' poses on rays to which neither was fitted. Its rivals are the next best
+    poses of the last stage that had several.
     """
     about = pivot(settings.refinement.pivot, replace(problem, start=start[0])).to(problem.device)
     history = History([start[0].to("cpu")])
@@ -87,19 +87,19 @@ class FewSteps:
     """The result of ``take_few_steps``."""
 
     poses: SE3  # (s + 1)
-    inliers: float  # share of the rays, those with depth if 5 % of them have it, that render what was measured from there
+    inliers: float  # inlier fraction of the rays, of those with depth if at least 5 % have it
 
 
 def take_few_steps(
     problem: Problem, start: SE3, stage: RefinementStage, settings: RenderedCostSettings, generator: Generator,
     surface: SurfaceCost | None = None,
 ) -> FewSteps:  # fmt: skip
-    """Take up to ``stage.steps`` second-order steps from one pose that is nearly right, on one draw of rays.
+    """Take up to ``stage.steps`` second-order steps from a nearly correct pose, on one draw of rays.
 
-    With the cost of measured points on the ``surface``, the steps lower the sum of both, each divided by the variance of its
-    residuals at the start: a field that renders badly moves a pose little if the surface determines it well. It stops before
-    a step that would not lower the cost. The last pose is assessed on the same rays and without derivatives, which costs half
-    as much as ``refine``.
+    With the cost of measured points on the ``surface``, the steps minimize the sum of both, each divided by the variance of its
+    residuals at the start, so a badly rendering field hardly moves a pose that the surface determines well. It stops before a
+    step that would not lower the cost. The last pose is assessed on the same rays and without derivatives, at half the cost of
+    ``refine``.
     """
     device, name, views = problem.device, settings.refinement.pivot, len(problem.views)
     about = pivot(name, replace(problem, start=start)) if surface is None else surface.cloud.pivot
@@ -131,7 +131,7 @@ def take_few_steps(
                 break
             poses.append(trial[0])
             inliers.append(here.inliers_by_depth()[0])
-    # Where the host must not wait, steps were taken after the first one that did not lower the cost: they are left out here.
+    # Where the host must not wait for the device, steps after the first that did not lower the cost are discarded here.
     count = 1 + int(torch.stack(lower).cpu().cumprod(0).sum() if lower else 0)
     return FewSteps(SE3.stack(poses[:count]).to("cpu"), float(inliers[count - 1]))
 
@@ -178,7 +178,7 @@ def _assessed(cost: RenderedCost, T: SE3, rivals: SE3 | None, history: History) 
 
 @torch.no_grad()
 def rendered_support(cost: RenderedCost, T: SE3, rivals: SE3 | None = None) -> Support:
-    """Return how well rendered rays distinguish a pose from its rivals, of which ``rivals`` (h) are some."""
+    """Return how well rendered rays distinguish a pose from its rivals, which include ``rivals`` (h)."""
     problem = cost.problem
     if not bool(T.matrix().isfinite().all()):
         return NONE

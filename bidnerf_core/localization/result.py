@@ -24,28 +24,30 @@ from bidnerf_core.io.json import from_plain, read_record, to_plain
 
 
 class Outcome(StrEnum):
-    """The reason why a pose is accepted or rejected; only ``CONVERGED`` means accepted."""
+    """The reason for which a pose is accepted or rejected; only ``CONVERGED`` means accepted."""
 
     CONVERGED = "converged"
     AMBIGUOUS = "ambiguous"  # another pose explains the measurements about as well
     OFF_SURFACE = "off surface"  # too few of the measured points lie on the map's surface
-    COLOUR_MISMATCH = "colour mismatch"  # too few of them have its colour
+    COLOUR_MISMATCH = "colour mismatch"  # too few of the measured points have the surface's colour
     FREE_SPACE_VIOLATED = "free space violated"  # lines of sight pass through the surface
-    RENDERING_MISMATCH = "rendering mismatch"  # the field renders something else from there
+    RENDERING_MISMATCH = "rendering mismatch"  # the field's rendering differs from the image or its depth
     UNDETERMINED = "undetermined"  # the measurements do not constrain all six degrees of freedom
-    NOT_SETTLED = "not settled"  # newly drawn rays still call for a large step
-    HIGH_LOSS = "high loss"  # a descent ended above the loss that counts as converged
+    NOT_SETTLED = "not settled"  # newly drawn rays still give a large step
+    HIGH_LOSS = "high loss"  # a descent ended above the convergence threshold
     DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
-    MISCALIBRATED = "miscalibrated"  # the image contradicts the intrinsics, or the map's may be right instead
+    MISCALIBRATED = (
+        "miscalibrated"  # the image contradicts the given intrinsics, or the map's may be right instead
+    )
     MIRRORED = "mirrored"  # the mirror image fits the map better than the image
-    IMPRECISE = "imprecise"  # the pose is too uncertain, compared with the distance of what is in view
+    IMPRECISE = "imprecise"  # the pose is too uncertain, relative to the distance to the scene
     UNCERTAIN = "uncertain"  # the diagnostics together make a wrong pose too likely
     TOO_FEW_MATCHES = "too few matches"  # of image features with the map's landmarks
 
 
 @runtime_checkable
 class Diagnostics(Protocol):
-    """The measures by which a pose is judged: a dataclass of numbers, whose fields depend on how the pose was found."""
+    """The measures by which a pose is accepted or rejected: a dataclass of numbers that depends on how the pose was found."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -64,10 +66,10 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """The pose found for the last view's camera, and how it was found."""
+    """The pose found for the last view's camera, with its uncertainty and acceptance."""
 
     T_world_camera: SE3
-    outcome: Outcome  # judged without knowledge of the true pose
+    outcome: Outcome  # determined without ground truth
     reason: str  # the outcome in a sentence
     steps: int
     seconds: float
@@ -78,14 +80,14 @@ class Localization:
     # Covariance of a right update at the camera: translation (``unit``) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
     focal_factor: float = 1.0  # ratio of the estimated to the given focal length; 1 if it was not corrected
-    # Probability that the pose is right, from the diagnostics; None where no model of it was learned.
+    # Probability that the pose is right, from the diagnostics; None if no model of it was learned.
     confidence: float | None = None
-    diagnostics: Diagnostics | None = None  # the measures by which the pose was judged
-    intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were taken
+    diagnostics: Diagnostics | None = None  # the measures by which the pose was accepted or rejected
+    intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
 
     def covariance_in(self, convention: CovarianceConvention) -> Float[Tensor, "6 6"] | None:
-        """Return the covariance in another convention, see ``CovarianceConvention``; None where it is not known.
+        """Return the covariance in another convention, see ``CovarianceConvention``; None if unknown.
 
         Raises ``InputError`` for an unknown convention.
         """
@@ -99,11 +101,11 @@ class Localization:
         return self.outcome is Outcome.CONVERGED
 
     def frame_as_taken(self, frame: Frame) -> Frame:
-        """Return the last image's frame with the intrinsics that go with the pose: the given or the corrected ones."""
+        """Return the last image's frame with the intrinsics of the pose: the given or the corrected ones."""
         return frame if self.intrinsics is None else replace(frame, intrinsics=self.intrinsics)
 
     def plain(self) -> dict[str, Any]:
-        """Return the result as JSON values, with the keys of ``bidnerf localize --json``.
+        """Convert the result to JSON values, with the keys of ``bidnerf localize --json``.
 
         Numbers and matrices that are not finite are None.
         """
@@ -129,14 +131,14 @@ class Localization:
 
     @staticmethod
     def load(path: str | Path) -> Localization:
-        """Read what ``save`` wrote. The diagnostics are not in the file, nor are intermediate poses and losses.
+        """Read a file written by ``save``. It contains no diagnostics and no intermediate poses or losses.
 
-        Raises ``InputError`` for another file, and for a localization whose pose is not finite.
+        Raises ``InputError`` for any other file, and for a pose that is not finite.
         """
         where = str(path)
         saved = from_plain(_Saved, dict(read_record(Path(path)).values), where)
         if saved.T_world_camera is None:
-            raise InputError(f"{where}: T_world_camera is null, expected a pose that is finite")
+            raise InputError(f"{where}: T_world_camera is null, expected a finite pose")
         T = pose_from_matrix(
             _matrix(saved.T_world_camera, 4, f"{where}: T_world_camera"), f"{where}: T_world_camera"
         )
@@ -158,7 +160,7 @@ class Localization:
 
 @dataclass(frozen=True)
 class _Saved:
-    """The values in the file of a localization."""
+    """The contents of a localization's file."""
 
     T_world_camera: list[list[float]] | None
     converged: bool
@@ -182,6 +184,6 @@ def _matrix(rows: list[list[float]], size: int, what: str) -> Float[Tensor, "n n
 
 
 def _finite(value: Any) -> Any:
-    """Return a number, or rows of numbers, or None where any of them is not finite, for which JSON has no notation."""
+    """Return a number or rows of numbers; None if any is not finite, which JSON cannot represent."""
     rows = value if isinstance(value, list) else [[value]]
     return value if all(x is not None and math.isfinite(x) for row in rows for x in row) else None

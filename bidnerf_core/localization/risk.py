@@ -1,8 +1,8 @@
-"""Tolerated risk: the share of wrong answers among the accepted ones, and the confidence that it requires.
+"""Tolerated risk: the fraction of wrong answers among the accepted ones, and the confidence that it requires.
 
-``benchmarks/risk.py`` calibrates the least confidence on answers to images with and without faults; ``confidence.json`` holds it.
-The threshold applies to the final answer, after all other rules of acceptance: these decide how an answer is found, and a
-guarantee holds only for answers found as those of the calibration were.
+``benchmarks/risk.py`` calibrates the minimum confidence on images with and without faults, and ``confidence.json`` stores it. The
+threshold applies to the final answer, after all other acceptance criteria: these influence how an answer is found, and a
+guarantee holds only for answers found in the same way as those of the calibration.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bidnerf_core.settings import Range
 
 @lru_cache(maxsize=1)
 def levels() -> tuple[tuple[float, float], ...]:
-    """Return the calibrated risks in increasing order, each with the least confidence of an accepted answer."""
+    """Return the calibrated risks in increasing order, each with the minimum confidence of an accepted answer."""
     stored = json.loads((files(__package__) / "confidence.json").read_text())
     return tuple((risk, least) for risk, least in stored.get("risk", {}).get("least_confidence", []))
 
@@ -30,7 +30,7 @@ def least_confidence(risk: float) -> float:
     Raises ``InputError`` for a risk outside the calibrated range.
     """
     if not levels():
-        raise InputError(f"risk is {risk!r}, expected none: no risk was calibrated for this confidence")
+        raise InputError(f"risk is {risk!r}, but no risk was calibrated for this confidence; leave it out")
     calibrated = Range(levels()[0][0], levels()[-1][0])
     if risk not in calibrated:
         raise InputError(f"risk is {risk!r}, expected {calibrated}, for which the confidence was calibrated")
@@ -38,10 +38,10 @@ def least_confidence(risk: float) -> float:
 
 
 def within_risk(found: Localization, risk: float) -> Localization:
-    """Return an answer, as ``uncertain`` if its confidence is less than the risk requires or not known."""
+    """Return an answer, as ``uncertain`` if its confidence is unknown or lower than the risk requires."""
     least = least_confidence(risk)
     if not found.converged or (found.confidence is not None and found.confidence >= least):
         return found
-    said = "not known" if found.confidence is None else f"{found.confidence:.3f}"
+    said = "unknown" if found.confidence is None else f"{found.confidence:.3f}"
     reason = f"the confidence is {said}, a risk of {risk:g} requires {least:.3f}; {found.reason}"
     return replace(found, outcome=Outcome.UNCERTAIN, reason=reason)

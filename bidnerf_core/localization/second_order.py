@@ -1,4 +1,4 @@
-"""Second-order methods: ``bid-lm`` on colour and depth, ``inerf-lm`` on colour, by steps from coarse to fine."""
+"""Coarse-to-fine second-order methods: ``bid-lm`` on colour and depth, and ``inerf-lm`` on colour alone."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
 
 @dataclass(frozen=True)
 class BidLmStages(Settings):
-    """Settings of the stages, from many poses and few rays at the coarsest level to one pose and many rays."""
+    """Settings of the stages, from many poses on few rays at the coarsest level to one pose on many rays."""
 
-    search_rays: ExpertRays = 128  # number of rays that rank each of the poses about the start
+    search_rays: ExpertRays = 128  # number of rays by which each of the poses around the start is ranked
     coarse_poses: ExpertCount = 6  # number of best poses that take steps at the coarsest level
     coarse_steps: ExpertCount = 4  # steps of each of the coarse poses
     coarse_rays: ExpertRays = 128  # number of rays for each of the coarse poses
@@ -48,11 +48,11 @@ class BidLmStages(Settings):
     middle_rays: ExpertRays = 256  # number of rays for each of the middle poses
     fine_steps: Steps = 6  # steps of the best pose, in full detail
     fine_rays: RayCount = 1024  # number of rays rendered for each of the fine steps
-    # width, in pixels, of the squares that colours are averaged over in coarse steps
+    # width, in pixels, of the squares over which colours are averaged in coarse steps
     blur: Annotated[int, Range(1, 10**4), EXPERT] = 8
-    # number of times that poses are first centred on what was measured
+    # number of times that poses are first centred on the measured points
     centring: Annotated[int, Range(0, 100), EXPERT] = 2
-    # half width of the interval about the depth that fine steps sample, metres; 0: all
+    # half width of the interval around the depth that fine steps sample, metres; 0: the whole ray
     depth_window: Annotated[NotNegative, EXPERT] = 0.0
 
 
@@ -69,7 +69,7 @@ class BidLmConfig(Settings):
 
 
 def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
-    """Refine poses about ``problem.start``; they and the pixels are drawn from ``seed``."""
+    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``."""
     began, spread = time.perf_counter(), config.spread
     start = problem.start_for("bid-lm")
     poses = neighbours(start, spread.poses, spread.spread_translation, spread.spread_rotation, seed)
@@ -93,7 +93,7 @@ def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization
 
 
 def stages(config: BidLmConfig) -> tuple[RefinementStage, ...]:
-    """Return the stages that the settings describe."""
+    """Return the stages given by the settings."""
     s, sigma = config.stages, config.refinement.surface_sigma
     scales = (config.colour.colour_scale, config.depth.depth_scale)
     wide = (3 * scales[0], 3 * scales[1])
@@ -115,7 +115,7 @@ BID_LM = Method(
 
 @dataclass(frozen=True)
 class ImageSearchSettings(Settings):
-    """Settings of the search with small renderings, which become larger as poses become fewer."""
+    """Settings of the search with small renderings, which grow as the number of poses decreases."""
 
     search_poses: ExpertCount = 24  # number of best poses that take steps on small renderings
     search_steps: ExpertCount = 8  # steps of each of the search poses
@@ -147,9 +147,9 @@ class InerfLmConfig(Settings):
 
 
 def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
-    """Refine poses about ``problem.start``; they and the pixels are drawn from ``seed``.
+    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``.
 
-    It needs the field alone, and uses neither measured depth nor a baked surface.
+    It needs only the field, and uses neither measured depth nor a baked surface.
     """
     began, generator, spread = time.perf_counter(), Generator().manual_seed(seed), config.spread
     start = problem.start_for("inerf-lm")

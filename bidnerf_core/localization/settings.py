@@ -1,4 +1,4 @@
-"""Settings of the methods and of a tracker: groups that several methods share, and what the names of objectives mean."""
+"""Settings of the methods and the tracker, in groups that methods share, and the objectives that they define."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 RENDERED_DEPTH_SHARE = 0.038
-"""Depth difference at which outliers begin in rendered rays, as a share of the scene's mean side."""
+"""Depth difference at which outliers begin in rendered rays, as a fraction of the scene's mean side."""
 LEAST_POINTS = 50
-"""Least number of measured depths from which the shape of the scene can be recognised."""
+"""Minimum number of measured depths from which the shape of the scene can be recognised."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ def objective_of(
     depth_scale: float | None = None,
     miss_scales: float | None = None,
 ) -> Objective:
-    """Return the objective that the settings describe; a stage may replace their scales with its own.
+    """Return the objective given by the settings; a stage may replace their scales with its own.
 
-    ``miss_scales`` is the depth residual, in depth scales, of a ray that meets nothing; None stands for the paper's.
+    ``miss_scales`` is the depth residual, in depth scales, of a ray that hits nothing; None means the paper's.
     """
     terms = [colour_term(colour.robust(colour_scale))]
     if depth is not None and depth.used:
@@ -86,39 +86,37 @@ def objective_of(
 
 @dataclass(frozen=True)
 class DescentSettings(Settings):
-    """Settings of the rays of a step, and of the frame of updates."""
+    """Settings of the rays of a step and of the frame of updates."""
 
-    rays: Count = 2048  # number of rays per step, shared out equally among the views
+    rays: Count = 2048  # number of rays per step, divided equally among the views
     level: int | None = None  # level of the field: 0 is the coarsest, None the field itself
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
     pivot: PivotName = "camera"  # what an update rotates about: camera, world, or the middle of the scene
     # length of the sampled interval, in units of [near, far]; the paper's "wide" is 2
     wide: Annotated[float, Above(0.0, 100.0)] = 1.0
-    renew: Annotated[bool, EXPERT] = True  # draw pixels anew at each step instead of once
+    renew: Annotated[bool, EXPERT] = True  # draw new pixels at each step instead of once
 
 
 @dataclass(frozen=True)
 class ReachSettings(Settings):
-    """Settings that widen the reach of first-order steps. The defaults add nothing to the paper's objective."""
+    """Settings that widen the basin of convergence of first-order steps. The defaults leave the paper's objective unchanged."""
 
-    # number of pixels drawn for each ray, where images show background; those that show matter, then those that may meet it, come first
+    # number of pixels drawn for each ray, for images with background; pixels on matter are preferred, then those that may hit it
     candidates: Annotated[int, Range(1, 64), EXPERT] = 1
-    # number of equal intervals of each ray, whether or not they may hold matter; 0: the field's own
+    # number of equal intervals of each ray, whether or not they may contain matter; 0: the field's own
     samples: Annotated[int, Range(0, 4096), EXPERT] = 0
-    # standard deviation of the points at which the field is queried, metres, at the first step; 0: not blurred
+    # standard deviation of the noise added to the query points of the field, metres, at the first step; 0: not blurred
     blur: Annotated[float, Range(0.0), EXPERT] = 0.0
-    blur_steps: Annotated[int, Range(1, 10**7), EXPERT] = (
-        200  # number of steps in which the blur falls by half
-    )
+    blur_steps: Annotated[int, Range(1, 10**7), EXPERT] = 200  # number of steps in which the blur halves
     # weight of the distance between measured points and the box of the scene, unless there is matter beyond the box
     box_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
 
 
 @dataclass(frozen=True)
 class AdamSettings(Settings):
-    """Settings of Adam's steps and of when they end."""
+    """Settings of Adam's steps and of the criteria that end them."""
 
-    max_steps: Count = 200  # largest number of steps
+    max_steps: Count = 200  # maximum number of steps
     learning_rate: Annotated[float, Above(0.0, 1e3)] = 0.01  # initial length of a step, metres and radians
     decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor by which the learning rate falls in decay_steps
     decay_steps: Count = 100  # number of steps in which the learning rate falls by decay
@@ -126,18 +124,18 @@ class AdamSettings(Settings):
     stop_loss: NotNegative = 0.0
     # stop once the mean length of 20 steps is below this (metres, radians); 0: never
     stop_step: Annotated[float, Range(0.0), EXPERT] = 0.0
-    # pose to answer with: the last, or the one after the 20 steps of least mean loss
+    # pose to return: the last, or the one after the 20 steps with the smallest mean loss
     answer: Annotated[AnswerName, EXPERT] = "last"
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
-    # largest share of the cost of the image's mean colour that an accepted answer leaves, where only colours are compared
+    # maximum cost of an accepted pose as a fraction of the cost of the image's mean colour, if only colours are compared
     plain_share: Annotated[float, Range(0.0), EXPERT] = 0.5
 
 
 @dataclass(frozen=True)
 class SpreadSettings(Settings):
-    """Settings of the poses near the start that are tried as well."""
+    """Settings of the additional poses tried near the start."""
 
-    # number of poses tried, the start among them; 1: the start alone
+    # number of poses tried, including the start; 1: the start alone
     poses: Annotated[int, Range(1, 10**5)] = 32
     # standard deviation of the poses along each axis of the camera, metres
     spread_translation: NotNegative = 0.3
@@ -151,7 +149,7 @@ class RefinementSettings(Settings):
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
     # what an update rotates about: middle of the scene, camera, world
     pivot: Annotated[PivotName, EXPERT] = "scene"
-    exposure: bool = False  # estimate a gain and a bias of each colour channel
+    exposure: bool = False  # estimate a gain and a bias for each colour channel
     surface_sigma: NotNegative = 0.03  # uncertainty of the map's surfaces in coarse steps, metres
     # rendering weight below which a sample has no derivative
     least_weight: Annotated[float, Range(0.0, 0.999999), EXPERT] = 0.01
@@ -163,36 +161,38 @@ class RefinementSettings(Settings):
 
 @dataclass(frozen=True)
 class RenderedThresholds(Settings):
-    """Thresholds for accepting an answer, measured on fresh rendered rays."""
+    """Thresholds for accepting a pose, applied to newly drawn rendered rays."""
 
-    # least share of rays that render what was measured, for an accepted answer
+    # minimum inlier fraction of the rays for an accepted pose
     converged_inliers: NotNegative = 0.93
-    converged_step: NotNegative = 0.02  # largest step that those rays may still ask for (metres, radians)
+    converged_step: NotNegative = 0.02  # maximum length of a further step on those rays (metres, radians)
 
 
 @dataclass(frozen=True)
 class RefinementStage:
-    """A stage of refinement: steps at one level of detail on one draw of rays; without steps, poses are only ranked."""
+    """A stage of refinement: steps at one level of detail on one draw of rays; with 0 steps, poses are only ranked."""
 
     steps: int
     rays: int  # per pose
-    keep: int = 1  # number of poses that the stage begins with: the best so far
+    keep: int = 1  # number of poses with which the stage begins: the best so far
     level: int | None = None  # of the field: 0 is the coarsest, None the field itself
     blur: int = 1  # width, in pixels, of the squares over which observed colours are averaged
     colour_scale: float = 0.1  # colour difference at which outliers begin
     depth_scale: float = 0.1  # depth difference, metres, at which outliers begin
-    surface_sigma: float = 0.0  # metres by which surfaces may be off: steep residuals count less
-    window: float = 0.0  # metres about the measured depth that are sampled; 0: the whole ray
+    surface_sigma: float = (
+        0.0  # metres: standard deviation of surfaces; residuals with steep gradients count less
+    )
+    window: float = 0.0  # metres sampled around the measured depth; 0: the whole ray
     damping: float = 1e-3  # of the first step
-    # number of times that each pose is first shifted to bring the middle of what it renders to that of what was measured
+    # number of times that each pose is first shifted to align the middle of the rendering with that of the measurements
     centring: int = 0
 
 
 def rendered_depth_scale(bounds: SceneBounds) -> float:
     """Return the depth difference (metres) at which outliers begin in rendered rays.
 
-    A field divides its box into parts whose size is a share of the box, and its depth errs accordingly. The resolution of a
-    baked surface does not matter: it may be made of measured depth, which is more accurate than what the field renders.
+    A field's resolution, and hence the error of its depth, is a fraction of its box. The resolution of a baked surface does not
+    matter: it may come from measured depth, which is more accurate than the field's renderings.
     """
     return RENDERED_DEPTH_SHARE * math.prod(bounds.size) ** (1 / 3)
 
@@ -201,12 +201,12 @@ def rendered_depth_scale(bounds: SceneBounds) -> float:
 class ColourRefinementSettings(Settings):
     """Settings of the last steps on colour alone."""
 
-    # steps of each pose that the search left, at the coarsest level
+    # steps of each pose from the search, at the coarsest level
     coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
     # number of rays rendered for each of the coarse steps
     coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256
     fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
-    # number of rays rendered for each of the fine steps; four times as many where something may hide the scene
+    # number of rays rendered for each of the fine steps; four times as many if part of the scene may be hidden
     fine_rays: Annotated[int, Range(7, 10**7)] = 1024
 
 
@@ -224,21 +224,20 @@ class ByColourConfig(Settings):
 class AutoConfig(Settings):
     """Settings of method ``auto``."""
 
-    # largest number of measured points that are aligned
+    # maximum number of measured points that are aligned
     points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000
-    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # number of poses with which a round of search begins
-    # largest number of rounds of search, each with fresh hypotheses, until an answer is accepted
+    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # number of initial poses of a round of search
+    # maximum number of rounds of search, each with new hypotheses, until a pose is accepted
     rounds: Annotated[int, Range(1, 100)] = 3
-    # steps on rendered rays that refine an answer by depth; 0: none
+    # steps on rendered rays that refine a pose by depth; 0: none
     refine_steps: Annotated[int, Range(0, 1000)] = 2
     refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for each of these steps
-    landmarks: bool = True  # match image features with the map's landmarks first, where it has some
-    # number of rendered rays that are fused with landmarks; 0: nothing is rendered, neither for that nor to tell cameras or mirror
-    # images apart
+    landmarks: bool = True  # match image features with the map's landmarks first, if it has any
+    # number of rendered rays fused with landmarks; 0: nothing is rendered, for fusion or for comparing cameras or mirror images
     fused_rays: Annotated[int, Range(0, 10**6)] = 1024
-    # what measured the depth: unknown, kinect, realsense, lidar or rendered
+    # the depth sensor: unknown, kinect, realsense, lidar or rendered
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
-    # share of wrong answers among the accepted ones that is tolerated; None: accepted as usual
+    # tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance
     risk: float | None = None
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
 
@@ -252,18 +251,18 @@ class AutoConfig(Settings):
 class TrackerConfig(Settings):
     """Settings of a tracker."""
 
-    # largest number of landmarks that are followed from image to image
+    # maximum number of landmarks tracked from image to image
     points: Annotated[int, Range(20, 10**4)] = 250
-    depth_points: Annotated[int, Range(50, 10**6)] = 400  # largest number of measured pixels that are aligned
-    # number of keypoints of an image in which landmarks are sought
+    depth_points: Annotated[int, Range(50, 10**6)] = 400  # maximum number of measured pixels that are aligned
+    # number of keypoints of an image that are matched with landmarks
     keypoints: Annotated[int, Range(50, 10**5), EXPERT] = 600
-    # share of the followed landmarks that is left when new ones are sought
+    # remaining fraction of the tracked landmarks at which new ones are detected
     refresh_share: Annotated[float, Range(0, 1), EXPERT] = 0.5
-    # number of frames after which new landmarks are sought anyway
+    # number of frames after which new landmarks are detected in any case
     refresh_frames: Annotated[int, Range(1, 10**6), EXPERT] = 20
     # number of second-order steps on depth in addition to landmarks
     depth_steps: Annotated[int, Range(1, 100), EXPERT] = 1
-    # number of lost frames that are all searched; afterwards every second one is
+    # number of lost frames that are all searched; after that, every second one is
     patience: Annotated[int, Range(1, 10**6), EXPERT] = 3
     # interval between frames without time stamps, seconds
     frame_seconds: Annotated[float, Above(0.0, 1e4)] = 1 / 30

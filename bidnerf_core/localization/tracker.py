@@ -1,4 +1,4 @@
-"""``Tracker``: finds the poses of a sequence's frames, one after another, and reports at once when it is lost."""
+"""``Tracker``: estimates the poses of a sequence's frames one by one, and reports immediately when it is lost."""
 
 from __future__ import annotations
 
@@ -52,26 +52,25 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.landmarks.features import grey_image, strongest
 
 START = 0.03, 0.1
-"""Standard deviations of a start whose uncertainty is not given: share of the scene's extent, and radians."""
+"""Standard deviations of a start of unknown uncertainty: fraction of the scene's extent, and radians."""
 VELOCITY_KEPT = 0.6
-"""Share of the velocity that is kept with each lost frame."""
+"""Fraction of the velocity kept with each lost frame."""
 NOTHING_SEEN = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
 
 
 class Tracker:
-    """Finds the pose of each frame of a sequence from the frames before it.
+    """Estimates the pose of each frame of a sequence from the frames before it.
 
-    It predicts the pose with a constant velocity and refines it from there, without a search, by the landmarks that optical
-    flow carries from image to image, by measured depth, or by colour. The localizer's acceptance judges each pose. When one
-    is not accepted, the answer is marked as such; the tracker then relocalizes in the following frames and meanwhile continues
-    by odometry. Its memory does not grow. Trackers may share a localizer, even across threads; a tracker itself belongs to one
-    thread.
+    It predicts the pose with a constant-velocity model and refines it locally by landmarks tracked with optical flow, by measured
+    depth, or by colour. Each pose passes through the localizer's acceptance. After a rejected pose, which is marked as such, the
+    tracker relocalizes in the following frames, and meanwhile continues by odometry. Its memory does not grow. Trackers may share
+    a localizer, even across threads, but a tracker itself belongs to one thread.
     """
 
     def __init__(
         self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None
     ) -> None:
-        """Track in the map of ``localizer``, which must have distances. ``start``: a guess at the first T_world_camera."""
+        """Track in the map of ``localizer``, which must have distances. ``start`` is a guess at the first T_world_camera."""
         config = TrackerConfig() if config is None else config
         self.localizer, self.config = _checked_localizer(localizer), config
         self._state = TrackerState(Clock(None, config.frame_seconds))
@@ -95,12 +94,12 @@ class Tracker:
         return self._state.lost
 
     def __call__(self, frame: Frame, time: float | None = None) -> Localization:
-        """Find T_world_camera of the next frame.
+        """Estimate T_world_camera of the next frame.
 
-        ``time`` (seconds, from any origin) is when it was taken; frames without one are taken to come at the last interval.
-        The answer's ``outcome`` is other than ``CONVERGED`` where the acceptance rejects the pose; the pose is then the best
-        guess, with a covariance to match. Raises ``InputError`` for a time that is not finite, and where the map cannot be
-        searched for the first frame without a start.
+        ``time`` (seconds, from any origin) is its time stamp; without one, the last interval is assumed. If the pose is
+        rejected, the answer has an ``outcome`` other than ``CONVERGED``, and its pose is the best guess with a corresponding
+        covariance. Raises ``InputError`` for a non-finite time, and if the map does not allow the first frame to be found
+        without a start.
         """
         began = clocks.perf_counter()
         clock, seconds = self._state.clock.step(time)
@@ -111,7 +110,7 @@ class Tracker:
             answer, state = self._begun(frame, image, state)
         else:
             answer, state = self._continued(frame, image, state, state.motion, seconds)
-        # Points are followed from the last image, even past frames without one.
+        # Points are tracked from the last image, even across frames without one.
         self._state = state = state if image is None else replace(state, image=image)
         answer = replace(
             answer, seconds=clocks.perf_counter() - began, focal_factor=1.0, intrinsics=None,
@@ -120,11 +119,11 @@ class Tracker:
         return answer if state.camera is None else state.camera.stated_in(answer, stated)
 
     def save(self, path: str | Path) -> None:
-        """Write the tracker's state to a file, from which ``restore`` continues exactly here."""
+        """Write the tracker's state to a file, from which ``restore`` continues exactly."""
         save_state(Path(path), self._state, self._key)
 
     def restore(self, path: str | Path) -> None:
-        """Continue where the tracker that wrote the file stopped. Raises ``InputError`` for another map's or a damaged file."""
+        """Continue from a saved state. Raises ``InputError`` for a damaged file or one for another map."""
         self._state = load_tracker_state(Path(path), self._key)
 
     def _begun(
@@ -136,7 +135,7 @@ class Tracker:
             answer, state = self._continued(frame, image, state, motion, 0.0)
             if answer.converged or image is None:
                 return answer, state
-        if image is None:  # a shape alone fits in many places of a building
+        if image is None:  # a shape alone fits many places in a building
             return unknown(self._start, self._extent), replace(state, lost=state.lost + 1)
         found = None
         if search_due(self.localizer, frame, state.searchable, self.config.patience):
@@ -153,7 +152,7 @@ class Tracker:
     def _continued(
         self, frame: Frame, image: Grey | None, state: TrackerState, motion: Motion, seconds: float
     ) -> tuple[Localization, TrackerState]:
-        """Find the pose from that of the last frame. If it is not accepted, search anew from the next frame on."""
+        """Estimate the pose from that of the last frame. If it is rejected, search again from the next frame on."""
         surface = self.localizer.map.surface
         predicted = motion.predicted(seconds, state.clock.stamped)
         if image is None and surface is not None and has_points(frame):
@@ -169,7 +168,7 @@ class Tracker:
             found = None
             if search_due(self.localizer, frame, lost, self.config.patience, waited):
                 found = relocalized(self.localizer, frame, T, lost, state.frames)
-                waited = waited if image is None else 0.0  # a shape alone does not show landmarks
+                waited = waited if image is None else 0.0  # a frame with depth alone shows no landmarks
             state = replace(state, waited=waited)
             if found is not None and found.converged:
                 return self._found(frame, image, state, found)
@@ -183,9 +182,9 @@ class Tracker:
     def _by_shape(
         self, surface: SurfaceMap, frame: Frame, state: TrackerState, predicted: Motion
     ) -> tuple[Localization, TrackerState]:
-        """Correct the prediction by the depth of a frame that has no colours; nothing is searched.
+        """Correct the prediction by the depth of a frame without colours; there is no search.
 
-        A fit that leaves the position uncertain is not accepted. It still corrects what the shape determines.
+        A fit that leaves the position uncertain is rejected, but still corrects the directions that the shape determines.
         """
         found = by_shape(surface, frame, state, predicted, self.config)
         if not found.verdict.accepted:
@@ -201,7 +200,7 @@ class Tracker:
     def _by_odometry(
         self, frame: Frame, points: FollowedPoints, motion: Motion, predicted: Motion, seconds: float
     ) -> tuple[Motion, FollowedPoints, str]:
-        """Return a prediction from the motion between the images, where corners of the last one were followed."""
+        """Return a prediction from the motion between the images, if corners of the last one were tracked."""
         corners = points[points.landmark == FRESH]
         if len(corners):
             moved = self._odometry.moved(frame, corners, motion, predicted.T_world_camera, seconds)
@@ -212,7 +211,7 @@ class Tracker:
     def _measured(
         self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> Measurement | None:
-        """Measure the pose by the best means that map and frame offer."""
+        """Measure the pose by the best method that map and frame allow."""
         if self._by_landmarks is not None and image is not None:
             known = points[points.landmark != FRESH]
             return self._by_landmarks(frame, image, state, known, predicted)
@@ -231,7 +230,7 @@ class Tracker:
     def _accepted(
         self, frame: Frame, image: Grey | None, measured: Measurement, predicted: Motion
     ) -> tuple[Localization, TrackerState]:
-        """Fuse an accepted pose with the prediction, unless the camera moved in a way that no prediction could foresee."""
+        """Fuse an accepted pose with the prediction, unless the measurement has already determined the motion."""
         motion = predicted.updated(measured.pose) if measured.motion is None else measured.motion
         reach = self._reach(frame, measured.state.points, measured.pose.T_world_camera)
         motion = replace(motion, reach=reach)
@@ -244,7 +243,7 @@ class Tracker:
     def _found(
         self, frame: Frame, image: Grey | None, state: TrackerState, found: Localization
     ) -> tuple[Localization, TrackerState]:
-        """Begin to track at a pose that a search has found."""
+        """Start tracking at a pose found by a search."""
         covariance = found.covariance
         if covariance is None:
             covariance = self._at_start(frame, found.T_world_camera).covariance
@@ -268,7 +267,7 @@ class Tracker:
     def _adrift(
         self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> TrackerState:
-        """Return the state of a tracker that is lost: corners to follow, and a velocity that is trusted less and less."""
+        """Return the state of a lost tracker, with corners to track and a decayed velocity."""
         corners = self._odometry.replenished(frame, image, points, predicted.T_world_camera)
         motion = replace(predicted, velocity=VELOCITY_KEPT * predicted.velocity)
         return replace(

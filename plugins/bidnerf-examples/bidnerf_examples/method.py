@@ -31,7 +31,7 @@ def solve(problem: Problem, config: LandmarksAloneConfig, seed: int) -> Localiza
     return Localization(
         T_world_camera=SE3.identity() if found is None else found.T_world_camera,
         outcome=Outcome.CONVERGED if accepted else Outcome.TOO_FEW_MATCHES,
-        reason=f"{agreeing} landmarks agree, {config.least_inliers} are needed",
+        reason=f"{agreeing} landmark inliers, {config.least_inliers} are needed",
         steps=0,
         seconds=time.perf_counter() - began,
         loss=0.0 if found is None else float(found.residuals.square().mean()),
