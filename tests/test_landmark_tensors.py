@@ -83,5 +83,5 @@ def test_descriptors_of_another_detector_are_named_when_they_meet(
     landmarks: LandmarkMap, channels: int
 ) -> None:
     other = replace(landmarks, descriptors=torch.zeros((len(landmarks), channels), dtype=torch.uint8))
-    with pytest.raises(InputError, match=f"descriptors of {channels} channels, those of the image"):
+    with pytest.raises(InputError, match=f"descriptors have {channels} channels, those of the image"):
         LandmarkMatcher(other).nearest(landmarks.descriptors, 2)

@@ -1,1 +1,1 @@
-"""Cost terms: how well poses explain what was measured."""
+"""Cost terms: how well poses explain the measurements."""

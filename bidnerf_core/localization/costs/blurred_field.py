@@ -13,10 +13,10 @@ from bidnerf_core.fields.contract import FieldValues, RadianceField, RaySampler
 
 @dataclass(frozen=True, eq=False)
 class Blurred:
-    """A field that is queried at points displaced at random, by ``sigma`` metres along each axis.
+    """A field queried at points with random displacements, of standard deviation ``sigma`` metres along each axis.
 
-    In expectation it is the field convolved with a Gaussian (randomized smoothing, Duchi et al. 2012), at the cost of one
-    query. The sampler is the field's own: where it skips empty cells, matter is not blurred into them.
+    In expectation, it is the field convolved with a Gaussian (randomized smoothing, Duchi et al. 2012), at the cost of one
+    query. The sampler is the field's own: if it skips empty cells, matter is not blurred into them.
     """
 
     field: RadianceField

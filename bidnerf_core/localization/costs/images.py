@@ -1,8 +1,8 @@
-"""The cost of whole small images: compare renderings of a map from many poses with the photo.
+"""The cost of whole small images: photos are compared with renderings of a map from many poses.
 
-Thumbnails are the photos, small and smooth. Renderers draw the same views fast, without derivatives, from the baked surface or
-from a field. The derivative of a rendered image with respect to the pose follows from the image's gradient and its depth,
-whatever the renderer; automatic differentiation is not needed.
+Thumbnails are small, smoothed photos. Renderers quickly render the same views, without derivatives, from the baked surface or a
+field. The derivative of a rendered image by the pose follows from the image's gradient and its depth for any renderer; automatic
+differentiation is not needed.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from bidnerf_core.mapping.surface.casting import cast
 KERNEL_REACH = 3.0
 """Radius of a blurring kernel in standard deviations."""
 CHUNK = 16384
-"""Number of rays that are rendered at a time."""
+"""Number of rays rendered at a time."""
 UNKNOWN_COST = 0.7
 """Cost of a pixel for which the map renders nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A view resampled to a small camera without distortion. All that is derived from it lies on the device of ``rgb``."""
+    """A view resampled to a small camera without distortion. Derived tensors are on the device of ``rgb``."""
 
     camera: Intrinsics
     T_last_camera: SE3
@@ -69,7 +69,7 @@ class Thumbnail:
 
     @cached_property
     def rotation(self) -> Float[Tensor, "3 3"]:
-        """Rotation that takes the axes of the camera to those of the last camera."""
+        """Rotation from the camera's frame to the last camera's."""
         return self.T_last_camera.rotation.to(self.flat)
 
     @cached_property
@@ -78,7 +78,7 @@ class Thumbnail:
 
 
 def thumbnail(view: View, width: int) -> Thumbnail:
-    """Return ``view`` reduced to at most ``width`` pixels on its longer side, without distortion, smoothed; on the CPU."""
+    """Return ``view`` undistorted, smoothed and reduced to at most ``width`` pixels on its longer side; on the CPU."""
     camera = view.frame.intrinsics
     small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
     rgb = continued(view.frame).cpu().float().permute(2, 0, 1)[None]
@@ -93,7 +93,7 @@ def thumbnail(view: View, width: int) -> Thumbnail:
 
 
 def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """Convolve with a binomial kernel of 5x5 pixels, about a Gaussian of one pixel; the border is repeated."""
+    """Convolve with a 5x5 binomial kernel, approximately a Gaussian of one pixel; the border is replicated."""
     kernel = constant((1.0, 4.0, 6.0, 4.0, 1.0), image) / 16
     flat = image.reshape(-1, 1, *image.shape[-2:])
     flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
@@ -102,7 +102,7 @@ def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def gaussian_blurred(image: Float[Tensor, "b c h w"], pixels: float) -> Float[Tensor, "b c h w"]:
-    """Convolve with a Gaussian of standard deviation ``pixels``; the border is repeated."""
+    """Convolve with a Gaussian of standard deviation ``pixels``; the border is replicated."""
     size = 2 * math.ceil(KERNEL_REACH * pixels) + 1
     return gaussian_blur2d(image, (size, size), (pixels, pixels), "replicate")
 
@@ -120,19 +120,19 @@ def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, 
 class RayColours:
     """The rendered colour and distance of rays."""
 
-    rgb: Float[Tensor, "r 3"]  # times ``known``, where that is less than 1
+    rgb: Float[Tensor, "r 3"]  # premultiplied by ``known``
     known: Float[Tensor, "r"]  # 0 where the map has nothing along the ray
-    # Metres to what is seen or, where that is the background, to where the ray passes closest to the scene.
+    # Metres to the visible point or, for the background, to where the ray passes closest to the scene.
     along: Float[Tensor, "r"]
 
 
 @runtime_checkable
 class ViewRenderer(Protocol):
-    """Renders half-lines with unit directions (world frame)."""
+    """Renders rays with unit directions (world frame)."""
 
     @property
     def device(self) -> torch.device:
-        """Device on which the rays must lie and their colours are returned."""
+        """Device of the rays and the returned colours."""
         ...
 
     def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours: ...
@@ -140,12 +140,12 @@ class ViewRenderer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceRenderer:
-    """Renders the colours of surfels and, where the scene has a background, its colour behind them."""
+    """Renders the colours of surfels and, if the scene has a background, its colour behind them."""
 
     surface: SurfaceMap
     background: (
         tuple[float, float, float] | None
-    )  # None: a ray that meets nothing looks through a hole in the map
+    )  # None: a ray that hits nothing passes through a hole in the map
 
     @property
     def device(self) -> torch.device:
@@ -162,7 +162,7 @@ class SurfaceRenderer:
 
 @dataclass(frozen=True, eq=False)
 class FieldRenderer:
-    """Renders a field, with its background."""
+    """Renders a field with its background."""
 
     field: RadianceField
     bounds: SceneBounds
@@ -187,22 +187,24 @@ class FieldRenderer:
 
 @dataclass(frozen=True)
 class ColourScales:
-    """Scales of the comparison of colours, and how an image's exposure relative to the map is fitted."""
+    """Scales for comparing colours and for fitting an image's exposure relative to the map."""
 
-    colour: float = 0.2  # norm of a pixel's difference (three channels) at which its inlier weight is 1/2
+    colour: float = (
+        0.2  # norm of a pixel's colour difference (three channels) at which its inlier weight is 1/2
+    )
     gain: float = 0.2  # standard deviation of the prior about 1
     bias: float = 0.1  # standard deviation of the prior about 0
-    exposure_rounds: int = 2  # number of rounds of robust reweighting, which begin at a gain of 1; at least 1
+    exposure_rounds: int = 2  # number of rounds of robust reweighting, starting at a gain of 1; at least 1
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """A thumbnail's n pixels as the map renders them from each of h poses."""
+    """A thumbnail's n pixels as rendered from each of h poses."""
 
     camera: Intrinsics
     rgb: Float[Tensor, "h 3 n"]  # smoothed
-    known: Float[Tensor, "h n"]  # share of the pixel that the map renders, 0 to 1
-    points: Float[Tensor, "h n 3"]  # points seen by the pixels: metres, last camera's frame
+    known: Float[Tensor, "h n"]  # fraction of the pixel that the map renders, 0 to 1
+    points: Float[Tensor, "h n 3"]  # points visible in the pixels: metres, last camera's frame
     depth: Float[Tensor, "h n"]  # metres, in the thumbnail's camera
 
     @cached_property
@@ -245,16 +247,16 @@ def render_view(renderer: ViewRenderer, small: Thumbnail, T: SE3) -> RenderedVie
 class ImageCost:
     """Mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, with the difference c between rendered and measured colour.
 
-    Its normal equations are those of iteratively reweighted least squares. With the mean of both images' slopes, colours are
+    Its normal equations are those of iteratively reweighted least squares. By the mean of both images' gradients, colours are
     linearized with second-order accuracy (Benhimane and Malis 2004, "Real-time image-based tracking of planes using efficient
-    second-order minimization"). Updates rotate about ``pivot``. The cost is infinite where a pose is not finite.
+    second-order minimization"). Updates rotate about ``pivot``. The cost is infinite for non-finite poses.
     """
 
     renderer: ViewRenderer
     thumbnails: Sequence[Thumbnail]
     scales: ColourScales
     pivot: Float[Tensor, "3"]  # metres, last camera's frame
-    # Standard deviation by which photos are blurrier than renderings, pixels of thumbnails.
+    # Standard deviation of the photos' additional blur relative to renderings, pixels of thumbnails.
     blur: float = 0.0
 
     def __call__(self, T: SE3) -> NormalEquations:
@@ -272,11 +274,11 @@ class ImageCost:
         return torch.cat([part.pixels for part in compared], -1).double()
 
     def with_blur_of(self, T: SE3, candidates: Sequence[float]) -> ImageCost:
-        """Return the cost with the candidate blur that makes renderings from one pose most similar to the photos."""
+        """Return the cost with the candidate blur for which renderings from one pose are most similar to the photos."""
         return replace(self, blur=candidates[int(self.costs_of_blurs(T, candidates).argmin())])
 
     def costs_of_blurs(self, T: SE3, candidates: Sequence[float]) -> Float[Tensor, "b"]:
-        """Return the cost with each blur from one pose, which is rendered once."""
+        """Return the cost of one pose, rendered once, with each blur."""
         costs = torch.zeros(len(candidates), dtype=torch.float64, device=self.renderer.device)
         for small in self.thumbnails:
             seen = render_view(self.renderer, small, T[None])
@@ -297,14 +299,16 @@ class ImageCost:
         return compared.cost, gradient, weighted.mT @ rows.flatten(1, 2)
 
     def _compared(self, small: Thumbnail, seen: RenderedView) -> _Compared:
-        """Compare a rendered image, at the exposure that suits it best, with the measured one."""
+        """Compare a rendered image, at the best-fitting exposure, with the measured one."""
         measured, scale = small.rgb.flatten(1), self.scales.colour
         corrected = exposed(seen, measured, self.scales)
         error = corrected.clamp(0, 1) - measured
         near = inlier_weight((error**2).sum(1), scale)
         pixels = seen.known * (1 - near) + (1 - seen.known) * UNKNOWN_COST
         weight = seen.known * near**2 / scale**2 / error.shape[-1]
-        inside = (corrected - 0.5).abs() < 0.5  # where a camera clips, the colour does not depend on the pose
+        inside = (
+            corrected - 0.5
+        ).abs() < 0.5  # where the camera clips, the colour does not depend on the pose
         return _Compared(pixels, error, weight[:, None] * inside)
 
 
@@ -322,7 +326,7 @@ class _Compared:
 
 
 def plain_pixel_costs(thumbnails: Sequence[Thumbnail], scale: float) -> Float[Tensor, "n"]:
-    """Return each pixel's cost of images of one colour, the median of what was measured: the baseline that a pose must beat."""
+    """Return each pixel's cost for images with the median measured colour: the baseline that a pose must beat."""
     costs = []
     for small in thumbnails:
         measured = small.rgb.flatten(1)
@@ -334,9 +338,9 @@ def plain_pixel_costs(thumbnails: Sequence[Thumbnail], scale: float) -> Float[Te
 def exposed(
     seen: RenderedView, measured: Float[Tensor, "3 n"], scales: ColourScales
 ) -> Float[Tensor, "h 3 n"]:
-    """Return the rendered colours at the exposure that, given its priors, brings them nearest to the measured ones.
+    """Return the rendered colours at the exposure that, given its priors, best fits the measured ones.
 
-    The result is not clipped. Measured colours that are clipped, at black or white, do not influence the exposure.
+    The result is not clipped. Measured colours clipped at black or white do not influence the exposure.
     """
     if not (scales.gain and scales.bias):
         return seen.rgb
@@ -353,7 +357,7 @@ def exposed(
 def _by_point(
     small: Thumbnail, slope: Float[Tensor, "h 3 n 2"], depth: Float[Tensor, "h n"]
 ) -> Float[Tensor, "h 3 n 3"]:
-    """Return the change of each pixel's colour with a displacement of the camera, in the last camera's axes, per metre.
+    """Return the derivative of each pixel's colour by a displacement of the camera, in the last camera's axes, per metre.
 
     A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
     """

@@ -1,8 +1,8 @@
-"""Residuals of rendered rays and their Jacobian: one backward pass per channel, for any differentiable field.
+"""Residuals of rendered rays and their Jacobian, by one backward pass per channel, for any differentiable field.
 
-Rays are independent of each other, so the gradient of a channel's sum over all rays, with respect to their origins and
-directions, contains the gradient of every single ray. Four passes give the whole Jacobian of an RGB-D objective; on a GPU, one
-pass over four copies of the rays does.
+Rays are independent, so the gradient of a channel's sum over all rays, with respect to their origins and directions, contains the
+gradient of every single ray. Four passes give the whole Jacobian of an RGB-D objective; on a GPU, one pass over four copies of
+the rays suffices.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bidnerf_core.fields.sampling import rows_of
 from bidnerf_core.geometry.se3 import SE3
 
 MOST_AT_ONCE = 2**18
-"""Number of samples, copies included, up to which all channels are differentiated in one pass."""
+"""Number of samples, including copies, up to which all channels are differentiated in one pass."""
 
 BackgroundColour = tuple[float, float, float]
 
@@ -49,19 +49,19 @@ def linearize(
 ) -> Linearization:
     """Render ``rays`` (h n), which move with the pivots (h), and differentiate their residuals against ``observed`` (n).
 
-    ``least_weight``: samples with a smaller rendering weight contribute to what is rendered, but not to its derivative; most of
-    them lie in empty space, and nearly all of the time goes into derivatives. ``channels``: those to differentiate, by default
-    all; the Jacobian of the others is 0.
+    Samples with a rendering weight below ``least_weight`` contribute to the rendering, but not to its derivative: most of them lie
+    in empty space, and derivatives take nearly all of the time. ``channels`` are those to differentiate, by default all; the
+    Jacobian of the others is 0.
     """
     flat, shape = flattened(rays), rays.near.shape
     repeated = observed.repeated(shape[0])
     has_hits = isinstance(field, HitField)
     with torch.set_grad_enabled(has_hits):
-        # A field that finds what rays meet is rendered once: nearly all of the time goes into finding it.
+        # A field that finds ray hits is rendered once, since finding them takes nearly all of the time.
         leaves = [part.detach().requires_grad_(has_hits) for part in (flat.origins, flat.directions)]
         rendering = render(field, replace(flat, origins=leaves[0], directions=leaves[1]), background)
     with torch.no_grad():
-        # Rendered and measured colours nearly cancel at the answer, so their difference is taken in float64.
+        # Rendered and measured colours nearly cancel at the solution, so their difference is computed in float64.
         precise = replace(rendering, rgb=rendering.rgb.double())
         residuals = residual(precise, replace(repeated, rgb=repeated.rgb.double()))
     count = residuals.shape[-1]
@@ -87,9 +87,9 @@ def _gradients_by(
     leaves: list[Tensor], rendering: Rendering, observed: Observations, residual: Residual, channels: tuple[int, ...],
     count: int,
 ) -> tuple[Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]:  # fmt: skip
-    """Return the gradients of each ray's residuals with respect to ``leaves``: the origins and directions that were rendered."""
+    """Return the gradients of each ray's residuals with respect to ``leaves``, the rendered origins and directions."""
     results = [leaf.new_zeros((len(leaf), count, 3)) for leaf in leaves]
-    if not rendering.rgb.requires_grad:  # no ray meets anything
+    if not rendering.rgb.requires_grad:  # no ray hits anything
         return results[0], results[1]
     with torch.enable_grad():
         found = residual(rendering, observed)
@@ -132,7 +132,7 @@ def _ray_gradients(
     moving = replace(few, origins=leaves[0], directions=leaves[1])
     rendering: Rendering = render_samples(field, moving, samples, background)
     found = residual(rendering, seen).unflatten(0, (copies, -1))
-    # Each pass is of one channel of each copy of the rays.
+    # Each pass differentiates one channel of each copy of the rays.
     passes = [channels] if copies > 1 else [(channel,) for channel in channels]
     for number, wanted in enumerate(passes, start=1):
         total = sum((found[copy, :, c].sum() for copy, c in enumerate(wanted)), start=found.new_zeros(()))
@@ -148,15 +148,15 @@ def _ray_gradients(
 
 
 def _all_at_once(samples: RaySamples, channels: int) -> bool:
-    """Return whether to differentiate all channels in one pass, over as many copies of the rays.
+    """Return whether to differentiate all channels in one pass over as many copies of the rays.
 
-    A CPU would only have more to compute. On a GPU, the launch dominates the time of a pass unless its samples are many.
+    On a CPU, this would only add computation. On a GPU, the launch dominates the time of a pass unless there are many samples.
     """
     return samples.valid.device.type != "cpu" and channels * samples.valid.numel() <= MOST_AT_ONCE
 
 
 def _gathered(samples: RaySamples, kept: Bool[Tensor, "r s"], rays: Tensor) -> RaySamples:
-    """Return the kept samples of some rays, moved to the front of rows that are as short as possible."""
+    """Return the kept samples of some rays, packed into rows that are as short as possible."""
     kept = kept[rays]
     order = (~kept).sort(dim=-1, stable=True).indices[:, : int(kept.sum(-1).amax())]
     parts = (samples.starts[rays], samples.ends[rays], kept)

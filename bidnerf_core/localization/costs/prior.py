@@ -1,4 +1,4 @@
-"""A Gaussian prior on a pose as a cost, from landmarks, a previous frame or another sensor."""
+"""A Gaussian prior on a pose, from landmarks, a previous frame or another sensor, as a cost."""
 
 from __future__ import annotations
 

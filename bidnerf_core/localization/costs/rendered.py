@@ -1,6 +1,6 @@
-"""The cost of rendered rays: what the field renders from a pose against what was measured.
+"""The cost of rendered rays: comparison of the field's renderings from a pose with the measurements.
 
-Rays are drawn with the weights of their residuals, which are the same for every pose that is tried.
+Rays are drawn once, with weights of their residuals that are the same for every pose.
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ from bidnerf_core.localization.settings import (
 from bidnerf_core.localization.solvers.pivots import Pivot
 
 MISS_SCALES = 3.0
-"""Depth residual, in depth scales, of a ray that meets nothing: an outlier's, but less than the whole distance."""
+"""Depth residual, in depth scales, of a ray that hits nothing: that of an outlier, but less than the whole distance."""
 LEAST_WITH_DEPTH = 0.05
-"""Least share of the rays that must have depth for these to represent all."""
+"""Minimum fraction of rays with depth for these to represent all."""
 
 
 @dataclass(frozen=True)
 class RayCounts:
     """The numbers of rays to draw."""
 
-    pixels: int  # in all, shared out equally among the views
+    pixels: int  # in total, divided equally among the views
     depth_rays: int = 0  # in addition, from a sensor with rays of its own
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedRays:
-    """Measured rays in the last camera's frame, and how much each residual counts in the objective."""
+    """Measured rays in the last camera's frame, and the weights of their residuals in the objective."""
 
     observed: Observations  # (n)
     weights: Float[Tensor, "n c"]  # 0 where nothing was measured
 
     @cached_property
     def channels(self) -> tuple[int, ...]:
-        """The residuals that were measured along any ray."""
+        """The channels that were measured along any ray."""
         used = (self.weights > 0).any(0).tolist()
         return tuple(channel for channel, is_used in enumerate(used) if is_used)
 
@@ -70,9 +70,9 @@ def draw_weighted_rays(
     blur: int,
     generator: Generator,
 ) -> WeightedRays:
-    """Draw pixels of all views and, where there are any, depth rays, weighted as in eqs. 5 and 6.
+    """Draw pixels of all views and any depth rays, weighted as in eqs. 5 and 6.
 
-    Colours are averaged over squares of ``blur`` x ``blur`` pixels; 1 leaves them as they are.
+    Colours are averaged over squares of ``blur`` x ``blur`` pixels; 1 leaves them unchanged.
     """
     views = [blurred(view, blur) for view in problem.views] if blur > 1 else problem.views
     seen = draw(views, counts.pixels, drawer(pixels), generator, device=problem.device)
@@ -85,12 +85,12 @@ def draw_weighted_rays(
 
 
 def blurred(view: View, size: int) -> View:
-    """Return the view with colours averaged over squares of ``size`` pixels and interpolated in between; depth is unchanged."""
+    """Return the view with colours averaged over squares of ``size`` pixels and interpolated between; depth is unchanged."""
     frame = view.frame
     height, width = frame.held_rgb.shape[:2]
     size = min(size, height, width)
     small = avg_pool2d(continued(frame).permute(2, 0, 1)[None], size, ceil_mode=True, count_include_pad=False)
-    # Enlarged to whole squares, then cut to the image, so that squares stay where they were.
+    # Enlarged to whole squares, then cropped to the image, so that squares stay in place.
     covered = (small.shape[2] * size, small.shape[3] * size)
     smooth = interpolate(small, covered, mode="bilinear", align_corners=False)[..., :height, :width]
     return replace(view, frame=replace(frame, rgb=smooth[0].permute(1, 2, 0).contiguous()))
@@ -104,13 +104,13 @@ class Residuals:
     jacobian: Float[Tensor, "h n c 6"]
     weights: Float[Tensor, "n c"]  # of each in the objective; 0 where nothing was measured
     steepness: Float[Tensor, "h n c"]  # norm of its gradient with respect to the ray's origin, per metre
-    surface_sigma: float  # metres: how far off what is seen may be, by the map's errors or the pose's
+    surface_sigma: float  # metres: uncertainty of the scene's position, due to errors of the map or the pose
     objective: Objective
-    home: torch.device = torch.device("cpu")  # device of the poses, on which all results are returned
+    home: torch.device = torch.device("cpu")  # device of the poses, on which results are returned
 
     @cached_property
     def confidence(self) -> Float[Tensor, "h n c"]:
-        """1, or less where a residual is too steep for the accuracy of what is seen: its variance is (steepness x sigma)^2."""
+        """1, or less for residuals too steep for the scene's uncertainty, which adds a variance of (steepness x sigma)^2."""
         scales = constant(tuple(self.objective.scales), self.value)
         return (1 + (self.surface_sigma / scales * self.steepness) ** 2).rsqrt()
 
@@ -122,8 +122,8 @@ class Residuals:
     def cost(self) -> Float[Tensor, "h"]:
         """Return ``2 sum weight rho(r)``, the plain weighted sum of squares if residuals are small.
 
-        The confidence weights the equations of a step, but not this cost. Otherwise a step could lower the cost by moving
-        rays to where residuals are steep and their confidence is low.
+        The confidence weights the equations of a step, but not this cost. Otherwise, a step could lower the cost by moving rays
+        to where residuals are steep and their confidence is low.
         """
         return self.ray_costs().sum(-1)
 
@@ -145,9 +145,9 @@ class Residuals:
         return torch.einsum("hnc,hnci->hni", self._pull * self.value, self.jacobian).to(self.home)
 
     def variance(self) -> Float[Tensor, "h"]:
-        """Return the variance of a residual as the pose sees it: rays that determine nothing, as on a background, do not count.
+        """Return the variance of a residual with respect to the pose, ignoring uninformative rays such as those on a background.
 
-        With it, independent rays would give the pose's covariance by the inverse of the Hessian divided by their number.
+        For n independent rays, the pose's covariance would be this times the inverse of the Hessian, divided by n.
         """
         hessian, scores = self.normal_equations().hessian, self.scores()
         scores = scores - scores.mean(1, keepdim=True)  # the remaining mean gradient is not noise
@@ -157,13 +157,13 @@ class Residuals:
         return scores.shape[1] / 6 * spread
 
     def inliers(self) -> Float[Tensor, "h"]:
-        """Return the share of rays none of whose residuals exceeds three times the scale at which outliers begin."""
+        """Return the fraction of rays with all residuals within three times the scale at which outliers begin."""
         return self._agreeing.double().mean(-1).to(self.home)
 
     def inliers_by_depth(self) -> Float[Tensor, "h"]:
-        """Return the share of ``inliers`` among the rays with depth; among all rays if fewer than ``LEAST_WITH_DEPTH`` have it.
+        """Return the inlier fraction of the rays with depth, or of all rays if less than ``LEAST_WITH_DEPTH`` have it.
 
-        What hides the scene without having depth is left out: it may be too near for the sensor, too dark or too transparent.
+        This excludes occluders without depth, which may be too close for the sensor, too dark or too transparent.
         """
         measured = (self.weights[:, 3:] > 0).any(-1).double()
         agreeing = self._agreeing.double()
@@ -179,7 +179,7 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False)
 class RenderedCost:
-    """The objective on one draw of rays, at one stage's level of detail."""
+    """The objective on one draw of rays, at a stage's level of detail."""
 
     problem: Problem
     rays: WeightedRays
@@ -192,11 +192,11 @@ class RenderedCost:
         return self.residuals(T).normal_equations()
 
     def cost(self, T: SE3) -> Float[Tensor, "h"]:
-        """Return the cost alone, without spending time on derivatives."""
+        """Return the cost alone, without computing derivatives."""
         return self.residuals(T, derivatives=False).cost()
 
     def residuals(self, T: SE3, derivatives: bool = True) -> Residuals:
-        """Return the residuals from poses T (h); without ``derivatives`` their Jacobian is 0."""
+        """Return the residuals at poses T (h); without ``derivatives``, their Jacobian is 0."""
         home, device = T.translation.device, self.rays.weights.device
         T, channels = T.to(device), self.rays.channels if derivatives else ()
         rays = self.rays.observed.rays(T, self.problem.bounds)
@@ -210,13 +210,13 @@ class RenderedCost:
         return replace(residuals, home=home)
 
     def ray_costs(self, T: SE3) -> Float[Tensor, "h n"]:
-        """Return each ray's part of the cost, without spending time on derivatives."""
+        """Return each ray's part of the cost, without computing derivatives."""
         return self.residuals(T, derivatives=False).ray_costs()
 
     def plain_ray_costs(self) -> Float[Tensor, "n"] | None:
-        """Return each ray's part of the cost of images of a single colour, the one that suits the rays best; on the CPU.
+        """Return each ray's part of the cost for images with the single best-fitting colour; on the CPU.
 
-        None if depth was measured too, or no colour.
+        None if depth was measured too, or if no colour was.
         """
         weights, rgb = self.rays.weights.double(), self.rays.observed.rgb.double()
         if bool((weights[:, 3:] > 0).any()) or not bool((weights[:, :3] > 0).any()):
@@ -236,7 +236,7 @@ class RenderedCost:
         return self.problem.level(self.stage.level)
 
     def _field(self, rays: Rays) -> RadianceField:
-        """Return the stage's level, sampled only about the measured depth where the stage has a window."""
+        """Return the stage's level, sampled only around the measured depth if the stage has a window."""
         if self.stage.window == 0:
             return self.field
         distance = self.rays.observed.distance.expand(rays.near.shape).flatten()
@@ -248,7 +248,7 @@ class RenderedCost:
 
 @dataclass(frozen=True)
 class RenderedCostSettings:
-    """The settings of the rendered cost that all stages of a refinement share."""
+    """The settings of the rendered cost that are common to all stages of a refinement."""
 
     colour: ColourSettings
     depth: DepthSettings | None  # None: colour alone
@@ -262,16 +262,16 @@ class RenderedCostSettings:
         objective = objective_of(self.colour, depth, stage.colour_scale, stage.depth_scale, MISS_SCALES)
         counts = RayCounts(stage.rays, 0 if depth is None else depth.depth_rays)
         rays = draw_weighted_rays(problem, objective, counts, self.refinement.pixels, stage.blur, generator)
-        _ = rays.channels  # counted here, since the host waits for it
+        _ = rays.channels  # computed here, since the host waits for it
         return RenderedCost(problem, rays, objective, stage, self.refinement, pivot)
 
 
 def _residuals(
     found: Linearization, rays: WeightedRays, objective: Objective, exposure: bool, surface_sigma: float
 ) -> Residuals:
-    """Turn a linearization into weighted residuals; with ``exposure``, the rendering first takes on the image's exposure.
+    """Convert a linearization to weighted residuals; with ``exposure``, the rendering is first corrected to the image's exposure.
 
-    The correction clips colours at black and at white, as cameras do; where it does, a residual does not depend on the pose.
+    The correction clips colours at black and white, as cameras do; a clipped residual does not depend on the pose.
     """
     value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
     if exposure:

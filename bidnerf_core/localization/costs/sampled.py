@@ -26,14 +26,14 @@ from bidnerf_core.localization.settings import DescentSettings, ReachSettings
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""
 LITTLE_BACKGROUND = 0.02
-"""Share of an image's pixels that show no matter, up to which preferring the other pixels is not worth its cost."""
+"""Fraction of an image's pixels without matter below which preferring the other pixels is not worth its cost."""
 BOX_SCALE = 0.1
 """Distance (metres) between a measured point and the box of the scene at which outliers begin."""
 
 
 @dataclass(eq=False)
 class SampledLoss:
-    """The loss at a pose, on pixels that are drawn anew at each call or only once."""
+    """The loss of a pose on pixels that are drawn at each call or only once."""
 
     problem: Problem
     objective: Objective
@@ -62,11 +62,11 @@ class SampledLoss:
 
     @property
     def is_capturable(self) -> bool:
-        """Whether each call does the same computation apart from random numbers; with a blur, which fades, it does not."""
+        """Whether all calls do the same computation apart from random numbers; not with a blur, which fades."""
         return self.reach.blur == 0
 
     def _field(self) -> RadianceField:
-        """Return the level that is rendered, with the sampling and the blur of this step."""
+        """Return the level to render, with the sampling and the blur of this step."""
         scene, reach = self.problem.level(self.rays.level), self.reach
         if reach.samples > 0:
             scene = Resampled(scene, Stratified(reach.samples, self.problem.bounds))
@@ -96,7 +96,7 @@ class SampledLoss:
         return masked_mean(robust(torch.linalg.vector_norm(off, dim=-1)), observed.measured).mean()
 
     def _drawn(self, T_world_last: SE3) -> list[Observations]:
-        """Draw pixels (views, pixels per view) and, where there are any, depth rays (1, rays)."""
+        """Draw pixels (views, pixels per view) and any depth rays (1, rays)."""
         problem, device = self.problem, self.problem.device
         many = self.counts.pixels * self._candidates
         pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
@@ -112,7 +112,7 @@ class SampledLoss:
         return batches
 
     def _rank(self, pixels: Observations, T_world_last: SE3) -> Int[Tensor, "k p"]:
-        """Return 2 or more for pixels that show matter in the image, and 1 for others that may meet it in the map."""
+        """Return 2 or more for pixels that show matter in the image, and 1 for others whose rays may hit it in the map."""
         background = constant(self.problem.bounds.background, pixels.rgb)
         shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
         sampler = self.problem.level(self.rays.level).sampler
@@ -125,7 +125,7 @@ def _shows_background(problem: Problem) -> bool:
 
 
 def _share_of_background(frame: Frame, bounds: SceneBounds) -> float:
-    """Return the share of the pixels that have the background's colour and no measured depth."""
+    """Return the fraction of the pixels with the background's colour and without measured depth."""
     plain = ((frame.rgb - constant(bounds.background, frame.rgb)).abs() <= DIFFERENT).all(-1)
     plain = plain if frame.depth is None else plain & (frame.depth <= 0)
     return float((plain if frame.hidden is None else plain[~frame.hidden]).float().mean())

@@ -1,4 +1,4 @@
-"""The cost of measured points on a baked surface, with exact derivatives, for many poses at once."""
+"""The cost of measured points on a baked surface, with exact derivatives, for batches of poses."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from bidnerf_core.mapping import SurfaceMap
 SURFEL_RADIUS = 1.5
 """Radius of a surfel's disc, in cells of the surface's grid."""
 MOST_DRAWN_FROM = 1_000_000
-"""Number of a view's measured pixels above which they are thinned evenly before points are drawn."""
+"""Number of a view's measured pixels above which they are evenly subsampled before points are drawn."""
 MOST_COLOUR_CHANGE = 0.2
-"""Largest change of a surfel's colour along its plane to which its gradient is extrapolated."""
+"""Maximum change of a surfel's colour to which its gradient is extrapolated within the plane."""
 
 
 @dataclass(frozen=True)
@@ -39,23 +39,23 @@ class PointScales:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Measured points with their colours, in the frame of the camera whose pose is sought."""
+    """Measured points with their colours, in the frame of the camera to be localized."""
 
     points: Float[Tensor, "p 3"]  # metres
     rgb: Float[Tensor, "p 3"]
-    origins: Float[Tensor, "p 3"]  # metres: where each was measured from
+    origins: Float[Tensor, "p 3"]  # metres: position of the sensor for each
     coloured: Bool[Tensor, "p"]  # whether a colour was measured
-    # Derivative of the points (metres) with respect to errors that all depths share. If given, these follow the pose's six
-    # unknowns.
+    # Derivative of the points (metres) with respect to errors common to all depths. If given, these are unknowns after the
+    # pose's six.
     by_error: Float[Tensor, "p 3 e"] | None = None
 
     @staticmethod
     def measured(
         views: tuple[View, ...], depth_rays: Observations | None, count: int, generator: Generator
     ) -> PointCloud:
-        """Return up to ``count`` measured points in random order, shared out equally among the sensors; on the CPU.
+        """Return up to ``count`` measured points in random order, divided equally among the sensors; on the CPU.
 
-        Points of ``depth_rays`` take their colours from the views that see them.
+        Points of ``depth_rays`` take their colours from the views in which they are visible.
         """
         share = -(-count // (len(views) + (depth_rays is not None)))
         parts = [_cloud_of(view, share, generator) for view in views]
@@ -80,7 +80,7 @@ class PointCloud:
         )
 
     def corrected(self, factor: float, offset: float) -> PointCloud:
-        """Return the points, not corrected so far, with distances multiplied by a factor and lengthened by an offset (metres).
+        """Return uncorrected points with distances multiplied by a factor and increased by an offset (metres).
 
         Factor and offset become unknowns, in this order.
         """
@@ -100,7 +100,7 @@ class PointCloud:
 
     @cached_property
     def basis(self) -> Float[Tensor, "p 3 k"]:
-        """Jacobian of the points, in the camera's axes, with respect to an update about their middle and the shared errors, if any."""
+        """Jacobian of the points, in the camera's axes, by an update about their middle and any shared errors."""
         turned = -skew(self.points - self.middle)
         eye = torch.eye(3, dtype=turned.dtype, device=turned.device)
         by_pose = torch.cat([eye.expand_as(turned), turned], dim=-1)
@@ -108,7 +108,7 @@ class PointCloud:
 
     @cached_property
     def squares(self) -> Float[Tensor, "p kk"]:
-        """``basis^T basis`` of each point: what an isotropic residual adds to the Hessian."""
+        """``basis^T basis`` of each point: the contribution of an isotropic residual to the Hessian."""
         return (self.basis.mT @ self.basis).flatten(1)
 
     @cached_property
@@ -119,13 +119,13 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Each measured point's nearest surfel and its offset from it, from each of h poses."""
+    """Each measured point's nearest surfel and the offset from it, for each of h poses."""
 
     index: Int[Tensor, "h p"]  # of the surfel
     across: Float[Tensor, "h p"]  # metres out of its plane
     normal: Float[Tensor, "h p 3"]  # world
     along: Float[Tensor, "h p 3"]  # metres, the offset within the plane; world
-    beyond: Float[Tensor, "h p"]  # the part of that offset that lies beyond the surfel's own disc, 0 to 1
+    beyond: Float[Tensor, "h p"]  # fraction of that offset beyond the surfel's disc, 0 to 1
     rotation: Float[Tensor, "h 3 3"]
 
     @property
@@ -138,8 +138,8 @@ class Correspondences:
 class SurfaceCost:
     """The cost of measured points on a surface: the mean over points of ``(1 - n) + w (1 - n a)``.
 
-    The inlier weight n falls from 1 to 0 with the distance from the nearest surfel; a falls likewise with the difference
-    between the surfel's colour and the measured one; w is ``colour_weight``.
+    The inlier weight n falls from 1 to 0 with the distance from the nearest surfel, a likewise with the difference between the
+    surfel's colour and the measured one, and w is ``colour_weight``.
 
     Its normal equations are those of iteratively reweighted least squares: the gradient is exact, the Hessian positive
     semidefinite. They are computed on the device of the surface and returned on that of the poses.
@@ -179,7 +179,7 @@ class SurfaceCost:
         return NormalEquations(self._cost(near, alike), gradient + by_colour[0], hessian + by_colour[1])
 
     def cost(self, T: SE3) -> Float[Tensor, "h"]:
-        """Return the cost alone, without spending time on derivatives."""
+        """Return the cost alone, without computing derivatives."""
         near, alike = self.inliers(self.correspondences(T))
         colour = self.scales.colour_weight
         return moved(self._cost(near, alike) if colour else (1 - near).mean(-1).double(), T.device)
@@ -190,7 +190,7 @@ class SurfaceCost:
         return moved((1 - near + self.scales.colour_weight * (1 - near * alike)).double(), T.device)
 
     def inliers(self, found: Correspondences) -> tuple[Float[Tensor, "h p"], Float[Tensor, "h p"]]:
-        """Return each point's inlier weights: that of its distance and that of its colour."""
+        """Return each point's inlier weights by distance and by colour."""
         near = inlier_weight(found.squared, self.scales.distance)
         difference, _ = self.colour_differences(found)
         return near, inlier_weight((difference**2).sum(-1), self.scales.colour)
@@ -214,7 +214,7 @@ class SurfaceCost:
     def correspondences(self, T: SE3) -> Correspondences:
         """Match each point with its nearest surfel, on the surface's device.
 
-        A point beside an edge lies in the plane of the surfel there, but not on the surfel; ``beyond`` accounts for it.
+        A point beside an edge may lie in the plane of the nearest surfel but not on its disc; ``beyond`` accounts for this.
         """
         surface, points = self.surface, self.cloud.points
         rotation, translation = T.rotation.to(points), T.translation.to(points)
@@ -231,8 +231,8 @@ class SurfaceCost:
     def colour_differences(
         self, found: Correspondences
     ) -> tuple[Float[Tensor, "h p 3"], Float[Tensor, "h p 3 3"]]:
-        """Return the surface's colour at each point minus the measured one, and its derivative with respect to the point's
-        position (channel by world axis).
+        """Return the surface's colour at each point minus the measured one, and its derivative by the point's position (channel
+        by world axis).
         """
         gradient = self.surface.surfels.rgb_gradient[found.index]
         change = (gradient @ found.along[..., None])[..., 0]
@@ -260,7 +260,7 @@ def _cloud_of(view: View, count: int, generator: Generator) -> PointCloud:
 def _cloud_of_rays(
     depth_rays: Observations, views: tuple[View, ...], count: int, generator: Generator
 ) -> PointCloud:
-    """Return the points that rays measured, in the last camera's frame, with the colours of the pixels where views see them."""
+    """Return the points of depth rays, in the last camera's frame, with the colours of the pixels to which they project."""
     some = depth_rays.drawn(count, generator, device="cpu")
     rgb, coloured = torch.zeros_like(some.points), torch.zeros(len(some), dtype=torch.bool)
     for view in views:
@@ -268,7 +268,7 @@ def _cloud_of_rays(
         local = view.T_ref_camera.to(some.points).inverse().apply(some.points)
         pixels = camera.project(local)
         size = pixels.new_tensor([camera.width, camera.height])
-        seen = ((pixels >= 0) & (pixels < size)).all(-1)  # never where it is NaN, behind the camera
+        seen = ((pixels >= 0) & (pixels < size)).all(-1)  # false for NaN, behind the camera
         seen[seen.clone()] = visible_at(view.frame, pixels[seen])
         columns, rows = pixels[seen].long().unbind(-1)
         rgb[seen] = colours_at(view.frame.held_rgb.cpu(), rows, columns).to(rgb)
@@ -281,8 +281,8 @@ def _distance_terms(
 ) -> tuple[Tensor, Tensor]:
     """Return the gradient and the Hessian of half the weighted squared distances.
 
-    A squared distance is split into a part across the plane and an isotropic one,
-    ``n n^T + s (1 - n n^T) = (1 - s) n n^T + s``; the derivative of s itself is left out.
+    A squared distance is split into a part across the plane and an isotropic part,
+    ``n n^T + s (1 - n n^T) = (1 - s) n n^T + s``; the derivative of s itself is neglected.
     """
     count = len(cloud)
     spread = weight * found.beyond

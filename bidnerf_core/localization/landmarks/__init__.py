@@ -1,1 +1,1 @@
-"""Localization by landmarks: features, matches, a first pose, its camera, and the evidence for it."""
+"""Localization by landmarks: features, matching, an initial pose, its camera, and the evidence for it."""

@@ -1,22 +1,22 @@
-"""The significance of an agreement: how many equally good ones are expected by chance."""
+"""Significance of an agreement: the number of equally good ones expected by chance (false alarms)."""
 
 from __future__ import annotations
 
 import math
 
 DECISIVE = 4.0
-"""Log odds beyond which one of two explanations is right."""
+"""Log odds beyond which one of two explanations is accepted."""
 BY_SHARE = 10.0
-"""Log odds for each factor e between the numbers of landmarks that match: at the right place, seldom are less than two thirds as
-many as elsewhere.
+"""Log odds per factor e between the numbers of matching landmarks: the right place rarely has fewer than two thirds as many as
+another.
 """
 
 
 def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) -> float:
-    """Return the decimal logarithm of the number of false alarms (Moisan and Stival 2004, eq. 10).
+    """Return log10 of the number of false alarms (Moisan and Stival 2004, eq. 10).
 
-    This is the expected number of poses with which ``agreeing`` of ``matches`` agree, if all matches are wrong. The lower it
-    is, the less likely the agreement is due to chance. ``probability`` is the probability that a wrong match agrees with a
+    This is the expected number of poses with ``agreeing`` inliers among ``matches`` if all matches are wrong. The lower it is,
+    the less likely the agreement is due to chance. ``probability`` is the probability that a wrong match is an inlier of a
     given pose; ``sample`` is the number of correspondences that determine a pose.
     """
     if agreeing <= sample:
@@ -41,7 +41,7 @@ def probability_of(log_odds: float) -> float:
 
 
 def log_odds_of_share(share: float) -> float:
-    """Return the log odds of a pose against an explanation that has this share of its evidence by landmarks."""
+    """Return the log odds of a pose against an explanation with this fraction of its evidence by landmarks."""
     return -BY_SHARE * math.log(share) if share > 0 else math.inf
 
 

@@ -1,7 +1,7 @@
-"""A first pose from matches that are mostly outliers, by poselib's minimal solvers in LO-RANSAC.
+"""Initial pose from matches that are mostly outliers, by poselib's minimal solvers in LO-RANSAC.
 
-One camera: P3P (Persson and Nordberg 2018). Several with known relative poses: generalized P3P (Kukelova et al. 2016).
-Unknown focal length: P4Pf, which poselib provides without a RANSAC loop, so the loop is here.
+The solver is P3P for one camera (Persson and Nordberg 2018), generalized P3P for several with known relative poses (Kukelova et
+al. 2016), and P4Pf for an unknown focal length. poselib provides P4Pf without a RANSAC loop, so the loop is here.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ SUCCESS = 0.9999
 """RANSAC stops once a sample without outliers has been drawn with this probability."""
 LEAST_DRAWS, MOST_DRAWS = 50, 20_000
 MOST_DRAWS_WITH_FOCAL = 1500
-"""Fewer draws are allowed because each takes some hundred microseconds."""
+"""Fewer draws are allowed because each takes hundreds of microseconds."""
 FOCAL_RANGE = (0.2, 5.0)
 """Range of the focal length, in multiples of the given one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose and the correspondences that agree with it."""
+    """A pose and its inliers."""
 
     T_world_rig: SE3
     inliers: Bool[Tensor, "m"]
@@ -44,7 +44,7 @@ def sample_consensus(
     """Return the pose with the most inliers within ``threshold`` pixels; None if there are too few matches or no solution.
 
     The matches in ``data`` must be ordered from the most to the least reliable. For a rig, each camera is also tried alone,
-    because the generalized solver is unstable if the cameras are almost in one place.
+    because the generalized solver is unstable if the camera centres almost coincide.
     """
     views = view.unique().tolist()
     found = [_single(data, (view == v).nonzero()[:, 0], threshold, seed) for v in views]
@@ -104,7 +104,7 @@ def focal_consensus(
     """Return the pose and focal length of one camera with the most inliers within ``threshold`` pixels, or None.
 
     The matches in ``data`` must be ordered from the most to the least reliable. The focal length is searched within
-    ``FOCAL_RANGE`` of the given one; the principal point is taken as known.
+    ``FOCAL_RANGE`` of the given one; the principal point is assumed to be known.
     """
     if len(data) < 5:
         return None
@@ -136,7 +136,7 @@ def _projected(pose: poselib.CameraPose, points: Float[np.ndarray, "m 3"]) -> Fl
 
 
 def _draws_needed(inliers: float) -> int:
-    """Return how many samples of four to draw so that one most likely has no outlier (Fischler and Bolles 1981)."""
+    """Return the number of samples of four among which one most likely has no outlier (Fischler and Bolles 1981)."""
     clean = min(max(inliers, 1e-3) ** 4, 1 - 1e-9)
     return max(LEAST_DRAWS, int(3 * np.log(1 - SUCCESS) / np.log1p(-clean)))
 

@@ -21,14 +21,14 @@ from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 @dataclass(frozen=True, eq=False)
 class QueryImage:
-    """The keypoints of a query image, as undistorted rays, and its camera's pose in the frame of the rig's last camera."""
+    """The keypoints of a query image, as undistorted rays, and the pose of its camera in the rig's frame."""
 
     keypoints: Keypoints
     rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
     depth: Float[Tensor, "n"]  # metres, 0 where none was measured
     intrinsics: Intrinsics
     T_rig_camera: SE3  # float64
-    hidden: Bool[Tensor, "h w"] | None = None  # pixels that show what the map does not have, see ``Frame``
+    hidden: Bool[Tensor, "h w"] | None = None  # pixels of objects that are not in the map, see ``Frame``
 
     @property
     def focal(self) -> float:
@@ -37,7 +37,7 @@ class QueryImage:
 
 
 def query_images(views: Sequence[View], features: Features) -> list[QueryImage]:
-    """Detect the keypoints of ``views``, whose poses share any common frame; the rig's frame is that of the last camera."""
+    """Detect the keypoints of ``views``, with poses in any common frame; the rig's frame is that of the last camera."""
     T_rig_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
     return [
         query_image(
@@ -57,19 +57,19 @@ def query_image(frame: Frame, T_rig_camera: SE3, features: Features) -> QueryIma
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMatches:
-    """Matches: each row is a view, one of its keypoints, and the landmark that the keypoint shows."""
+    """Matches: each row is a view, one of its keypoints, and the landmark matched with it."""
 
     view: Int[Tensor, "m"]
     keypoint: Int[Tensor, "m"]
     landmark: Int[Tensor, "m"]
-    ambiguity: Float[Tensor, "m"]  # 0: nothing else looks like it; 1: something else looks as much like it
+    ambiguity: Float[Tensor, "m"]  # ratio of the best to the second-best descriptor distance
 
     def __len__(self) -> int:
         return len(self.view)
 
     @property
     def keys(self) -> Int[Tensor, "m"]:
-        """A number that identifies each match by its view (up to 512), keypoint (up to a million) and landmark."""
+        """A unique number for each match by its view (up to 512), keypoint (up to a million) and landmark."""
         return (self.view << 54) + (self.keypoint << 34) + self.landmark
 
     def __getitem__(self, index: Tensor) -> LandmarkMatches:
@@ -86,7 +86,7 @@ class LandmarkMatches:
 def observed_points(
     images: Sequence[QueryImage], landmarks: LandmarkMap, found: LandmarkMatches
 ) -> ObservedPoints:
-    """Return the landmarks and the observations that the matches ``found`` refer to, as input of a pose solver."""
+    """Return the landmarks and keypoints of the matches ``found``, as input for a pose solver."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
     number = first[found.view] + found.keypoint
     T_camera_rig = SE3.stack([image.T_rig_camera.inverse() for image in images])

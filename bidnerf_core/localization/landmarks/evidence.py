@@ -1,4 +1,4 @@
-"""The evidence for a pose by landmarks: how many agree with it, how many would by chance, and where they lie."""
+"""The evidence for a pose by landmarks: its inliers, the number expected by chance, and their spread over the image."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from bidnerf_core.localization.landmarks.refinement import GuidedPose
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 LEAST_DEPTHS = 6
-"""Least number of measured depths that determine a depth scale."""
+"""Minimum number of measured depths for estimating a depth scale."""
 CELLS = 8
-"""Rows and columns into which an image is divided to see how far the correspondences spread."""
+"""Number of rows and columns of cells by which the spread of correspondences over an image is measured."""
 
 
 def described(answer: GuidedPose) -> LandmarkPose:
@@ -73,7 +73,7 @@ def median_distance(data: ObservedPoints, T_world_rig: SE3) -> float:
 
 
 def depth_scale(data: ObservedPoints, T_world_rig: SE3) -> float | None:
-    """Return the factor that corrects measured depth; None if too little was measured."""
+    """Return the factor that corrects measured depth; None if too few depths were measured."""
     known = data.depth > 0
     if int(known.sum()) < LEAST_DEPTHS:
         return None
@@ -81,29 +81,29 @@ def depth_scale(data: ObservedPoints, T_world_rig: SE3) -> float | None:
 
 
 def log10_agreement(query: LandmarkQuery, matches: LandmarkMatches, agreeing: int) -> float:
-    """Return the logarithm of the number of false alarms if ``agreeing`` of ``matches`` are inliers."""
+    """Return log10 of the number of false alarms if ``agreeing`` of ``matches`` are inliers."""
     return log10_nfa(len(matches), agreeing, probability_within(query.threshold, query.images[-1].intrinsics))
 
 
 def probability_within(radius: float, camera: Intrinsics) -> float:
-    """Return the probability that a wrong match, which lies anywhere in the image, is within ``radius`` pixels of a point."""
+    """Return the probability that a wrong match, uniformly distributed in the image, is within ``radius`` pixels of a point."""
     return min(0.5, math.pi * radius**2 / (camera.width * camera.height))
 
 
 def cell_numbers(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
-    """Return the number of the cell, in a grid over the image, in which each pixel lies."""
+    """Return the number of the grid cell of the image in which each pixel lies."""
     size = torch.tensor([camera.width, camera.height])
     column, row = (pixels / size * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
     return row * CELLS + column
 
 
 def share_of_cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> float:
-    """Return the share of the image's cells that hold one of the pixels."""
+    """Return the fraction of the image's cells that contain any of the pixels."""
     return len(cell_numbers(pixels, camera).unique()) / CELLS**2
 
 
 def _spread(query: LandmarkQuery, found: LandmarkMatches) -> float:
-    """Return the share of an image's cells that hold a correspondence, averaged over the views."""
+    """Return the fraction of an image's cells that contain a correspondence, averaged over the views."""
     shares, pixels = [], query.pixels(found)
     for number, image in enumerate(query.images):
         shares.append(share_of_cells(pixels[found.view == number], image.intrinsics))

@@ -1,7 +1,7 @@
-"""Cameras so far from the stated one that the image's matches have to be found anew: another focal length, a crop, a resized image.
+"""Cameras so different from the stated one that matching must be repeated: another focal length, a crop or a resized image.
 
-Matches in one part of the scene, on a single wall say, agree with a wrong pose and wrong intrinsics as well as with the right
-ones. The other matches decide: far more of them agree if the camera is an unknown of the fit.
+Matches in one part of the scene, such as a single wall, fit a wrong pose with wrong intrinsics as well as the right ones. The
+other matches decide: far more of them become inliers if the camera is estimated too.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from bidnerf_core.mapping.geometry.reprojection import SCALE, ReprojectionErrors
 from bidnerf_core.mapping.geometry.resection import minimized
 
 UNSUSPECTED = 0.8
-"""Least share of agreeing matches at which the stated intrinsics are not suspected."""
+"""Minimum inlier fraction of the matches at which the stated intrinsics are not suspected."""
 SUSPECTED, FAR = 0.5, 0.1
-"""Share of agreeing matches below which a pose may be far off, and shift of the principal points tried then, as a share of the
-focal length.
+"""Inlier fraction of the matches below which a pose may be far off, and the shift of the principal points that are then tried, as
+a fraction of the focal length.
 """
 SUPPORT_RATIO, MIN_EXTRA_INLIERS = 1.1, 5
-"""Factor by which, and number of exact matches by which, the support of another camera has to exceed that of the one found."""
+"""Factor, and number of exact matches, by which the support of another camera must exceed that of the one found."""
 AS_MANY = 0.9
-"""Share of the matches agreeing with another camera that must still agree after its refinement."""
+"""Fraction of another camera's inliers that must remain inliers after its refinement."""
 FIT_SCALES = (4.0, 1.0)
 """Residuals at which outliers begin in the successive fits, in units of the inlier threshold."""
 FEW_DRAWS = 500
-"""Largest number of minimal samples: enough for two inliers in five matches."""
+"""Maximum number of minimal samples: enough for an inlier ratio of 40 %."""
 
 
 def with_far_camera(query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose) -> LandmarkPose:
-    """Return a pose, found again with another camera if far more of the ``matches`` by descriptors agree with that.
+    """Return a pose, estimated again with another camera if that has far more inliers among the ``matches`` by descriptors.
 
     Images from different cameras keep their stated intrinsics.
     """
@@ -65,9 +65,9 @@ def with_far_camera(query: LandmarkQuery, matches: LandmarkMatches, found: Landm
 
 
 def better_camera(query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose) -> Candidate | None:
-    """Return a pose and a correction of the intrinsics with which far more matches agree than with a pose that was found, or None.
+    """Return a pose and a correction of the intrinsics with far more inliers than the pose ``found``, or None.
 
-    Nothing is sought where most matches agree with that pose already, or, if its intrinsics were estimated, all of them.
+    There is no search if most matches are already inliers, or, if the intrinsics of ``found`` were estimated, all of them.
     """
     data = query.observed(matches).without_motion(found.T_world_camera, found.motion)
     return camera_fit(
@@ -86,11 +86,10 @@ def camera_fit(
     limit: float,
     unsuspected: float = UNSUSPECTED,
 ) -> Candidate | None:
-    """Return the fit of a camera with which far more matches agree than with the one that was found; None if there is none.
+    """Return the fit of a camera with far more inliers than the one that was found; None if there is none.
 
-    ``data`` are matches by descriptors alone; a match agrees if its residual is within ``limit`` (pixels). The camera that was
-    found is the stated one corrected by ``calibration``; if at least a share ``unsuspected`` of the matches agree with it, no
-    other is sought.
+    ``data`` are matches by descriptors alone; inliers have residuals within ``limit`` (pixels). The camera that was found is the
+    stated one corrected by ``calibration``; if its inlier fraction is at least ``unsuspected``, no other is sought.
     """
     here = _Fit.of(data, State.of(T_world_rig, calibration), limit)
     enough = SUPPORT_RATIO * here.support + MIN_EXTRA_INLIERS
@@ -114,11 +113,11 @@ def camera_fit(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The residuals of matches with a pose and a camera."""
+    """The inliers and support of a pose and a camera."""
 
     state: State
     inliers: Bool[np.ndarray, "m"]
-    support: float  # number of matches that agree, each counted less the farther off it is (MSAC: Torr and Zisserman 2000)
+    support: float  # number of inliers, each weighted by its residual (MSAC: Torr and Zisserman 2000)
 
     @staticmethod
     def of(data: ObservedPoints, state: State, limit: float) -> _Fit:
@@ -132,7 +131,7 @@ class _Fit:
 
 
 def _fitted(data: ObservedPoints, start: State, limit: float, scales: Sequence[float]) -> _Fit:
-    """Return the fit of a pose and a camera that a start leads to."""
+    """Fit a pose and a camera from a start."""
     prior, state = replace(STRETCHED, radial=0.0), start
     deviations = np.append(prior.deviations.numpy(), np.zeros(6))
     errors = ReprojectionErrors(data, start.pose())
@@ -143,9 +142,9 @@ def _fitted(data: ObservedPoints, start: State, limit: float, scales: Sequence[f
 
 
 def _from_sample(data: ObservedPoints, limit: float) -> list[_Fit]:
-    """Return the fit from the best minimal sample of the matches, whose focal length is free.
+    """Return the fit from the best minimal sample of the matches, with a free focal length.
 
-    There is none for several views, whose matches are not those of one pinhole camera.
+    It is empty for several views, since their matches do not come from one pinhole camera.
     """
     parts = (data.translation, data.rotation, data.focal)
     if not all(bool((part == part[0]).all()) for part in parts):
@@ -157,7 +156,7 @@ def _from_sample(data: ObservedPoints, limit: float) -> list[_Fit]:
 
 
 def _turned(T_world_rig: SE3, calibration: Calibration, u: float, v: float) -> State:
-    """Return a start with a principal point far from the middle, and the camera turned so that the image stays in place."""
+    """Return a start with a principal point far from the middle, and the camera rotated to keep the image in place."""
     turn = torch.tensor([0.0, 0.0, 0.0, v, -u, 0.0], dtype=torch.float64)
     return State.of(T_world_rig.retract(turn), replace(calibration, shift_u=u, shift_v=v))
 
@@ -165,7 +164,7 @@ def _turned(T_world_rig: SE3, calibration: Calibration, u: float, v: float) -> S
 def _with_map_camera(
     query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose
 ) -> LandmarkPose | None:
-    """Return the pose by minimal samples with one of the map's cameras; None unless far more matches agree with it."""
+    """Return the pose by minimal samples with one of the map's cameras; None unless it has far more inliers."""
     enough = SUPPORT_RATIO * found.agreeing + MIN_EXTRA_INLIERS
     sampled: list[tuple[MapCamera, Candidate]] = []
     for camera in map_cameras(query.images[-1].intrinsics, query.landmarks.cameras, crops=True):

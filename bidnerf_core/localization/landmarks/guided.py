@@ -20,13 +20,13 @@ from bidnerf_core.mapping.landmarks.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 CANDIDATES = 6
-"""Largest number of landmarks that are compared with a keypoint: the nearest ones in the image."""
+"""Maximum number of landmarks that are compared with a keypoint: the nearest ones in the image."""
 GUIDED_RATIO = 0.9
-"""Largest ratio of a match's descriptor distance to that of the next best candidate (Lowe 2004, section 7.1)."""
+"""Maximum ratio of the best to the second-best candidate's descriptor distance (Lowe 2004, section 7.1)."""
 OBLIQUE = radians(40)
-"""Largest angle (radians) outside the cone of a landmark's mapped viewing directions from which it is still matched."""
+"""Maximum angle (radians) outside the cone of a landmark's viewing directions at which it is still matched."""
 OCTAVES = 1.0
-"""Largest difference (octaves) between the size of a keypoint and the size at which its landmark should appear."""
+"""Maximum difference (octaves) between the size of a keypoint and the expected size of its landmark."""
 
 
 def guided_matches(
@@ -40,8 +40,8 @@ def guided_matches(
 ) -> LandmarkMatches:
     """Return the matches of keypoints with landmarks that project within ``radius`` pixels of them.
 
-    ``motion`` is that of a single camera while its rows were exposed.
-    ``most_distance`` is the largest squared distance between the descriptors of a match.
+    ``motion`` is that of a single camera during its readout, and ``most_distance`` the maximum squared descriptor distance of a
+    match.
     """
     projections = projected_landmarks(images, landmarks, T_world_rig, calibration, radius, motion)
     return LandmarkMatches.cat([found.matches(radius, most_distance) for found in projections])
@@ -55,7 +55,7 @@ def projected_landmarks(
     margin: float,
     motion: Float[Tensor, "6"] = AT_REST,
 ) -> list[ProjectedLandmarks]:
-    """Return the landmarks that each image should show, up to ``margin`` pixels beyond its edges."""
+    """Return the landmarks that should be visible in each image, up to ``margin`` pixels beyond its edges."""
     return [
         ProjectedLandmarks(number, image, landmarks, T_world_rig, calibration, margin, motion)
         for number, image in enumerate(images)
@@ -63,7 +63,7 @@ def projected_landmarks(
 
 
 class ProjectedLandmarks:
-    """The landmarks that one of the query's images should show, and where."""
+    """The landmarks that should be visible in one of the query's images, with their projections."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class ProjectedLandmarks:
     def matches(
         self, radius: float, most_distance: float, shift: tuple[float, float] = (0.0, 0.0)
     ) -> LandmarkMatches:
-        """Return matches as ``guided_matches`` does; if keypoints are shifted (pixels), all matches are due to chance."""
+        """Return matches as in ``guided_matches``; if keypoints are shifted (pixels), all matches are due to chance."""
         observed = (self._image.rays[:, :2] * self._image.focal + torch.tensor(shift)).float()
         keypoint, found = self._near(observed, radius)
         keypoints = self._image.keypoints
@@ -119,7 +119,7 @@ class ProjectedLandmarks:
 
 
 def _image_pixels(pixels: Float[Tensor, "m 2"], image: QueryImage) -> Float[Tensor, "m 2"]:
-    """Convert pixels from the principal point, at the mean focal length, to pixels of the image; distortion is neglected."""
+    """Convert pixels relative to the principal point, at the mean focal length, to image pixels; distortion is neglected."""
     camera = image.intrinsics
     across = torch.tensor([camera.fx, camera.fy]) / image.focal
     return pixels * across + torch.tensor([camera.cx, camera.cy])
@@ -130,12 +130,12 @@ def _visible(
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
     """Return the landmarks in front of the camera, inside its image, and seen roughly from a mapped direction.
 
-    They are not much smaller than the smallest keypoint: beyond a wall there may be many. Their positions are in the camera's
-    frame.
+    Those much smaller than the smallest keypoint are excluded, since there may be many beyond a wall. The positions are in the
+    camera's frame.
     """
     camera = image.intrinsics
     half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
-    # Distortion moves the edges of the image. A generous margin does no harm: landmarks outside match no keypoint.
+    # Distortion moves the edges of the image. A generous margin is harmless: landmarks outside match no keypoints.
     slopes = (1.3 * half + margin) / focal
     found = image.keypoints.sizes
     size = float(found.min()) / (2**OCTAVES * focal) if len(found) else 0.0
@@ -153,7 +153,7 @@ def _visible(
 def _hidden(
     hidden: Bool[Tensor, "h w"], local: Float[Tensor, "m 3"], camera: Intrinsics
 ) -> Bool[Tensor, "m"]:
-    """Return which points in front of a camera project to its hidden pixels; distortion is neglected."""
+    """Return a mask of the points in front of a camera that project to hidden pixels; distortion is neglected."""
     column = (local[:, 0] / local[:, 2] * camera.fx + camera.cx).floor().clamp(-1, camera.width).long()
     row = (local[:, 1] / local[:, 2] * camera.fy + camera.cy).floor().clamp(-1, camera.height).long()
     within = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
@@ -163,7 +163,7 @@ def _hidden(
 def _best(
     keypoint: Int[Tensor, "p"], landmark: Int[Tensor, "p"], distance: Float[Tensor, "p"], most: float
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
-    """Return the best pair of each keypoint that passes the ratio test, at most one for each landmark, and its ambiguity."""
+    """Return the best pair of each keypoint that passes the ratio test, at most one per landmark, and its ambiguity."""
     order = distance.argsort(stable=True)
     order = order[keypoint[order].argsort(stable=True)]
     begins = torch.ones(len(order), dtype=torch.bool)

@@ -1,8 +1,8 @@
-"""Who took this image, and how: hypotheses about its camera, and their probabilities given the image's keypoints.
+"""Hypotheses about an image's camera and its motion, and their probabilities given the image's keypoints.
 
-Each hypothesis is a Gaussian prior on the same few numbers, the correction of the stated intrinsics and the motion of the camera
-while its rows were exposed, and has a prior probability. The keypoints are fitted once, with all of these numbers free; linear
-algebra gives the evidence for each hypothesis in Laplace's approximation (MacKay 2003, ch. 28), the pose under it and its
+Each hypothesis has a prior probability, and is a Gaussian prior on the same few parameters: the correction of the stated
+intrinsics and the camera's motion during the readout. The keypoints are fitted once with all parameters free; linear algebra then
+gives the evidence for each hypothesis in Laplace's approximation (MacKay 2003, ch. 28), with the pose under it and its
 covariance.
 """
 
@@ -47,21 +47,21 @@ from bidnerf_core.mapping.geometry.resection import RESECTION_STEPS, minimized
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 CROPS_BESIDE_APPROXIMATE = 0.1
-"""Share of crops among images whose focal length is approximate."""
+"""Fraction of crops among images with an approximate focal length."""
 SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
-"""Prior probability that an image shows a motion, and that it does if those of the map do.
+"""Prior probability that an image has motion during readout, and the same if the map's images do.
 
-The first is low because lens stabilisers, and lenses that the intrinsics do not describe, distort images in similar ways.
+The first is low because image stabilisers, and lens distortion that is not modelled, distort images in similar ways.
 """
 TRANSPOSED = 0.1
-"""Share of the motions in which the rows run across those that the image's shape suggests: crops, turned square images."""
+"""Fraction of motions for which the shutter rolls along the other axis than the image's shape suggests: crops, rotated squares."""
 MAX_MOTION = 22.5
-"""Largest squared motion, in standard deviations of its prior (chi-squared at 99.9 %, six degrees of freedom).
+"""Maximum squared motion, in standard deviations of its prior (chi-squared at 99.9 %, six degrees of freedom).
 
-A larger one more probably makes up for another camera. It is not taken, and the shift of the pose that it brings counts as doubt.
+A larger one more probably compensates for another camera. It is not used, and the resulting shift of the pose adds to the doubt.
 """
 MIN_POINTS = 20
-"""Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""
+"""Minimum number of points for estimating a motion; with fewer, the noise is as uncertain as the motion itself."""
 
 APPROXIMATE, CROPPED_IMAGE, WRONG_FOCAL, WRONG_CAMERA = (
     "approximate",
@@ -71,13 +71,13 @@ APPROXIMATE, CROPPED_IMAGE, WRONG_FOCAL, WRONG_CAMERA = (
 )
 """Names of the hypotheses under which intrinsics are estimated."""
 STATED, INEXACT, ESTIMATED = "stated", "inexact", "estimated"
-"""Names of the hypotheses that the stated intrinsics are right, exactly and as far as devices usually state them, and of the group of
-those that they are wrong or unknown.
+"""Names of the hypotheses that the stated intrinsics are right, exactly or to the accuracy usual for devices, and of the group of
+hypotheses that they are wrong or unknown.
 """
 
 
 class Whose(StrEnum):
-    """Whose intrinsics an image is localized with."""
+    """Source of the intrinsics with which an image is localized."""
 
     GIVEN = "given"
     MAP = "map"
@@ -85,11 +85,11 @@ class Whose(StrEnum):
 
 
 class Motion(StrEnum):
-    """How the camera moved while its rows were exposed."""
+    """Motion of the camera during the readout."""
 
     STILL = "still"
     MOVING = "moving"
-    TRANSPOSED = "transposed"  # moving, and its rows run along the other axis
+    TRANSPOSED = "transposed"  # moving, with a shutter that rolls along the other axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +99,14 @@ class Hypothesis:
     name: str
     whose: Whose
     log_prior: float
-    refitted: CalibrationPrior  # what a fit under it estimates anew, about the stated intrinsics; ``FIXED``: nothing
+    refitted: CalibrationPrior  # prior of the refit under it, about the stated intrinsics; ``FIXED``: nothing is estimated
     mean: Float[Tensor, "5"]  # in the order of ``Calibration``
     deviations: Float[Tensor, "5"]  # of the correction about its mean
     camera: Intrinsics | None = None  # the map's
 
     @property
     def group(self) -> str:
-        """The hypotheses that differ in size alone: of the same stated intrinsics, or of intrinsics that are wrong."""
+        """Name of the group of similar hypotheses: that the stated intrinsics are right, or that they are wrong."""
         if self.name in (STATED, INEXACT):
             return STATED
         return self.name if self.camera is not None else ESTIMATED
@@ -115,8 +115,8 @@ class Hypothesis:
 def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FIXED) -> list[Hypothesis]:
     """Return all hypotheses about the intrinsics of an image, with their priors.
 
-    ``cameras``: those of the map, relative to the stated intrinsics. ``prior``: how uncertain the stated intrinsics are, if they
-    are approximate and therefore estimated in any case.
+    ``cameras`` are the map's, relative to the stated intrinsics. ``prior`` is that of the stated intrinsics if they are
+    approximate and therefore always estimated.
     """
 
     def about(
@@ -148,7 +148,7 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         own = [
             about(STATED, 1 - USUALLY - wrong, RIGHT),
             about(INEXACT, USUALLY, USUAL),
-            # What is wrong may be so by any amount: it is estimated without its prior.
+            # A mistaken parameter may be off by any amount, so it is estimated without its prior.
             about(
                 WRONG_FOCAL,
                 0.6 * MISTAKES * share,
@@ -176,7 +176,7 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
 
 
 def share_moving(landmarks: LandmarkMap) -> float:
-    """Return the prior probability that an image of the scene shows a motion: its camera may be that of the map's images."""
+    """Return the prior probability of a motion during readout, since the camera may be that of the map's images."""
     return max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving)
 
 
@@ -186,15 +186,15 @@ class Explanation:
 
     hypothesis: Hypothesis
     motion: Motion
-    log_evidence: float  # with the log prior, up to a constant
-    update: Float[Tensor, "6"]  # right update of the pose of the fit in which everything is free
+    log_evidence: float  # including the log prior, up to a constant
+    update: Float[Tensor, "6"]  # right update of the pose of the fit with all parameters free
     parameters: Float[Tensor, "11"]  # most probable calibration and motion
     covariance: Float[Tensor, "6 6"]  # of the pose, due to the calibration and the motion
-    by_motion: Float[Tensor, "6 6"]  # the part that is left with a known calibration
+    by_motion: Float[Tensor, "6 6"]  # the part that remains with a known calibration
     by_fit: Float[
         Tensor, "6 6"
     ]  # ``covariance`` without the scatter of calibrations among the map's own images
-    is_plausible: bool = True  # whether its motion is not larger than cameras move
+    is_plausible: bool = True  # whether its motion is within ``MAX_MOTION``
 
     @property
     def calibration(self) -> Calibration:
@@ -203,18 +203,18 @@ class Explanation:
 
     @property
     def taken(self) -> Calibration:
-        """The correction with which an image is localized where none is estimated along with the pose."""
+        """The correction with which an image is localized if none is estimated along with the pose."""
         if self.hypothesis.name == STATED:
             return GIVEN
         known = self.hypothesis.camera is not None
         return Calibration(*self.hypothesis.mean.tolist()) if known else self.calibration
 
     def is_as(self, other: Explanation) -> bool:
-        """Return whether the image is localized in the same way with both: the same intrinsics and motion."""
+        """Return whether both have the same intrinsics and kind of motion."""
         return self.hypothesis.name == other.hypothesis.name and self.motion is other.motion
 
     def intrinsics(self, given: Intrinsics) -> Intrinsics:
-        """Return the intrinsics with which to localize an image that states the ``given`` ones."""
+        """Return the intrinsics with which an image with the ``given`` ones is localized."""
         return self.hypothesis.camera or self.taken.applied(given)
 
 
@@ -222,23 +222,23 @@ class Explanation:
 class Posterior:
     """The explanations of an image, and their probabilities."""
 
-    T_world_rig: SE3  # of the fit in which everything is free
-    noise: float  # pixels, of that fit
+    T_world_rig: SE3  # of the fit with all parameters free
+    noise: float  # of that fit, pixels
     apparent: Float[Tensor, "5"]  # the correction of that fit, in the order of ``Calibration``
     deviations: Float[Tensor, "5"]  # its standard deviations due to the noise of keypoints
     distance: float  # metres: median depth of the landmarks
     explanations: tuple[Explanation, ...]
-    chosen: Explanation | None = None  # one to localize with however probable it is
+    chosen: Explanation | None = None  # the explanation to use, whatever its probability
 
     @property
     def stated(self) -> Explanation:
-        """The explanation that the stated intrinsics are right, or approximately right, and the camera was at rest."""
+        """The explanation with the stated intrinsics, exact or approximate, and a static camera."""
         return self.explanations[0]
 
     def with_best(self, explanation: Explanation, T_world_rig: SE3 | None = None) -> Posterior:
-        """Return the posterior with the explanation like a given one as its ``best``, however probable that is.
+        """Return the posterior with the equivalent of a given explanation as its ``best``, whatever its probability.
 
-        ``T_world_rig`` is the pose that was fitted under it, from which the shifts to all others are measured.
+        ``T_world_rig`` is the pose fitted under it, relative to which the shifts of all others are measured.
         """
         best = next(each for each in self.explanations if each.is_as(explanation))
         if T_world_rig is None:
@@ -249,14 +249,14 @@ class Posterior:
 
     @cached_property
     def probabilities(self) -> list[float]:
-        """The probability of each explanation; they add up to 1."""
+        """The probabilities of the explanations, which sum to 1."""
         odds = torch.tensor([each.log_evidence for each in self.explanations], dtype=torch.float64)
         found: list[float] = odds.softmax(0).tolist()
         return found
 
     @cached_property
     def best(self) -> Explanation:
-        """The explanation with which to localize the image: ``chosen``, or that of the most probable intrinsics (``best_of``)."""
+        """The explanation to use: ``chosen``, or that of the most probable intrinsics (see ``best_of``)."""
         if self.chosen is not None:
             return self.chosen
         totals: dict[str, float] = {}
@@ -265,9 +265,10 @@ class Posterior:
         return self.best_of(max(totals, key=lambda key: totals[key]))
 
     def best_of(self, name: str) -> Explanation:
-        """Return the explanation of a hypothesis with which it is localized, with the more probable of a motion and none.
+        """Return the explanation to use for a hypothesis: moving or static, whichever is more probable.
 
-        A motion is taken where it is more probable than all else. The motion of rows across those that the image's shape suggests is never taken: it counts as doubt.
+        A motion is used if it is more probable than all alternatives together. One with the shutter rolling along the other
+        axis is never used; it adds to the doubt.
         """
         inside = [(each, p) for each, p in self._weighted if each.hypothesis.name == name]
         moving = sum(p for each, p in inside if each.motion is Motion.MOVING and each.is_plausible)
@@ -277,7 +278,7 @@ class Posterior:
 
     @property
     def with_stated(self) -> Posterior:
-        """The posterior with the best explanation by the stated intrinsics as its ``best``, however probable these are."""
+        """The posterior with the best explanation by the stated intrinsics as its ``best``, whatever their probability."""
         return self.with_best(self.best_of(self.stated.hypothesis.name))
 
     @property
@@ -286,7 +287,7 @@ class Posterior:
 
     @property
     def _others(self) -> list[tuple[Explanation, float]]:
-        """The explanations of other groups than the best; what is left open within its group is part of the covariance."""
+        """The explanations of other groups than the best; the spread within its own group is part of the covariance."""
         return [(e, p) for e, p in self._weighted if e.hypothesis.group != self.best.hypothesis.group]
 
     def shift(self, explanation: Explanation) -> Float[Tensor, "6"]:
@@ -299,12 +300,12 @@ class Posterior:
 
     @property
     def wrong(self) -> float:
-        """The probability that neither the stated intrinsics nor those of the map's images are right, not even nearly."""
+        """The probability that neither the stated intrinsics nor the map's are even approximately right."""
         return sum(p for e, p in self._weighted if e.hypothesis.group == ESTIMATED)
 
     @property
     def expected_shift(self) -> float:
-        """The sum over all other intrinsics of their probability times the shift of the position that they bring (metres)."""
+        """The sum over all other intrinsics of their probability times the resulting shift of the position (metres)."""
         return sum(p * float(self.shift(e)[:3].norm()) for e, p in self._others)
 
     @property
@@ -316,7 +317,7 @@ class Posterior:
         return max(others, key=lambda pair: pair[1] * float(self.shift(pair[0])[:3].norm()))[0]
 
     def updated(self, log_odds: Mapping[str, float]) -> Posterior:
-        """Return the posterior with the log odds of groups by further evidence: renderings, a start, another sensor."""
+        """Update the posterior with log odds of groups from further evidence: renderings, a start or another sensor."""
         explanations = tuple(
             replace(each, log_evidence=each.log_evidence + log_odds.get(each.hypothesis.group, 0.0))
             for each in self.explanations
@@ -325,14 +326,14 @@ class Posterior:
 
     @property
     def doubt_of_motion(self) -> Float[Tensor, "6 6"]:
-        """What the doubt about the motion adds to the covariance of a pose with known intrinsics."""
+        """Covariance of the pose due to uncertainty about the motion, in addition to that of ``best``, for known intrinsics."""
         best = self.best
         same = [(e, p) for e, p in self._weighted if e.hypothesis is best.hypothesis]
         return _moment(same, best.update, "by_motion") - best.by_motion
 
     @property
     def doubt_of_camera(self) -> Float[Tensor, "6 6"]:
-        """What the doubt about the intrinsics adds to that."""
+        """Further covariance of the pose due to uncertainty about the intrinsics."""
         best = self.best
         own = best.by_fit if best.hypothesis.whose is Whose.ESTIMATED else best.by_motion
         found = _moment(self._weighted, best.update, "covariance") - own - self.doubt_of_motion
@@ -343,7 +344,7 @@ class Posterior:
 def _moment(
     weighted: Sequence[tuple[Explanation, float]], update: Float[Tensor, "6"], which: str
 ) -> Float[Tensor, "6 6"]:
-    """Return the second moment of the pose about an update, of a mixture whose parts have the covariances ``which``."""
+    """Return the mixture's second moment of the pose about an update; its components have the covariances ``which``."""
     total, whole = torch.zeros((6, 6), dtype=torch.float64), sum(p for _, p in weighted)
     for each, p in weighted:
         off = each.update - update
@@ -362,12 +363,12 @@ def posterior(
     share: float = 0.0,
     steps: int = RESECTION_STEPS,
 ) -> Posterior:
-    """Return the probabilities of hypotheses given observations with the stated intrinsics, and the pose under each of them.
+    """Return the probabilities of hypotheses given observations with the stated intrinsics, and the pose under each.
 
-    ``start`` and ``calibration`` are where the fit starts, ``noise`` (pixels) is a first guess, ``correlation`` the number of
-    observations that count as one, and ``share`` the prior probability of a motion between rows; 0 for a camera at rest.
-    ``scatter``: standard deviations of the corrections that images of the map seem to need although their intrinsics are right.
-    ``steps`` are taken at most to fit the observations; where the start is near, few leave the rest to the linear algebra.
+    ``start`` and ``calibration`` are the initial values of the fit, ``noise`` (pixels) is a first guess, ``correlation`` the
+    number of observations that count as one, and ``share`` the prior probability of a motion during readout (0: static).
+    ``scatter`` are the standard deviations of spurious corrections to right intrinsics, from images of the map. The fit takes at
+    most ``steps`` steps; from a close start, few suffice, and linear algebra does the rest.
     """
     mean, deviations = (
         torch.stack([getattr(each, name) for each in which]).numpy() for name in ("mean", "deviations")
@@ -423,7 +424,7 @@ def _explanations(
     share: float,
     offset: Float[Tensor, "6"],
 ) -> list[Explanation]:
-    """Return what the unknowns are under each hypothesis with a motion, whose prior probability is ``share``."""
+    """Return the explanations by each hypothesis with a kind of motion, whose prior probability is ``share``."""
     parameters = np.zeros((len(which), 11))
     parameters[:, free] = explained.parameters
     sizes = ((parameters[:, 5:] / np.maximum(usual, TIED)) ** 2).sum(1)

@@ -1,4 +1,4 @@
-"""The cameras of a map's own images, as an alternative to the intrinsics that a query states.
+"""The cameras of a map's own images, as an alternative to a query's stated intrinsics.
 
 A query from the camera that made the map may state slightly different intrinsics, from another calibration or from the
 manufacturer. The map was fitted to the intrinsics of its own images, so these are right for such a query.
@@ -29,29 +29,29 @@ from bidnerf_core.mapping.geometry.calibration import (
 )
 
 MAX_CAMERAS = 9
-"""Largest number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
+"""Maximum number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
 MAX_RESIDUAL = 0.002
-"""Root mean square difference, as a share of the image's width, above which a correction does not describe another camera."""
+"""Root mean square difference, as a fraction of the image's width, above which a correction does not describe a camera."""
 UNUSUAL = 0.03
-"""Share of the map's images up to which an agreeing camera is taken for an extreme of one that focuses, not for another one."""
+"""Fraction of the map's images up to which a matching camera counts as an extreme of autofocus instead of another camera."""
 GRID = 7
-"""Rows and columns of pixels at which cameras are compared."""
+"""Number of rows and columns of pixels at which cameras are compared."""
 DISTINGUISHABLE_DEVIATIONS = 2.0
-"""Standard deviations of a good calibration by which cameras must differ to be told apart."""
+"""Minimum difference of distinguishable cameras, in standard deviations of a good calibration."""
 SHARE_SAME_CAMERA = 0.9
-"""Share of queries with nearly the map's intrinsics that are from the map's camera."""
+"""Fraction of queries with nearly the map's intrinsics that are from the map's camera."""
 SAME_LOG_ODDS = math.log(SHARE_SAME_CAMERA / (1 - SHARE_SAME_CAMERA))
 OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1, stretch=STRETCH_TOLERANCE / 1.5)
 """Standard deviations of the differences between the intrinsics of different cameras with images of the same shape."""
 RESIZED = 0.05
-"""Share of resized images among those whose pixels have another aspect ratio than the map's images at their size would have."""
+"""Fraction of resized images among those with another pixel aspect ratio than the map's images at their size."""
 MAX_DEVIATIONS = 1.5
 """Multiple of the standard deviations of a prior beyond which a difference of intrinsics does not agree with it."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapCamera:
-    """The intrinsics of a map's images, relative to those that a query states."""
+    """The intrinsics of a map's images, relative to a query's stated ones."""
 
     correction: Float[Tensor, "5"]  # of the stated intrinsics, in the order of ``Calibration``
     deviations: Float[Tensor, "5"]  # of single images of the map, errors of a good calibration included
@@ -59,15 +59,15 @@ class MapCamera:
 
     @property
     def differs(self) -> Bool[Tensor, "5"]:
-        """Which parameters of the intrinsics differ."""
+        """Mask of the parameters that differ."""
         return self.correction.abs() > DISTINGUISHABLE_DEVIATIONS * self.deviations
 
     @property
     def log_odds(self) -> float:
-        """Prior log odds that the map's intrinsics are right rather than the stated ones.
+        """Prior log odds of the map's intrinsics against the stated ones.
 
-        Either the query is from the map's camera and misstates it, or it is from another camera with similar intrinsics. Where the
-        shapes of the pixels differ, the image was resized, or it is from another camera.
+        The query is either from the map's camera with misstated intrinsics, or from another camera with similar intrinsics. If
+        the pixel aspect ratios differ, the image was resized, or is from another camera.
         """
         if not self.is_near(STRETCHED):
             return -math.inf
@@ -79,7 +79,7 @@ class MapCamera:
 
     @property
     def is_stretched(self) -> bool:
-        """Whether the shapes of the pixels differ by more than those of different cameras do."""
+        """Whether the pixel aspect ratios differ by more than those of different cameras."""
         return abs(float(self.correction[4])) > STRETCH_TOLERANCE
 
     def is_near(self, prior: CalibrationPrior) -> bool:
@@ -87,19 +87,19 @@ class MapCamera:
         return bool((self.correction.abs() <= MAX_DEVIATIONS * prior.deviations).all())
 
     def _log_density(self, prior: CalibrationPrior) -> Float[Tensor, ""]:
-        """Return the logarithm of the density of the parameters that differ, but for the stretch, up to a constant."""
+        """Return the log density of the parameters that differ, except the stretch, up to a constant."""
         deviations, differs = prior.deviations[:4], self.differs[:4]
         return (-0.5 * (self.correction[:4] / deviations).square() - deviations.log())[differs].sum()
 
 
 def map_cameras(given: Intrinsics, cameras: tuple[Intrinsics, ...], crops: bool = False) -> list[MapCamera]:
-    """Return the cameras that may have taken an image with the ``given`` intrinsics if its camera is one of the map's.
+    """Return the map's cameras that may have taken an image with the ``given`` intrinsics.
 
-    Of the map's cameras with images of one shape, the one that the given intrinsics agree with is taken or, if that took hardly
-    any of the images, that with the median focal length. Cameras whose lens is so different that ``Calibration`` cannot
-    describe the difference are left out.
+    Among the map's cameras with images of one shape, the one that agrees with the given intrinsics is chosen or, if that took
+    hardly any of the images, the one with the median focal length. Cameras with a lens too different for ``Calibration`` are
+    left out.
 
-    A camera that took landscape images alone is turned to either side for a portrait one. An image of a shape that the map does
+    A camera with only landscape images is rotated to either side for a portrait image. An image with a shape that the map does
     not have is compared with the map's images resized to it and, with ``crops``, with their centre crops.
     """
     groups = cameras_at_size(cameras, given.width, given.height)
@@ -112,7 +112,7 @@ def map_cameras(given: Intrinsics, cameras: tuple[Intrinsics, ...], crops: bool 
 
 @lru_cache(maxsize=64)
 def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
-    """Return the one of ``cameras``, all of images of one size, that ``map_cameras`` describes."""
+    """Return the camera that ``map_cameras`` chooses among ``cameras``, which all have the same image size."""
     alike = list(cameras)
     agreeing = [camera for camera in alike if _agree(given, camera)]
     if len(agreeing) > UNUSUAL * len(alike):
@@ -130,7 +130,7 @@ def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCame
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:
-    """Return whether two intrinsics differ by no more than two good calibrations of the same camera may."""
+    """Return whether two intrinsics differ by no more than two good calibrations of the same camera."""
     known, size = CALIBRATED, max(len(a.distortion), len(b.distortion))
     parts = [
         (math.log(a.fx / b.fx), known.log_focal), (math.log(a.fy / b.fy), known.log_focal),
@@ -142,9 +142,9 @@ def _agree(a: Intrinsics, b: Intrinsics) -> bool:
 
 
 def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "5"] | None:
-    """Return the correction of ``given`` intrinsics, in the order of ``Calibration``, that comes closest to ``true`` ones.
+    """Return the correction of ``given`` intrinsics, in the order of ``Calibration``, that best matches ``true`` ones.
 
-    It minimizes the squared differences in pixels. None if these remain considerable.
+    It minimizes the squared differences in pixels. None if these remain large.
     """
     true = true.resized(given.width, given.height)
     u, v = (torch.linspace(0, size, GRID, dtype=torch.float64) for size in (given.width, given.height))

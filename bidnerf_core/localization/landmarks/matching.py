@@ -1,4 +1,4 @@
-"""Nearest-neighbour search among the landmarks' descriptors, in a time that is sublinear in their number."""
+"""Nearest-neighbour search among the landmarks' descriptors, in time sublinear in their number."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 from bidnerf_core.mapping.landmarks.vocabulary import BLOCK, k_means, nearest_centre
 
 EXHAUSTIVE = 4_000
-"""The number of landmarks up to which the search is exhaustive, and no cells are built."""
+"""The number of landmarks up to which the search is exhaustive, without cells."""
 COMPARISONS = 4_000_000
 """The number of keypoint-landmark pairs up to which comparing all of them is faster than searching cells."""
 USUAL_IN_CELL = 500
-"""Mean number of landmarks of a cell in large maps, where comparing them would otherwise take most of the time."""
+"""Mean number of landmarks per cell in large maps, where comparing them would otherwise take most of the time."""
 PROBED = 12
 """Number of cells that are searched for each keypoint."""
 
@@ -35,11 +35,11 @@ PROBED = 12
 class LandmarkMatcher:
     """Finds the landmarks whose descriptors are nearest to those of keypoints.
 
-    Above ``EXHAUSTIVE`` landmarks it uses an inverted file: k-means divides the landmarks into sqrt(n) cells, in large maps into
-    more, and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a
-    matcher. What guided matching needs is prepared too, see ``LandmarkMap.cells``.
+    Above ``EXHAUSTIVE`` landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large
+    maps), and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share
+    a matcher. It also prepares ``LandmarkMap.cells`` for guided matching.
 
-    Descriptors are compared on the device of those of ``landmarks``; all else that is done with landmarks is done on the CPU.
+    Descriptors are compared on the device of those of ``landmarks``; all other computations with landmarks run on the CPU.
     """
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
@@ -53,13 +53,13 @@ class LandmarkMatcher:
 
     @property
     def features(self) -> Features:
-        """The detector whose keypoints the landmarks are. Raises ``PluginError``, an ``InputError``, where it is not installed."""
+        """The detector of the landmarks. Raises ``PluginError`` (an ``InputError``) if it is not installed."""
         return self._found_once or find_features(
             self.landmarks.features, "the detector of the map's landmarks"
         )
 
     def for_query(self) -> LandmarkMatcher:
-        """Return the matcher for one query: its ``features`` finds the keypoints of each image once; all else is shared."""
+        """Return a matcher for one query, whose ``features`` cache the keypoints of each image; all else is shared."""
         found = copy.copy(self)
         found._found_once = FoundOnce(lambda rgb: detected(self.features, rgb))
         return found
@@ -74,8 +74,8 @@ class LandmarkMatcher:
         channels = self._descriptors.shape[1]
         if descriptors.shape[1] != channels:
             raise InputError(
-                f"the map's landmarks have descriptors of {channels} channels, those of the image {descriptors.shape[1]}; "
-                "expected the detector with which the map was baked, or bake it anew"
+                f"the map's descriptors have {channels} channels, those of the image {descriptors.shape[1]}; "
+                "use the detector with which the map was baked, or bake it again"
             )
         there = descriptors.to(self._descriptors.device)
         if self._cells is not None and len(descriptors) * len(self.landmarks) > COMPARISONS:

@@ -1,4 +1,4 @@
-"""Evidence that an image shows the scene as in a mirror: front cameras and faulty readers produce such images."""
+"""Evidence that an image is mirrored, as front cameras and faulty readers produce it."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from bidnerf_core.localization.landmarks.unguided import unguided_matches
 from bidnerf_core.mapping.geometry.calibration import FIXED
 
 KEYPOINTS = 700
-"""Number of keypoints, the strongest of a mirrored image, that are matched."""
+"""Number of the strongest keypoints of a mirrored image that are matched."""
 
 
 def mirror_evidence(matcher: LandmarkMatcher, view: View, seed: int = 0) -> tuple[int, float]:
-    """Match the mirror image that a view holds.
+    """Match a view of the mirror image with the map.
 
-    Returns how many landmarks agree with it, and the logarithm of the number of such agreements expected by chance.
+    Returns the number of landmark inliers, and log10 of the number of false alarms.
     """
     query = LandmarkQuery(query_images([view], matcher.features), matcher.landmarks, FIXED)
     matches = unguided_matches(query.images, matcher, KEYPOINTS)
@@ -31,7 +31,7 @@ def mirror_evidence(matcher: LandmarkMatcher, view: View, seed: int = 0) -> tupl
 
 
 def mirror_image(frame: Frame) -> Frame:
-    """Return what the frame's camera would see in a mirror: left and right swapped, without depth."""
+    """Return the mirror image of a frame (left and right swapped), without depth."""
     swap = Orientation(mirrors_columns=True)
     alpha, hidden = (None if image is None else swap.upright(image) for image in (frame.alpha, frame.hidden))
     camera = frame.intrinsics.upright(swap)

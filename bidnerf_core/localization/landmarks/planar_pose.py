@@ -1,8 +1,8 @@
-"""The second pose of a plane: where landmarks lie nearly in one plane, two poses may explain their observations.
+"""The second pose of a planar scene: two poses may explain observations of nearly coplanar landmarks.
 
-From afar, a plane that is tilted to one side of the line of sight looks almost as if it were tilted to the other side. Each of
-the two poses is a local minimum of the reprojection error, so that refinement never leaves the one where it began
-(Schweighofer and Pinz 2006, "Robust pose estimation from a planar target").
+From a distance, a plane tilted to one side of the line of sight looks almost like one tilted to the other side. Both poses are
+local minima of the reprojection error, so refinement stays at the one where it started (Schweighofer and Pinz 2006, "Robust pose
+estimation from a planar target").
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_likelihood_ratio, resect
 
 LEAST_POINTS = 4
-"""Least number of points that determine a pose."""
+"""Minimum number of points that determine a pose."""
 FAR_OFF = 10.0
-"""Median residual, in standard deviations, beyond which a plane's second pose explains nothing before refinement."""
+"""Median residual, in standard deviations, beyond which a second pose is discarded before refinement."""
 SAME = 5.0
-"""Squared Mahalanobis distance, in the first pose's covariance, up to which two poses are the same minimum."""
+"""Squared Mahalanobis distance, in the first pose's covariance, below which two poses are the same minimum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class PlanarPose:
     """The other local minimum of the reprojection error."""
 
     fit: ReprojectionFit
-    log_odds: float  # of the first pose against this one, by the observations
+    log_odds: float  # of the first pose against this one, given the observations
 
 
 def second_pose(
@@ -40,10 +40,9 @@ def second_pose(
     correlation: float = 1.0,
     prior: CalibrationPrior = FIXED,
 ) -> PlanarPose | None:
-    """Return the other local minimum of a plane's observations, or None if refinement leads back to the first one.
+    """Return the other local minimum for observations of a plane, or None if refinement leads back to the first.
 
-    The points have to lie nearly in one plane and to take up a small angle. ``correlation``: number of observations that count
-    as one.
+    The points must be nearly coplanar and subtend a small angle. ``correlation`` is the number of observations that count as one.
     """
     start = start_of_second_pose(data, first.T_world_rig, first.noise)
     if start is None:
@@ -56,9 +55,9 @@ def second_pose(
 
 
 def start_of_second_pose(data: ObservedPoints, T_world_rig: SE3, noise: float) -> SE3 | None:
-    """Return where the search for the other minimum begins, or None where the points are too deep or too near to have one.
+    """Return the start of the search for the other minimum, or None if the points are too far from coplanar or too close.
 
-    ``noise``: the keypoints', pixels.
+    ``noise`` is that of the keypoints, pixels.
     """
     if len(data) < LEAST_POINTS:
         return None
@@ -70,8 +69,8 @@ def start_of_second_pose(data: ObservedPoints, T_world_rig: SE3, noise: float) -
 def tilted_to_the_other_side(points: Float[Tensor, "m 3"], T_world_camera: SE3) -> SE3:
     """Return the pose from which, to first order, the plane of the points (metres, world) looks the same.
 
-    In the camera, the points are mirrored at the plane through their middle that is perpendicular to the line of sight. That is
-    a motion for points of one plane, whose own mirror image they are.
+    In the camera's frame, the points are reflected in the plane through their middle perpendicular to the line of sight. For
+    coplanar points, which are their own mirror image in their plane, this is a rigid motion.
     """
     middle = points.mean(0)
     normal = torch.linalg.svd(points - middle, full_matrices=False).Vh[-1]
@@ -82,6 +81,6 @@ def tilted_to_the_other_side(points: Float[Tensor, "m 3"], T_world_camera: SE3) 
 
 
 def _mirror(normal: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Return the reflection at the plane through the origin with a normal of any length."""
+    """Return the reflection in the plane through the origin with a normal of any length."""
     unit = torch.nn.functional.normalize(normal, dim=0)
     return torch.eye(3, dtype=normal.dtype) - 2 * torch.outer(unit, unit)

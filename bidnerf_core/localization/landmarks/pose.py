@@ -1,4 +1,4 @@
-"""A pose found by landmarks, with its covariance and the evidence for it."""
+"""A pose by landmarks, with its covariance and the evidence for it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from bidnerf_core.localization.landmarks.refinement import GuidedPose
 from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 
 ESTIMATED_INFLATION = 3.0
-"""Factor on the covariance of poses whose intrinsics were estimated too.
+"""Factor on the covariance of poses with estimated intrinsics.
 
-Errors of landmarks and of lenses, which matter less where the intrinsics are known, shift the estimate. With this factor, 146
-of 153 such poses lie inside their 95 % bound in the record ``faults_camera``.
+Errors of landmarks and lenses, which matter less with known intrinsics, bias the estimate. With this factor, 146 of 153 such
+poses lie inside their 95 % bound in the record ``faults_camera``.
 """
 
 
@@ -29,17 +29,17 @@ class Rival:
     """Another pose that explains the keypoints about as well."""
 
     T_world_rig: SE3
-    log_odds: float  # of the pose itself against this one, by landmarks
+    log_odds: float  # of the pose itself against this one, given the landmarks
     reason: str
 
 
 @dataclass(frozen=True, eq=False)
 class CameraDoubt:
-    """What the probabilities of other intrinsics mean for a pose."""
+    """Effect of uncertainty about the intrinsics on a pose."""
 
-    wrong: float = 0.0  # probability that neither the stated intrinsics nor the map's are right, if one of these was taken
+    wrong: float = 0.0  # probability that neither the stated intrinsics nor the map's are right, if one of these was used
     expected_shift: float = (
-        0.0  # metres: sum over other intrinsics of their probability times the shift that they bring
+        0.0  # metres: sum over other intrinsics of their probability times the resulting shift
     )
     covariance: Float[Tensor, "6 6"] = field(default_factory=lambda: torch.zeros((6, 6), dtype=torch.float64))
     other: Calibration = (
@@ -49,7 +49,7 @@ class CameraDoubt:
 
     @staticmethod
     def of(found: Posterior) -> CameraDoubt:
-        """Return the doubt about the best explanation of a posterior."""
+        """Return the uncertainty about the intrinsics of a posterior's best explanation."""
         taken, other = found.best.hypothesis.whose, found.riskiest
         return CameraDoubt(
             0.0 if taken is Whose.ESTIMATED else found.wrong, found.expected_shift, found.doubt_of_camera,
@@ -60,59 +60,61 @@ class CameraDoubt:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkPose:
-    """A pose found by landmarks, its covariance, and the evidence for it."""
+    """A pose by landmarks, its covariance, and the evidence for it."""
 
     T_world_camera: SE3  # of the last view, float64
-    # Of the right update, translation (metres) first: due to the errors of keypoints, landmarks and calibration, and of the
-    # poses of the map's own images.
+    # Covariance of the right update, translation (metres) first: due to errors of keypoints, landmarks and calibration, and of
+    # the poses of the map's own images.
     covariance: Float[Tensor, "6 6"]
     map_covariance: Float[Tensor, "6 6"]  # the part of it due to the poses of the map's own images
     noise: float  # pixels: robust standard deviation of the reprojection errors along each axis
-    correspondences: LandmarkMatches  # those that the pose was refined on
+    correspondences: LandmarkMatches  # the matches used in the refinement
     residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences
-    normalized_residuals: Float[Tensor, "m 2"]  # the same in standard deviations, those of landmarks included
-    pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, in pixels of their images
+    normalized_residuals: Float[
+        Tensor, "m 2"
+    ]  # the same in standard deviations, including the landmarks' errors
+    pixels: Float[Tensor, "m 2"]  # keypoints of the correspondences, in pixels of their images
     matches: int  # by descriptors alone, before there was a pose
-    agreeing: int  # of those, how many agree with the pose
-    # Logarithm of the number of as good agreements expected by chance (Moisan and Stival 2004).
+    agreeing: int  # inliers among these matches
+    # log10 of the number of false alarms (Moisan and Stival 2004)
     log10_nfa: float
     chance: float  # correspondences that guided matching would find at a wrong pose
     visible: int  # landmarks that should be visible from the pose
     keypoints: int  # in the images
-    spread: float  # 0 to 1: share of the image that the correspondences lie in
-    noise_ratio: float  # ``noise`` over that of the map's own images
+    spread: float  # 0 to 1: fraction of the image's cells that contain correspondences
+    noise_ratio: float  # ratio of ``noise`` to that of the map's own images
     distance: float  # metres: median distance of the correspondences' landmarks
     calibration: (
-        Calibration  # of the camera: estimated, or that of the map's images if their intrinsics were taken
+        Calibration  # of the camera: estimated, or that of the map's images if their intrinsics were used
     )
     calibration_deviations: Float[Tensor, "5"]  # standard deviations, in the order of ``Calibration``
-    # Of the camera while its rows were exposed, see ``rolling_shutter``; 0 if none is evident.
+    # Motion of the camera during the readout, see ``rolling_shutter``; 0 if none is evident.
     motion: Float[Tensor, "6"]
     motion_covariance: Float[Tensor, "6 6"]  # the part of the pose's covariance due to the motion
     doubt: CameraDoubt
-    intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
-    depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
-    # With which far more matches agree, but which no pose could be refined with.
+    intrinsics: Intrinsics | None  # of the map's images, if these were used instead of the given ones
+    depth_scale: float | None  # factor that corrects measured depth; None if too few depths were measured
+    # A camera with far more inliers, but with which no pose could be refined.
     better_camera: Calibration | None = None
     rivals: tuple[Rival, ...] = ()  # if sought: other poses that explain the keypoints about as well
     guided: GuidedPose | None = (
-        None  # what evidence about the camera is added to; None for followed landmarks
+        None  # state to which evidence about the camera can be added; None for tracked landmarks
     )
 
     @property
     def focal_factor(self) -> float:
-        """Ratio of the estimated to the given focal length; of a stretched image, the geometric mean across and down."""
+        """Ratio of the estimated to the given focal length; for a stretched image, the geometric mean of both axes."""
         return self.calibration.focal_factor
 
     def intrinsics_of(self, given: Intrinsics) -> Intrinsics | None:
-        """Return the intrinsics that were taken or estimated for images with the ``given`` ones; None if these were kept."""
+        """Return the intrinsics used for images with the ``given`` ones; None if these were kept."""
         if self.intrinsics is not None:
             return self.intrinsics
         return None if self.calibration == GIVEN else self.calibration.applied(given)
 
     @property
     def changes_camera(self) -> bool:
-        """Whether the camera differs from the given one by more than errors of a good calibration."""
+        """Whether the camera differs from the given one by more than the errors of a good calibration."""
         return bool(self.calibration.considerable)
 
     @property
@@ -122,12 +124,12 @@ class LandmarkPose:
 
     @property
     def has_motion(self) -> bool:
-        """Whether the motion of the camera while its rows were exposed was estimated with the pose."""
+        """Whether the camera's motion during the readout was estimated with the pose."""
         return bool(self.motion.any())
 
     @property
     def takes_map_camera(self) -> bool:
-        """Whether the intrinsics are those of the map's images, in place of the given ones."""
+        """Whether the intrinsics are those of the map's images instead of the given ones."""
         return self.intrinsics is not None
 
     @property
@@ -137,20 +139,20 @@ class LandmarkPose:
 
     @property
     def stated_covariance(self) -> Float[Tensor, "6 6"]:
-        """``covariance``, enlarged where the intrinsics were estimated too."""
+        """``covariance``, inflated if the intrinsics were estimated too."""
         return (ESTIMATED_INFLATION if self.estimates_calibration else 1.0) * self.covariance
 
     @property
     def expected_shift(self) -> float:
-        """How far other intrinsics would move the position, times their probability, as a share of the landmarks' distance."""
+        """Expected shift of the position under other intrinsics, as a fraction of the landmarks' distance."""
         return self.doubt.expected_shift / self.distance
 
     @property
     def shared_covariance(self) -> Float[Tensor, "6 6"]:
-        """The part of the covariance that rendered rays and measured points have in common with the landmarks.
+        """The part of the covariance that rendered rays and measured points share with the landmarks.
 
-        It is due to the poses of the map's own images and to the motion. The part of the motion is at most nine tenths of all
-        that is not due to the map, in any direction.
+        It is due to the poses of the map's own images and to the motion. In any direction, the motion's part is at most 90 % of
+        the covariance that is not due to the map.
         """
         rest = self.covariance - self.map_covariance
         root = torch.linalg.inv(torch.linalg.cholesky(rest))

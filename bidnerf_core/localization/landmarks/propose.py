@@ -1,4 +1,4 @@
-"""Search by landmarks: find a pose and its covariance from images alone, without a start."""
+"""Localization by landmarks: find a pose and its covariance from images alone, without a start."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibratio
 from bidnerf_core.mapping.landmarks.features import Features
 
 STRONGEST = 700
-"""Number of keypoints, the strongest of an image, that are matched first; all are matched only if these do not suffice."""
+"""Number of an image's strongest keypoints that are matched first; all are matched only if these do not suffice."""
 CONVINCING = -20.0
-"""Logarithm of the number of false alarms below which the matches of the strongest keypoints suffice."""
+"""Log10 of the number of false alarms below which the matches of the strongest keypoints suffice."""
 LEAST_INLIERS = 6
-"""Least number of inliers for a pose to be refined at all."""
+"""Minimum number of inliers for a pose to be refined."""
 MANY_VISIBLE, CONTRADICTED = 200, 1.5
-"""Least number of visible landmarks that can contradict a pose, and multiple of the matches by chance that must match for them
-not to contradict it.
+"""Minimum number of visible landmarks for contradicting a pose, and multiple of the chance matches below which they contradict
+it.
 """
 
 
@@ -52,11 +52,11 @@ def propose(
 ) -> LandmarkPose | None:
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
-    ``prior``: how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal length
-    is approximate. ``features`` finds the keypoints, by default the detector of the map. One correction is estimated for all views; those of different cameras are taken as given.
-    ``seek_rivals``: whether to look for other poses that the images may show. ``moving``:
-    whether to estimate how the camera moved while the rows of its image were exposed, where that is evident.
-    Raises ``InputError`` if there is no view.
+    ``prior`` is that of the given intrinsics; by default they are fixed, or ``NOMINAL`` for an approximate focal length.
+    ``features`` detects the keypoints, by default the map's detector. One correction of the intrinsics is estimated for all
+    views; if these are from different cameras, their intrinsics are fixed. ``seek_rivals`` is whether to search for other
+    poses that explain the images, and ``moving`` whether to estimate the camera's motion during readout if it is evident.
+    Raises ``InputError`` if there are no views.
     """
     if not views:
         raise InputError("nothing to localize: expected at least one view")
@@ -71,28 +71,28 @@ def propose(
 
 
 def updated(found: LandmarkPose, log_odds: Mapping[str, float]) -> LandmarkPose:
-    """Return a pose with the log odds of intrinsics by further evidence, see ``Posterior.updated``.
+    """Update a pose with log odds of intrinsics from further evidence, see ``Posterior.updated``.
 
-    It is refined anew where other intrinsics have become the most probable; nothing is searched again.
+    It is refined again if other intrinsics have become the most probable, but without a new search.
     """
     if found.guided is None:
-        raise ValueError("landmarks that were followed have no posterior to add evidence to")
+        raise ValueError("tracked landmarks have no posterior to which evidence can be added")
     again = described(found.guided.updated(log_odds))
     return replace(again, better_camera=found.better_camera, rivals=found.rivals)
 
 
 @dataclass(frozen=True, eq=False)
 class Confirmation:
-    """The landmarks' evidence about a pose that was found by other means."""
+    """The landmarks' evidence about a pose found by other means."""
 
     pose: LandmarkPose | None  # refined on the landmarks that match near it; None if too few do
-    visible: int  # landmarks that should be visible there
+    visible: int  # number of landmarks that should be visible there
     matches: int
     chance: float  # matches expected at a wrong pose
 
     @property
     def contradicts(self) -> bool:
-        """Whether no more landmarks match than by chance, although many should."""
+        """Whether hardly more landmarks match than expected by chance, although many should."""
         return self.visible >= MANY_VISIBLE and self.matches < CONTRADICTED * self.chance + LEAST_INLIERS
 
 
@@ -106,13 +106,13 @@ def confirm(
 ) -> Confirmation:
     """Match the landmarks near their projections at a pose of the last of ``views``, and refine it.
 
-    ``seek_rivals`` is as in ``propose``. ``rival``: another pose; what matches only there does not show that the camera is another.
+    ``seek_rivals`` is as in ``propose``. ``rival`` is another pose; matches only with it are no evidence of another camera.
     """
     query = LandmarkQuery(
         query_images(views, features or matcher.features), matcher.landmarks, _calibration_prior(views)
     )
     visible, matches, chance = visible_and_matching(query, T_world_camera)
-    # Matches that were not sought near the pose are the evidence for it, and reveal another camera.
+    # Matches that are independent of the pose are the evidence for it, and reveal another camera.
     by_descriptors = unguided_matches(query.images, matcher, STRONGEST)
     if rival is not None:
         of_rival = agreeing_with(query, by_descriptors, rival)
@@ -132,7 +132,7 @@ def confirm(
 
 
 def _with_rivals(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> LandmarkPose:
-    """Return a pose with its rivals, sought with the intrinsics that were taken or estimated."""
+    """Return a pose with its rivals, which are sought with the intrinsics used for the pose."""
     cameras = [found.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
     seen = replace(query.seen_by(cameras), prior=FIXED)
     rivals = (twin_of(seen, matcher, found), second_of_plane(seen, found))
@@ -147,7 +147,7 @@ def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:
 def _first_pose(
     query: LandmarkQuery, matcher: LandmarkMatcher, seed: int
 ) -> tuple[LandmarkMatches, Candidate | None]:
-    """Match the strongest keypoints, then all if those do not give a convincing pose."""
+    """Match the strongest keypoints, and then all if those do not give a convincing pose."""
     most = max(len(image.keypoints) for image in query.images)
     for count in (min(STRONGEST, most), most):
         matches = unguided_matches(query.images, matcher, count)
@@ -161,7 +161,7 @@ def _first_pose(
 def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Candidate | None:
     data = query.observed(matches)
     found = sample_consensus(data, matches.view, query.threshold, seed)
-    if query.prior != FIXED:  # the focal length is sought together with the first pose
+    if query.prior != FIXED:  # the focal length is estimated along with the initial pose
         free = focal_consensus(data, query.threshold, seed)
         hypotheses = [h for h in (found, free, *_map_camera_consensus(query, matches, seed)) if h is not None]
         found = max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)
@@ -174,9 +174,9 @@ def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Can
 
 
 def _map_camera_consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> list[Candidate]:
-    """Return the hypotheses that most matches agree with if one of the map's cameras took the images, as far as that is probable.
+    """Return the candidates with the most inliers for each of the map's cameras that may have taken the images.
 
-    With a known focal length, three correct matches make a hypothesis instead of four, and far more are tried in the same time.
+    With a known focal length, a minimal sample has three matches instead of four, and far more samples fit into the same time.
     """
     found = []
     for hypothesis in query.hypotheses:

@@ -1,4 +1,4 @@
-"""The images of a query, the landmarks to find in them, and what is known about the camera."""
+"""The images of a query, the landmarks to find in them, and the prior on the camera."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from bidnerf_core.mapping.landmarks.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 THRESHOLD = 0.005
-"""Largest reprojection error of an inlier, as a share of the image's diagonal; never less than 2 pixels."""
+"""Maximum reprojection error of an inlier, as a fraction of the image's diagonal; at least 2 pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkQuery:
-    """The images of a query, the landmarks to find in them, and what is known about the camera."""
+    """The images of a query, the landmarks to find in them, and the prior on the camera."""
 
     images: list[QueryImage]
     landmarks: LandmarkMap
     prior: CalibrationPrior
-    moving: bool = True  # whether the camera of a single image may have moved while its rows were exposed
+    moving: bool = True  # whether the camera of a single image may have moved during the readout
 
     @property
     def may_move(self) -> bool:
-        """Whether a motion is estimated: the views of a rig may be from different moments, and count as still."""
+        """Whether a motion is estimated; a rig counts as static, since its views may be from different times."""
         return self.moving and len(self.images) == 1
 
     @property
     def threshold(self) -> float:
-        """The largest reprojection error of an inlier, pixels."""
+        """The maximum reprojection error of an inlier, pixels."""
         return pixel_threshold(self.images[-1].intrinsics)
 
     @property
     def map_cameras(self) -> list[MapCamera]:
-        """The intrinsics of the map's images, if all images of the query state the same."""
+        """The cameras of the map's images; empty unless all images of the query have the same intrinsics."""
         given = {image.intrinsics for image in self.images}
         if len(given) > 1:
             return []
@@ -52,7 +52,7 @@ class LandmarkQuery:
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
-        """The hypotheses about the camera. Images of different cameras have the stated intrinsics, as far as these are exact."""
+        """The hypotheses about the camera; for images from different cameras, only that the stated intrinsics are right."""
         every = camera_hypotheses(self.map_cameras, self.prior)
         if len({image.intrinsics for image in self.images}) == 1:
             return every
@@ -67,7 +67,7 @@ class LandmarkQuery:
         return replace(self, images=images)
 
     def observed(self, matches: LandmarkMatches) -> ObservedPoints:
-        """Return the landmarks and keypoints of ``matches`` as input of a pose solver."""
+        """Return the landmarks and keypoints of ``matches`` as input for a pose solver."""
         return observed_points(self.images, self.landmarks, matches)
 
     def descriptors(self, matches: LandmarkMatches) -> UInt8[Tensor, "m d"]:
@@ -81,7 +81,7 @@ class LandmarkQuery:
         return paired_squared_distances(descriptors, self.landmarks.descriptors, number, matches.landmark)
 
     def pixels(self, matches: LandmarkMatches) -> Float[Tensor, "m 2"]:
-        """Return where the keypoints of ``matches`` are in their images."""
+        """Return the pixels of the keypoints of ``matches``."""
         return torch.cat([image.keypoints.pixels for image in self.images])[self._number(matches)]
 
     def _number(self, matches: LandmarkMatches) -> Int[Tensor, "m"]:
@@ -90,5 +90,5 @@ class LandmarkQuery:
 
 
 def pixel_threshold(camera: Intrinsics) -> float:
-    """Return the largest reprojection error of an inlier, pixels."""
+    """Return the maximum reprojection error of an inlier, pixels."""
     return max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))

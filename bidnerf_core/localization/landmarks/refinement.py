@@ -30,21 +30,21 @@ from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
 RADII = (3.0, 1.5)
 """Radii of the rounds of guided matching, in units of the inlier threshold."""
 GUIDED_ROUNDS = 3
-"""Largest number of rounds of guided matching with the last radius; they end once the matches no longer change."""
+"""Maximum number of rounds of guided matching with the last radius; they end once the matches no longer change."""
 UNCHANGED = 0.02
-"""Share of the matches that may change in the last round."""
+"""Fraction of the matches that may change in the last round."""
 LOOSE = 1.3
-"""Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
+"""Maximum descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
-"""Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
+"""Maximum relative difference between a landmark's depth and the depth measured at its keypoint."""
 MAX_DISTANCE = 0.6
-"""Largest descriptor distance of a guided match where no first inliers show what is usual, in units of the distance between
-descriptors of different landmarks.
+"""Maximum descriptor distance of a guided match without first inliers, in units of the distance between descriptors of different
+landmarks.
 """
 LEAST_GUIDED_MATCHES = 6
-"""Least number of guided matches for another round."""
+"""Minimum number of guided matches for another round."""
 MAX_REFITS = 2
-"""Largest number of times that a pose is refined anew because other intrinsics or another motion have become more probable."""
+"""Maximum number of repeated refinements because other intrinsics or another motion have become more probable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +55,9 @@ class GuidedPose:
     matches: LandmarkMatches  # by descriptors alone
     fit: ReprojectionFit
     correspondences: LandmarkMatches
-    max_distance: float  # largest squared descriptor distance of a guided match
+    max_distance: float  # maximum squared descriptor distance of a guided match
     posterior: Posterior
-    best: Explanation  # of the intrinsics and the motion that the fit has
+    best: Explanation  # with the intrinsics and the motion of the fit
 
     @property
     def seen(self) -> LandmarkQuery:
@@ -65,7 +65,7 @@ class GuidedPose:
         return _seen(self.query, self.best)
 
     def visible_and_by_chance(self) -> tuple[int, float]:
-        """Return how many landmarks should be visible, and how many guided matches would be found at a wrong pose."""
+        """Return the number of landmarks that should be visible, and of guided matches expected at a wrong pose."""
         seen, fit, radius = self.seen, self.fit, RADII[-1] * self.query.threshold
         projections = projected_landmarks(
             seen.images, seen.landmarks, fit.T_world_rig, fit.calibration, radius, fit.motion
@@ -73,7 +73,7 @@ class GuidedPose:
         return sum(map(len, projections)), matches_by_chance(projections, radius, self.max_distance)
 
     def updated(self, log_odds: Mapping[str, float]) -> GuidedPose:
-        """Return the pose with the intrinsics that are most probable with further evidence, see ``Posterior.updated``."""
+        """Return the pose with the most probable intrinsics given further evidence, see ``Posterior.updated``."""
         return _explained(replace(self, posterior=self.posterior.updated(log_odds)), log_odds)
 
 
@@ -89,17 +89,17 @@ def refined_pose(query: LandmarkQuery, matches: LandmarkMatches, first: Candidat
 
 
 def usual_distance(query: LandmarkQuery, inliers: LandmarkMatches) -> float:
-    """Return the largest squared descriptor distance of a guided match, from those of the first inliers."""
+    """Return the maximum squared descriptor distance of a guided match, from those of the first inliers."""
     return LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
 
 
 def _most_distance(query: LandmarkQuery) -> float:
-    """Return the largest squared descriptor distance of a guided match, from the map alone."""
+    """Return the maximum squared descriptor distance of a guided match, from the map alone."""
     return (MAX_DISTANCE * query.landmarks.unrelated_distance) ** 2
 
 
 def confirmed(query: LandmarkQuery, matches: LandmarkMatches, T_world_rig: SE3) -> GuidedPose | None:
-    """Refine a pose that was found by other means on guided matches; None if there are too few."""
+    """Refine a pose found by other means on guided matches; None if there are too few."""
     radius, most = RADII[0] * query.threshold, _most_distance(query)
     found = guided_matches(query.images, query.landmarks, T_world_rig, radius, most)
     if len(found) < LEAST_GUIDED_MATCHES:
@@ -116,14 +116,14 @@ def _refined(
     found: LandmarkMatches,
     max_distance: float,
 ) -> GuidedPose:
-    """Refine a pose on guided matches, first as the query states its intrinsics, then with the most probable ones."""
+    """Refine a pose on guided matches, first with the stated intrinsics, then with the most probable ones."""
     fit, found = _guided(query, query.prior, fit, found, max_distance, RADII)
     judged = _posterior(query, fit, found, fit.calibration)
     return _explained(GuidedPose(query, matches, fit, found, max_distance, judged, judged.stated), {})
 
 
 def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
-    """Refine a pose anew with the most probable intrinsics and motion, until they are those that it has."""
+    """Repeat the refinement with the most probable intrinsics and motion until they no longer change."""
     for _ in range(MAX_REFITS):
         best = pose.posterior.best
         if best.is_as(pose.best):
@@ -133,7 +133,7 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
         start = best.calibration if best.hypothesis.whose is Whose.ESTIMATED else GIVEN
         T, most = pose.posterior.pose(best), pose.max_distance
         inliers = pose.matches[agreeing_with(seen, pose.matches, T, start)]
-        if len(inliers) > len(pose.correspondences):  # those of a camera far from the one before
+        if len(inliers) > len(pose.correspondences):  # the new camera differs much from the previous one
             most = max(most, usual_distance(seen, inliers))
         else:
             inliers = pose.correspondences
@@ -142,14 +142,14 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
         fit, found = _guided(seen, prior, fit, inliers, most, RADII[1:], motion)
         judged = _posterior(pose.query, fit, found, best.calibration).updated(log_odds)
         pose = replace(pose, fit=fit, correspondences=found, max_distance=most, posterior=judged, best=best)
-    # Of intrinsics that make each other more probable in turn, the last stay.
+    # If two intrinsics alternate as the more probable, the last are kept.
     return replace(pose, posterior=pose.posterior.with_best(pose.best, pose.fit.T_world_rig))
 
 
 def agreeing_with(
     query: LandmarkQuery, matches: LandmarkMatches, T_world_rig: SE3, calibration: Calibration = GIVEN
 ) -> Bool[Tensor, "m"]:
-    """Return which matches agree with a pose and a correction of the intrinsics."""
+    """Return a mask of the inliers of a pose and a correction of the intrinsics."""
     off = query.observed(matches).corrected(calibration).residuals(T_world_rig)
     return torch.linalg.vector_norm(off, dim=-1) <= query.threshold
 
@@ -165,7 +165,7 @@ def _posterior(
 
 
 def _seen(query: LandmarkQuery, explanation: Explanation) -> LandmarkQuery:
-    """Return the query with the intrinsics with which an explanation is fitted; those that the fit estimates are the stated ones."""
+    """Return the query with the intrinsics of an explanation, or the stated ones if the fit estimates them."""
     if explanation.hypothesis.refitted != FIXED:
         return query
     cameras = [explanation.intrinsics(image.intrinsics) for image in query.images]
@@ -185,7 +185,7 @@ def _guided(
     radii: Sequence[float],
     motion: MotionPrior = STILL,
 ) -> tuple[ReprojectionFit, LandmarkMatches]:
-    """Match near the projections and fit the pose to the matches, in rounds, until the matches no longer change."""
+    """Alternate guided matching and fitting of the pose until the matches no longer change."""
     for radius in (*radii[:-1], *[radii[-1]] * GUIDED_ROUNDS):
         guided = guided_matches(
             query.images, query.landmarks, fit.T_world_rig, radius * query.threshold, most, fit.calibration,
@@ -205,12 +205,12 @@ def _guided(
 
 
 def _changed(a: LandmarkMatches, b: LandmarkMatches) -> float:
-    """Return the share of the matches ``a`` that are not among ``b``."""
+    """Return the fraction of the matches ``a`` that are not in ``b``."""
     return 1 - float(torch.isin(a.keys, b.keys).float().mean())
 
 
 def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
-    """Return which correspondences agree with the depth at the keypoint, up to a common factor, or have no measured depth."""
+    """Return a mask of the correspondences without measured depth or consistent with it, up to a common factor."""
     z = data.in_camera(T_world_rig)[:, 2]
     known = data.depth > 0
     ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)
@@ -219,7 +219,7 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
 
 
 def visible_and_matching(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
-    """Return how many landmarks should be visible from a pose, how many match near there, and how many would by chance."""
+    """Return the numbers of landmarks that should be visible from a pose, that match near it, and that would by chance."""
     radius, most = RADII[0] * query.threshold, _most_distance(query)
     projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)
     matches = sum(len(found.matches(radius, most)) for found in projections)

@@ -1,6 +1,6 @@
 """Rivals of a pose: other poses that explain an image's keypoints about as well.
 
-A scene may repeat itself, such as two rooms with the same furniture. A plane has a second pose, see ``planar_pose``.
+A scene may be repetitive, such as two rooms with the same furniture. A planar scene has a second pose, see ``planar_pose``.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 COMPARED = 100
-"""Largest number of correspondences for which landmarks are sought elsewhere."""
+"""Maximum number of correspondences for which similar landmarks are sought elsewhere."""
 ALIKE = 0.9
-"""Least ratio of a correspondence's descriptor distance to that of a landmark elsewhere that looks as much like the keypoint."""
+"""Minimum ratio of a correspondence's descriptor distance to that of a similar landmark elsewhere."""
 LEAST_ALIKE = 0.3
-"""Least share of the correspondences that must have such a landmark, and that must agree with one other pose."""
+"""Minimum fraction of the correspondences with such a landmark, and of those that agree on one other pose."""
 
 
 def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> Rival | None:
-    """Return the twin of a pose, or None; ``query`` has the intrinsics with which it was found.
+    """Return a rival pose in a repetitive scene, or None; ``query`` has the intrinsics used for the pose.
 
-    The keypoints of its correspondences are compared with landmarks at other places. Where a scene does not repeat itself, few look
-    as much alike, and those do not agree on a pose.
+    The keypoints of its correspondences are matched with landmarks at other places. If the scene is not repetitive, few are as
+    similar, and those do not agree on a pose.
     """
     here = found.correspondences
     chosen = here[torch.linspace(0, len(here) - 1, min(COMPARED, len(here))).round().long().unique()]
@@ -66,7 +66,7 @@ def _two_places(here: LandmarkPose, there: LandmarkPose) -> str:
 
 
 def second_of_plane(query: LandmarkQuery, found: LandmarkPose) -> Rival | None:
-    """Return the second pose of a plane in which the correspondences nearly lie, or None if it fits clearly worse.
+    """Return the second pose for nearly coplanar correspondences, or None if it fits clearly worse.
 
     ``query`` is as for ``twin_of``.
     """
@@ -85,7 +85,7 @@ def second_of_plane(query: LandmarkQuery, found: LandmarkPose) -> Rival | None:
 
 
 def _off_in_depth(data: ObservedPoints, T_world_rig: SE3) -> Float[Tensor, "k"]:
-    """Return by how much, relatively, measured depths differ from those at a pose, up to a common factor."""
+    """Return the relative differences of measured depths from those at a pose, up to a common factor."""
     known = data.depth > 0
     ratio = (data.in_camera(T_world_rig)[known, 2] / data.depth[known]).abs()
     return (ratio / ratio.median() - 1).abs() if len(ratio) else ratio
@@ -107,11 +107,11 @@ def _elsewhere(
 
 
 def _keypoints(matches: LandmarkMatches) -> int:
-    """Return the number of keypoints that are matched."""
+    """Return the number of matched keypoints."""
     keys: Int[Tensor, "m"] = (matches.view << 34) + matches.keypoint
     return len(keys.unique())
 
 
 def _is_shared(there: LandmarkMatches, here: LandmarkMatches) -> bool:
-    """Return whether most of the matches at another pose are those of this one, which is then the same."""
+    """Return whether most of the matches at another pose are those of this one, so that both are the same."""
     return float(torch.isin(there.keys, here.keys).float().mean()) > 0.5

@@ -13,13 +13,13 @@ from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 LOOKED_UP = 4
-"""Number of landmarks looked up per keypoint; the best one at another place shows how ambiguous the match is."""
+"""Number of landmarks looked up per keypoint; the best one at another place determines the ambiguity of the match."""
 SAME_PLACE = 2.0
-"""Landmarks closer together than this many diameters are duplicates of one point."""
+"""Distance between landmarks, in diameters, below which they are duplicates of one point."""
 AMBIGUITY = 0.9
-"""Largest ratio of a match's descriptor distance to that of the best landmark at another place (Lowe 2004)."""
+"""Maximum ratio of a match's descriptor distance to that of the best landmark at another place (Lowe 2004)."""
 LEAST_MATCHES = 60
-"""If there are fewer unambiguous matches, the least ambiguous others are added up to this number."""
+"""Number of matches up to which the least ambiguous others are added to the unambiguous ones."""
 
 
 def unguided_matches(
@@ -46,13 +46,13 @@ def unguided_matches(
 def _ambiguity(
     landmarks: LandmarkMap, distances: Float[Tensor, "q k"], index: Int[Tensor, "q k"]
 ) -> Float[Tensor, "q"]:
-    """Return the ratio of the descriptor distances of the nearest landmark and of the best one at another place."""
+    """Return the ratio of the descriptor distances of the nearest landmark and the best one at another place."""
     if not len(landmarks):
         return torch.ones(len(distances))
     position, size = landmarks.positions[index], landmarks.sizes[index]
     apart = torch.linalg.vector_norm(position - position[:, :1], dim=-1)
     near = SAME_PLACE * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
     elsewhere = torch.where(apart > near, distances, torch.inf).amin(1)
-    # If all landmarks looked up are at one place, the last distance is a lower bound on that of any other.
+    # If all landmarks looked up are at one place, the last distance is a lower bound for any other.
     other = torch.where(elsewhere.isfinite(), elsewhere, distances[:, -1])
     return torch.where(other.isfinite(), (distances[:, 0] / other.clamp(min=1)).sqrt(), 0.0)

@@ -29,14 +29,14 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.surface.casting import Cast, cast
 
 APART, TURNED = 0.15, math.radians(20)
-"""Two poses farther apart than this (share of the extent, radians) are different answers."""
+"""Distance (fraction of the extent, radians) beyond which two poses are different answers."""
 OPEN = 0.2
-"""The map counts as having a background if more than this share of the keyframes' rays meet nothing."""
+"""Fraction of the keyframes' rays that hit nothing above which the map counts as having a background."""
 
 
 @dataclass(frozen=True)
 class ImageStage:
-    """A stage of the search: steps from all remaining poses, of which the best ``keep`` go on to the next stage."""
+    """A stage of the search: steps from all remaining poses, the best ``keep`` of which pass to the next stage."""
 
     width: int  # pixels of the longer side of thumbnails
     steps: int
@@ -57,25 +57,25 @@ DETAILED_STAGES: tuple[ImageStage, ...] = (
     ImageStage(96, 6, 2),
     ImageStage(192, 4, 2),
 )
-"""Stages for partly hidden images: in smaller thumbnails, nearly every pixel would show some of what hides the scene."""
+"""Stages for partly hidden images: in smaller thumbnails, nearly every pixel would contain part of the occluders."""
 WIDE_SCALES = ColourScales(gain=1.0, exposure_rounds=5)
-"""Scales with which images exposed twice or half as long are found."""
+"""Scales for finding images exposed twice or half as long."""
 DETAILED_SCALES = ColourScales(colour=0.07)
-"""Scales for partly hidden images: wider ones favour poses that explain a little of the colours of what hides the scene.
+"""Scales for partly hidden images: wider ones favour poses that partly explain the occluders' colours.
 
-They assume about the map's exposure: wider priors would explain more of what hides the scene.
+They assume approximately the map's exposure, since wider priors would also explain more of the occluders.
 """
 COMPARED_SCALES = replace(WIDE_SCALES, colour=0.07, exposure_rounds=10)
-"""Scales for comparing a few poses, whatever the exposure and whatever hides part of the scene."""
+"""Scales for comparing a few poses, robust to exposure and occluders."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSearch:
-    """Compares a query's images with renderings of a map from many poses."""
+    """Search by comparing a query's images with renderings of a map from many poses."""
 
     views: Sequence[View]
     renderer: ViewRenderer
-    middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what it sees; on the CPU
+    middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of the visible scene; on the CPU
     extent: float  # metres: size of the scene
     scales: ColourScales = field(default_factory=ColourScales)
 
@@ -131,7 +131,7 @@ class ImageSearch:
 
 
 def _from_keyframes(surface: SurfaceMap, small: Thumbnail, most: int = 16) -> Cast:
-    """Return where a thumbnail's rays, cast from up to about ``most`` keyframes, meet the surface."""
+    """Cast a thumbnail's rays from up to about ``most`` keyframes onto the surface."""
     every = max(1, len(surface.keyframes) // most)
     keyframes = SE3.from_matrix(surface.keyframes[::every]).to(small.flat)
     directions = torch.nn.functional.normalize(small.flat, dim=-1) @ keyframes.rotation.mT

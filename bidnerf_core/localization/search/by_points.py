@@ -1,4 +1,4 @@
-"""Search by measured depth: align the points of the query with the baked surface."""
+"""Search by measured depth: align the query's points with the baked surface."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from bidnerf_core.localization.search.starts import Surroundings, hypotheses_for
 from bidnerf_core.mapping import SurfaceMap
 
 JUDGED = 0.02
-"""Scale of the distances by which poses are compared, as a share of the scene's extent."""
+"""Distance scale for comparing poses, as a fraction of the scene's extent."""
 COMPARED_POINTS = 200
-"""Least number of points on which poses are compared."""
+"""Minimum number of points on which poses are compared."""
 APART, TURNED = 0.05, math.radians(10)
-"""Two poses farther apart than this (share of the extent, radians) are different answers."""
+"""Distance (fraction of the extent, radians) beyond which two poses are different answers."""
 
 
 @dataclass(frozen=True)
 class PointStage:
-    """A stage of the search: steps from all remaining poses, of which the best ``keep`` go on to the next stage."""
+    """A stage of the search: steps from all remaining poses, the best ``keep`` of which pass to the next stage."""
 
     points: int
     steps: int
     keep: int
-    distance: float  # scale of distances as a share of the scene's extent; 0: the finest
+    distance: float  # distance scale as a fraction of the scene's extent; 0: the finest
     colour_weight: float
 
 
-# Colour has no weight at first: its derivatives reach no farther than a surfel, and from afar only hold a pose back.
+# Colour has no weight at first: its derivatives are valid only within a surfel, and would only slow down distant poses.
 POINT_STAGES = (
     PointStage(48, 0, 96, 0.3, 0.0),
     PointStage(48, 8, 24, 0.3, 0.0),
@@ -48,9 +48,9 @@ POINT_STAGES = (
 
 @dataclass(frozen=True, eq=False)
 class PointSearch:
-    """Aligns measured points with a surface, starting from hypotheses all over the scene.
+    """Search by aligning measured points with a surface, starting from hypotheses all over the scene.
 
-    Steps are taken on the surface's device. Poses come from the CPU and return to it.
+    Steps are taken on the surface's device. Poses are given and returned on the CPU.
     """
 
     surface: SurfaceMap
@@ -60,7 +60,7 @@ class PointSearch:
         object.__setattr__(self, "cloud", self.cloud.to(self.surface.device))
 
     def __call__(self, start: SE3 | None, count: int, generator: Generator) -> SearchResult:
-        """Search once, from ``count`` fresh hypotheses."""
+        """Search once, from ``count`` new hypotheses."""
         return self.from_poses(hypotheses_for_points(self.surroundings, start, count, generator))
 
     def from_poses(self, T: SE3, stages: tuple[PointStage, ...] = POINT_STAGES) -> SearchResult:
@@ -71,13 +71,13 @@ class PointSearch:
 
     @property
     def surroundings(self) -> Surroundings:
-        """What hypotheses are drawn from; on the CPU, so that a seed draws the same ones whatever the device."""
+        """The input for drawing hypotheses; on the CPU, so that a seed gives the same ones on any device."""
         surface = self.surface
         keyframes, middle = SE3.from_matrix(surface.keyframes), surface.surfels.positions.median(0).values
         return moved(Surroundings(keyframes, surface.extent, middle, self.cloud.middle), "cpu")
 
     def judge(self, points: int | None = None) -> SurfaceCost:
-        """Return the cost of the first ``points`` (all by default), at the one scale at which poses are compared."""
+        """Return the cost of the first ``points`` (all by default), at the fixed scale for comparing poses."""
         cloud = self.cloud if points is None else self.cloud.first(points)
         return SurfaceCost(self.surface, cloud, PointScales(JUDGED * self.surface.extent))
 

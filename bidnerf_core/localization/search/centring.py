@@ -1,8 +1,8 @@
-"""Centring: shifting a camera so that what it renders lies where what it measured lies.
+"""Centring: shift a camera to align the middle of the rendered points with that of the measured points.
 
-From a wrong start, most of the error is that the scene appears in another part of the image. Shifting the camera until the
-medians of the rendered and of the measured points agree removes this error with one rendering of a few rays, even where the
-loss has no useful gradient.
+At a wrong start, the main error is that the scene appears in another part of the image. Shifting the camera until the medians of
+the rendered and measured points agree removes this error with one rendering of a few rays, even where the loss has no useful
+gradient.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bidnerf_core.localization.costs.linearization import flattened
 
 @torch.no_grad()
 def centred(field: RadianceField, observed: Observations, bounds: SceneBounds, T: SE3) -> SE3:
-    """Return the poses T (h) after centring; a pose stays as it is if nothing is measured or nothing is rendered."""
+    """Return the poses T (h) after centring; a pose is unchanged if nothing is measured or nothing is rendered."""
     points = torch.where(observed.measured[:, None], observed.points, torch.nan)
     measured = points.nanmedian(0).values  # NaN where nothing was measured
     shift = rendered_middle(field, observed, bounds, T) - measured
@@ -31,7 +31,7 @@ def centred(field: RadianceField, observed: Observations, bounds: SceneBounds, T
 def rendered_middle(
     field: RadianceField, observed: Observations, bounds: SceneBounds, T: SE3
 ) -> Float[Tensor, "h 3"]:
-    """Return the median, axis by axis, of the rendered points, in the last camera's frame; NaN if no ray meets anything."""
+    """Return the median of the rendered points along each axis, in the last camera's frame; NaN if no ray hits anything."""
     rays = observed.rays(T, bounds)
     shape = rays.near.shape
     seen = render(field, flattened(rays), bounds.background)

@@ -1,4 +1,4 @@
-"""Successive halving: reduce many poses to one, with costs that become finer as poses become fewer."""
+"""Successive halving: reduce many poses to one, with finer costs as poses become fewer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bidnerf_core.progress import check_stopped
 
 @dataclass(frozen=True, eq=False)
 class SearchStage:
-    """A stage: steps from all remaining poses, of which the best ``keep`` go on to the next stage."""
+    """A stage: steps from all remaining poses, the best ``keep`` of which pass to the next stage."""
 
     cost: Cost
     pivot: Pivot
@@ -35,14 +35,14 @@ class SearchStage:
 
 @dataclass(frozen=True)
 class Distinct:
-    """Decides whether two poses are different answers rather than approximations of the same one."""
+    """Decides whether two poses are different answers or approximations of the same one."""
 
-    middle: Float[Tensor, "3"]  # centre of what is seen, metres, last camera's frame
+    middle: Float[Tensor, "3"]  # centre of the visible scene, metres, last camera's frame
     distance: float  # poses that put it farther apart than this (metres) are different
     angle: float  # so are poses whose orientations differ by more than this (radians)
 
     def __call__(self, T: SE3) -> Bool[Tensor, "h"]:
-        """Return which of the poses are different from the first."""
+        """Return a mask of the poses that differ from the first."""
         middles = T.apply(self.middle.to(T.translation))
         away = torch.linalg.vector_norm(middles - middles[0], dim=-1) > self.distance
         trace = (T.rotation[0].mT @ T.rotation).diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -51,11 +51,11 @@ class Distinct:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The poses that remain at the end of a search, and how much better the best is than any different one; on the CPU."""
+    """The remaining poses of a search, and the margin of the best over any different one; on the CPU."""
 
     T: SE3  # (h), best first
     scores: Float[Tensor, "h"]
-    margin: float  # score of the best different pose minus that of the best; infinite where there was none
+    margin: float  # score of the best different pose minus that of the best; infinite if there was none
     path: SE3  # (s + 1): from the winning hypothesis to the best pose
     losses: Float[Tensor, "s"]  # of the path before each step; costs of different stages are not comparable
 
@@ -66,11 +66,11 @@ def search(
 ) -> SearchResult:  # fmt: skip
     """Run the stages on the hypotheses ``start`` (h) and return the poses that remain.
 
-    Steps are taken on ``device``, by default where the hypotheses lie.
+    Steps are taken on ``device``, by default that of the hypotheses.
 
     With ``keep_runner_up``, if the best poses of a stage are all the same answer, the last of them is replaced by the best
-    different one, and the margin is that of the last stage. Without it, the margin is that of the last stage that still had
-    different poses. The host waits for the device between stages, but not within one.
+    different one, and the margin is that of the last stage. Without it, the margin is that of the last stage with different
+    poses. The host waits for the device between stages, but not within one.
     """
     device = start.device if device is None else device
     T, distinct = start.to(device), moved(distinct, device)
@@ -108,6 +108,6 @@ def _best(T: SE3, scores: Float[Tensor, "h"], count: int, distinct: Distinct | N
 
 
 def _margin(T: SE3, scores: Float[Tensor, "h"], distinct: Distinct) -> float:
-    """Return by how much the best different pose is worse than the first; poses come best first."""
+    """Return the score of the best different pose minus that of the first; poses are sorted best first."""
     others = scores[distinct(T)]
     return float(others.min() - scores[0]) if len(others) else math.inf

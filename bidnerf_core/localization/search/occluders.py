@@ -1,4 +1,4 @@
-"""Things in front of the scene: the nearest piece of a depth image, cut out along jumps of the depth."""
+"""Occluders: the nearest segment of a depth image, cut out along depth discontinuities."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.surface.casting import cast
 
 JUMP = 0.05
-"""Relative difference of the depths of neighbouring pixels above which they belong to different things."""
+"""Relative depth difference above which neighbouring pixels belong to different segments."""
 CONSIDERABLE, REST = 0.15, 0.05
-"""Least share of the measured pixels in an occluder, and in the rest."""
+"""Minimum fraction of the measured pixels in an occluder, and in the rest."""
 LEAST_PIXELS = 50
-"""Least number of measured pixels in both."""
+"""Minimum number of measured pixels in both."""
 PROBED_POINTS = 300
-"""Largest number of points of an occluder that are compared with the surface."""
+"""Maximum number of an occluder's points that are compared with the surface."""
 CLEARLY_IN_FRONT = 0.02
-"""Distance in front of the surface (share of the scene's extent) up to which a point still lies on it."""
+"""Distance in front of the surface (fraction of the scene's extent) up to which a point still lies on it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Occluder:
-    """The nearest considerable piece of a depth image, and the problem without its pixels."""
+    """The nearest large segment of a depth image, and the problem without its pixels."""
 
     rest: Problem
-    share: float  # of the measured pixels that it has
-    points: Float[Tensor, "n 3"]  # some of it, in the camera's frame, metres
+    share: float  # its fraction of the measured pixels
+    points: Float[Tensor, "n 3"]  # some of its points, in the camera's frame, metres
 
     @torch.no_grad()
     def share_in_front(self, surface: SurfaceMap, T_world_camera: SE3) -> float:
-        """Return the share of its points that lie clearly in front of the surface, or of nothing, as seen from a pose."""
+        """Return the fraction of its points clearly in front of the surface, or of empty space, as seen from a pose."""
         T = T_world_camera.to(surface.device)
         ends = T.apply(self.points.to(T.translation))
         lines = (ends - T.translation).float()
@@ -49,9 +49,9 @@ class Occluder:
 
 
 def nearest_piece(problem: Problem) -> Occluder | None:
-    """Return the piece of the only depth image that may be an occluder: the nearest of the considerable ones.
+    """Return the segment of a single depth image that may be an occluder: the nearest large one.
 
-    None if there is no such piece, if it is all that was measured, or if there are several images or other sensors.
+    None if there is no such segment, if nothing else was measured, or if there are several images or other sensors.
     """
     if len(problem.views) != 1 or problem.depth_rays is not None:
         return None
@@ -90,7 +90,7 @@ def _nearest(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"] | None:
 
 
 def _pieces(depth: np.ndarray) -> np.ndarray:
-    """Return the number of the connected piece to which each pixel belongs, -1 where nothing was measured."""
+    """Return each pixel's connected segment by number, -1 where nothing was measured."""
     number, measured = np.arange(depth.size).reshape(depth.shape), (depth > 0) & np.isfinite(depth)
     depth = np.where(measured, depth, 0)
     pairs = []

@@ -1,4 +1,4 @@
-"""Hypotheses: the poses from which a search starts."""
+"""Hypotheses: the initial poses of a search."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bidnerf_core.localization.solvers.pivots import Pivot
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """The data from which hypotheses are made: the map's keyframes, the size of the scene, and what the query sees."""
+    """The input for hypotheses: the map's keyframes, the size of the scene, and the middle of the query's view."""
 
-    keyframes: SE3  # (k) T_world_camera of the images that the map was made from
+    keyframes: SE3  # (k) T_world_camera of the images from which the map was made
     extent: float  # metres: size of the scene
     scene_middle: Float[Tensor, "3"]  # metres, world
-    seen_middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what the query sees
+    seen_middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of the query's view
 
     @property
     def pivot(self) -> Pivot:
@@ -30,10 +30,10 @@ class Surroundings:
 
 
 def hypotheses_for_points(known: Surroundings, start: SE3 | None, count: int, generator: Generator) -> SE3:
-    """Return ``count`` poses from which measured points may fit the surface.
+    """Return ``count`` poses at which measured points may fit the surface.
 
-    Half are keyframes, moved a little. The other half put the middle of the measured points on the middle of the scene, which
-    suits cameras that look at an object; three quarters of their orientations are near those of keyframes, and a quarter are
+    Half are slightly perturbed keyframes. The other half place the middle of the measured points at the middle of the scene,
+    which suits cameras around an object; three quarters of their orientations are near those of keyframes, and a quarter are
     uniformly random. If there is a start, a quarter of all poses are the start and poses near it.
     """
     spread = _deviation(0.1 * known.extent, 0.25)
@@ -50,10 +50,10 @@ def hypotheses_for_points(known: Surroundings, start: SE3 | None, count: int, ge
 
 
 def hypotheses_for_images(known: Surroundings, start: SE3 | None, count: int, generator: Generator) -> SE3:
-    """Return ``count`` poses from which the map may look like the query's images.
+    """Return ``count`` poses at which the map may look like the query's images.
 
-    Up to half are keyframes as they are. The others are keyframes moved about what they look at; every fourth of them is
-    also rolled by a random angle. If there is a start, a quarter of all poses are the start and poses near it.
+    Up to half are unchanged keyframes. The others are keyframes perturbed about the point at which they look; every fourth of
+    them is also rolled by a random angle. If there is a start, a quarter of all poses are the start and poses near it.
     """
     near = [] if start is None else [_turned_and_moved(known, start, max(1, count // 4), generator)]
     left = count - sum(len(T.translation) for T in near)
@@ -68,10 +68,10 @@ def hypotheses_for_images(known: Surroundings, start: SE3 | None, count: int, ge
 
 
 def neighbours(T: SE3, count: int, translation: float, rotation: float, seed: int) -> SE3:
-    """Return ``T`` and ``count`` - 1 right updates of it, spread evenly under a normal distribution.
+    """Return ``T`` and ``count`` - 1 right updates of it, quasi-random samples of a normal distribution.
 
     ``translation`` (metres) and ``rotation`` (radians) are its standard deviations along and about each axis of the camera;
-    the points are a Sobol sequence, scrambled by ``seed``. Shape (count).
+    the samples are a Sobol sequence, scrambled with ``seed``. Shape (count).
     """
     even = SobolEngine(6, scramble=True, seed=seed).draw(count, dtype=torch.float64)
     xi = _deviation(translation, rotation) * torch.special.ndtri(even.clamp(1e-6, 1 - 1e-6))
@@ -80,7 +80,7 @@ def neighbours(T: SE3, count: int, translation: float, rotation: float, seed: in
 
 
 def random_rotations(count: int, generator: Generator) -> Float[Tensor, "h 3 3"]:
-    """Return orientations drawn uniformly: normalised Gaussian quaternions."""
+    """Return uniformly distributed orientations, from normalised Gaussian quaternions."""
     quaternions = torch.randn((count, 4), generator=generator, dtype=torch.float64)
     return quaternion_to_rotation_matrix(torch.nn.functional.normalize(quaternions, dim=-1))
 
@@ -92,7 +92,7 @@ def _about(start: SE3, pivot: Pivot, count: int, spread: Float[Tensor, "6"], gen
 
 
 def _turned_and_moved(known: Surroundings, start: SE3, count: int, generator: Generator) -> SE3:
-    """Return the start and poses near it: half are perturbed about the camera, half about what the camera looks at."""
+    """Return the start and poses near it: half are perturbed about the camera, half about the middle of its view."""
     many = SE3(start.rotation.expand(count, 3, 3), start.translation.expand(count, 3))
     half, spread = count // 2, _deviation(0.05 * known.extent, 0.25)
     turns = torch.randn((half, 6), generator=generator, dtype=torch.float64) * spread
@@ -106,13 +106,13 @@ def _moved(T: SE3, pivot: Pivot, spread: Float[Tensor, "6"], generator: Generato
 
 
 def _scattered(T: SE3, extent: float, generator: Generator) -> SE3:
-    """Return poses moved a little, so that repeated ones differ and a frame does not fail twice in the same way."""
+    """Return slightly perturbed poses, so that repeated ones differ and a frame does not fail twice in the same way."""
     shifts = torch.randn((len(T.translation), 6), generator=generator, dtype=torch.float64)
     return T.retract(shifts * _deviation(0.02 * extent, 0.05))
 
 
 def _without_repetition(T: SE3, count: int, generator: Generator) -> SE3:
-    """Draw ``count`` poses, none a second time before all have been drawn."""
+    """Draw ``count`` poses, with no pose repeated before all have been drawn."""
     rounds = max(1, -(-count // len(T.translation)))
     order = [torch.randperm(len(T.translation), generator=generator) for _ in range(rounds)]
     return T[torch.cat(order)[:count]]

@@ -1,1 +1,1 @@
-"""Solvers, which move poses down any cost."""
+"""Solvers that minimize any cost of poses."""

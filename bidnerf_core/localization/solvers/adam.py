@@ -1,9 +1,9 @@
-"""First-order descent: Adam on updates of one pose (Alg. 1 of the paper, its loop test the right way round).
+"""First-order descent: Adam on updates of one pose (Alg. 1 of the paper, with its loop condition corrected).
 
-A step of a few thousand rays consists of some hundreds of short operations, each of which takes longer to launch from Python
-than to compute; a CUDA graph launches all of them at once. A step can be captured if it never waits for the device (see
+A step on a few thousand rays consists of hundreds of short operations, each of which takes longer to launch from Python than to
+compute; a CUDA graph launches all of them at once. A step can be captured if it never waits for the device (see
 ``devices.without_waiting``), has the same shapes each time, and writes its results into existing tensors. Numbers computed in
-Python keep the value that they had during the capture.
+Python keep their values from the capture.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.progress import check_stopped
 
 WARM_UP = 3
-"""Steps to take before one is captured: caches are filled and kernels loaded in these, which a capture does not allow."""
+"""Steps before the capture, which fill caches and load kernels, as a capture does not allow this."""
 _capturing = Lock()
-"""Allows one capture at a time: a capture begins by waiting for the device, which another capture forbids."""
+"""Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 Loss = Callable[[SE3], Tensor]
 BETAS, EPSILON = (0.9, 0.999), 1e-8
-"""Decays of the moments, and what is added to the root of the second (Kingma and Ba 2015, Alg. 1)."""
+"""Decay rates of the moments, and the constant added to the root of the second (Kingma and Ba 2015, Alg. 1)."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Replay:
     graph: torch.cuda.CUDAGraph
-    constants: list[Tensor]  # kept alive here, since the graph reads them
+    constants: list[Tensor]  # kept alive here, as the graph reads them
 
     def __call__(self) -> None:
         self.graph.replay()
 
 
 def captured(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
-    """Return a callable equivalent to ``step``; on a GPU it replays a CUDA graph.
+    """Return a callable equivalent to ``step``; on a GPU, it replays a CUDA graph.
 
-    ``generator`` is the one from which the step draws. Capturing does not execute the step. If the capture fails, this warns and
-    returns ``step`` itself.
+    ``generator`` is the one from which the step draws. Capturing does not execute the step. If the capture fails, ``step`` itself
+    is returned, with a warning.
     """
     if device.type != "cuda":
         return step
     graph, before = torch.cuda.CUDAGraph(), generator.clone_state()
     graph.register_generator_state(generator)
-    # Where a capture fails, torch leaves the thread on the stream of the capture; the outer context sets it back.
+    # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
     with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
         try:
-            # Each device has a stream of its own. Other threads may go on launching.
+            # Each device has its own stream. Other threads may continue to launch.
             stream = torch.cuda.Stream(device)
             with (
                 noted() as constants,
@@ -67,7 +67,7 @@ def captured(step: Callable[[], None], device: torch.device, generator: Generato
             generator.graphsafe_set_state(before)  # the registered one still expects a capture
             why = str(error).partition("\n")[0]
             warnings.warn(
-                f"steps are launched one operation after the other, since one cannot be captured: {why}",
+                f"operations are launched one by one, since a step cannot be captured: {why}",
                 stacklevel=2,
             )
             return step
@@ -76,11 +76,11 @@ def captured(step: Callable[[], None], device: torch.device, generator: Generato
 
 
 class AdamSteps:
-    """Steps of one pose, on its own device: no step reads a number from the device, or copies anything from or to it.
+    """Adam's steps for one pose, on its device: no step copies anything between host and device.
 
-    Each step writes the pose as an update delta of the current one about ``pivot``, takes the gradient with respect to delta
-    at 0, and moves by Adam's update. A step that is not finite leaves the pose where it is. All that a step changes lies in
-    tensors that it writes in place, so each replay of a step captured as a CUDA graph takes the next step.
+    Each step parametrizes the pose by an update delta of the current one about ``pivot``, takes the gradient with respect to
+    delta at 0, and applies Adam's update. A non-finite step leaves the pose unchanged. All state is in tensors that are written
+    in place, so each replay of a captured CUDA graph takes the next step.
     """
 
     def __init__(self, loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3) -> None:
@@ -104,7 +104,7 @@ class AdamSteps:
         delta = torch.zeros_like(self._rate).requires_grad_()
         value = self._loss(self._pivot.moved_linearly(self._T, delta))
         update = torch.zeros_like(delta)
-        if value.requires_grad:  # it does not where no ray meets anything
+        if value.requires_grad:  # false if no ray hits anything
             (gradient,) = torch.autograd.grad(value, delta)
             update = self._update(gradient)
         with torch.no_grad():
@@ -118,9 +118,9 @@ class AdamSteps:
             self._steps += 1
 
     def block(self) -> tuple[SE3, Float[Tensor, "s"], Bool[Tensor, "s"]]:
-        """Return the poses after the last ``WINDOW`` steps, on the CPU, the loss before each, and whether each was finite.
+        """Return the poses after the last ``WINDOW`` steps on the CPU, the loss before each, and whether each was finite.
 
-        Call it after every ``WINDOW`` steps; rows of steps that were not taken hold earlier ones.
+        Call it after every ``WINDOW`` steps; rows of steps not yet taken contain earlier ones.
         """
         log = self._log.to("cpu", copy=True)  # later steps overwrite it
         return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13] > 0
@@ -143,11 +143,11 @@ def follow_gradient(
     loss: Loss, pivot: Pivot, config: AdamSettings, history: History, device: torch.device,
     generator: Generator | None = None,
 ) -> tuple[bool, str]:  # fmt: skip
-    """Take steps from ``history.T``, record them, and return whether they stayed finite and why they ended.
+    """Take steps from ``history.T``, record them, and return whether they stayed finite and the reason why they ended.
 
-    Steps are taken on ``device``, ``WINDOW`` at a time; the host reads them after each block. If a reason to stop arose
-    within a block, the steps after it are discarded. Give the ``generator`` from which the loss draws if all calls do the same
-    computation apart from these numbers: on a GPU, a step is then captured once and replayed.
+    Steps are taken on ``device``, ``WINDOW`` at a time; the host reads them after each block. If a stopping criterion was met
+    within a block, the steps after it are discarded. Pass the ``generator`` from which the loss draws if all calls do the same
+    computation apart from random numbers: on a GPU, a step is then captured once and replayed.
     """
     steps = AdamSteps(loss, pivot, config, history.T.to(device))
     take: Callable[[], None] = steps
@@ -169,7 +169,7 @@ def follow_gradient(
 def _recorded(
     history: History, config: AdamSettings, poses: SE3, losses: Tensor, finite: Tensor
 ) -> tuple[bool, str] | None:
-    """Add a block of steps to the history, up to the first at which to stop; return whether all is finite, and why to stop."""
+    """Add a block of steps to the history up to the stopping one; return whether all are finite, and the reason to stop."""
     for number, (value, is_finite) in enumerate(zip(losses.tolist(), finite.tolist(), strict=True)):
         step = len(history.losses) + 1
         if not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""The history of a descent: its poses and losses, when to stop, and which pose to answer with."""
+"""The history of a descent: its poses and losses, the stopping criteria, and the choice of the resulting pose."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class History:
         self.losses += (costs.amin(-1)[:-1] / 2).tolist()
 
     def recent_loss(self) -> float:
-        """Return the mean of the last ``WINDOW`` losses; NaN where there are none."""
+        """Return the mean of the last ``WINDOW`` losses; NaN if there are none."""
         last = self.losses[-WINDOW:]
         return sum(last) / len(last) if last else math.nan
 
@@ -49,7 +49,7 @@ class History:
         return float((way[:-1].inverse() @ way[1:]).log().norm(dim=-1).mean())
 
     def stop(self, loss_below: float, step_below: float) -> str | None:
-        """Return why to stop, or None; a threshold of 0 never stops."""
+        """Return the reason to stop, or None; a threshold of 0 is never met."""
         if len(self.losses) < WINDOW:
             return None
         if self.recent_loss() < loss_below:
@@ -61,8 +61,8 @@ class History:
     def answer(self, name: AnswerName) -> tuple[SE3, float]:
         """Return a pose and the mean loss of the steps up to it.
 
-        ``last`` is the last pose. ``best`` is the pose at the end of those ``WINDOW`` steps whose mean loss is least, since
-        the loss of a single step is that of a few pixels; of a shorter history, the last pose.
+        ``last`` is the last pose. ``best`` is the pose at the end of the ``WINDOW`` steps with the smallest mean loss, since the
+        loss of a single step is noisy; in a shorter history, it is the last pose.
         """
         if name == "last" or len(self.losses) < WINDOW:
             return self.T, self.recent_loss()

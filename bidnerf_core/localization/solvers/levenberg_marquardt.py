@@ -26,7 +26,7 @@ class Descent:
     accepted: Bool[Tensor, "s h"]  # which steps lowered the cost
     poses: SE3  # (s + 1, h)
     costs: Float[Tensor, "t h"]  # of these poses
-    converged: Bool[Tensor, "h"]  # which poses reached a place where a step is shorter than ``stop``
+    converged: Bool[Tensor, "h"]  # which poses reached a point where a step is shorter than ``stop``
 
 
 def descend(
@@ -39,9 +39,9 @@ def descend(
 ) -> Descent:
     """Take ``steps`` steps from the poses ``start`` (h); a step that does not lower its pose's cost is undone.
 
-    Damping scales with the diagonal (Marquardt 1963), so that units do not matter. ``stop``: a pose has converged once a
-    lightly damped step is shorter than this (norm of the tangent), whether or not it still lowers the cost; the descent
-    ends when all poses have, unless the host must not wait for the device to find out. 0: never.
+    Damping scales with the diagonal (Marquardt 1963), so units do not matter. A pose has converged once a lightly damped step is
+    shorter than ``stop`` (norm of the tangent), whether or not it lowers the cost; 0 means never. The descent ends when all poses
+    have converged, unless the host must not wait for the device.
     """
     T, here = start, cost(start)
     factor = torch.full_like(here.cost, damping)
@@ -52,7 +52,7 @@ def descend(
         delta = here.solve(factor)
         trial = retract(T, delta)
         there = cost(trial)
-        better = there.cost < here.cost  # never where it is NaN
+        better = there.cost < here.cost  # false for NaN
         converged |= _short(delta, factor, here, stop)
         T, here = _chosen(better, trial, T), there.chosen(better, here)
         factor = torch.where(better, factor / 4, factor * 6).clamp(LEAST_DAMPING, MOST_DAMPING)
@@ -68,7 +68,7 @@ def descend(
 def _short(
     delta: Float[Tensor, "h 6"], damping: Float[Tensor, "h"], here: NormalEquations, stop: float
 ) -> Bool[Tensor, "h"]:
-    """Return which steps are shorter than ``stop`` due to a small gradient, not to a failed solve or heavy damping."""
+    """Return a mask of steps shorter than ``stop`` due to a small gradient, not a failed solve or heavy damping."""
     whole = here.hessian.isfinite().all(-1).all(-1) & here.gradient.isfinite().all(-1)
     return whole & (damping <= 1) & (torch.linalg.vector_norm(delta, dim=-1) < stop)
 

@@ -1,4 +1,4 @@
-"""Pivots: the frames in which pose updates are expressed, and about whose origins they rotate."""
+"""Pivots: the frames of pose updates, whose origins are the centres of rotation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PivotName = Literal["scene", "camera", "world"]
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """The point about which updates rotate: one fixed to the camera, or the world's origin."""
+    """The centre of rotation of updates: a point fixed to the camera, or the world's origin."""
 
     T_camera_pivot: SE3 | None  # a translation; None: the world's own frame
 
@@ -40,13 +40,13 @@ class Pivot:
         return 1.0 if self.T_camera_pivot is None else max(1.0, float(self.T_camera_pivot.translation.norm()))
 
     def moved(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``T``, one pose or a batch, after the update ``delta``; differentiable with respect to ``delta``."""
+        """Return ``T``, one pose or a batch, after the update ``delta``; differentiable in ``delta``."""
         if self.T_camera_pivot is None:
             return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
     def moved_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``moved`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
+        """Return ``moved`` to first order in ``delta``, which is cheaper and has the same value and derivative at 0."""
         if self.T_camera_pivot is None:
             return SE3.identity(device=delta.device).retract_linearly(delta) @ T
         return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()
@@ -61,7 +61,7 @@ class Pivot:
         return carried @ covariance @ carried.mT
 
     def adjoint_from(self, other: Pivot) -> Float[Tensor, "6 6"]:
-        """Return the matrix that converts an update about another point of the camera's frame to one about this point."""
+        """Return the matrix that converts an update about another point in the camera's frame to one about this point."""
         assert self.T_camera_pivot is not None
         assert other.T_camera_pivot is not None
         return (self.T_camera_pivot.inverse() @ other.T_camera_pivot).adjoint()
@@ -72,11 +72,11 @@ class Pivot:
 
 
 def pivot(name: PivotName, problem: Problem) -> Pivot:
-    """Return a pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of what is seen.
+    """Return a pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of the visible scene.
 
-    For a scene some metres away, rotating the camera and moving it sideways change the image in almost the same way. In the
-    camera's frame the objective is therefore a long narrow valley, in which first-order steps are slow. About the middle of
-    what the camera sees, the two motions decouple.
+    For a scene metres away, rotation and sideways translation of the camera change the image in almost the same way. In the
+    camera's frame, the objective is therefore a long narrow valley, in which first-order steps are slow. About the middle of the
+    visible scene, the two motions decouple.
     """
     if name == "world":
         return Pivot(None)
@@ -84,7 +84,7 @@ def pivot(name: PivotName, problem: Problem) -> Pivot:
 
 
 def _middle(problem: Problem) -> Float[Tensor, "3"]:
-    """Return the middle of what was measured, else of the scene, else the camera; in the last camera's frame, metres."""
+    """Return the middle of the measured points, or else of the scene, or else 0; in the last camera's frame, metres."""
     point = measured_middle(problem.views)
     if point is not None:
         return point

@@ -11,20 +11,20 @@ from torch import Tensor
 from bidnerf_core.mapping.landmarks.features import FIRST_CENTRE
 
 FLOW_WINDOW = (13, 13)
-"""Pixels of the patches that are compared."""
+"""Size of the compared patches, pixels."""
 LEVELS = 3
 """Number of pyramid levels above the image itself; each halves it."""
 FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
-"""Largest number of iterations on each level, and the step (pixels) below which they end."""
+"""Maximum number of iterations on each level, and the step (pixels) below which they end."""
 RETURN = 0.7
-"""Largest distance (pixels) between a point and where the flow back from its new place ends."""
+"""Maximum forward-backward error of a point, pixels."""
 LEAST_TEXTURE = 1e-3
-"""Least eigenvalue of a patch's gradient matrix, as OpenCV normalises it; a blank wall with noise stays below it."""
+"""Minimum eigenvalue of a patch's gradient matrix, as normalised by OpenCV; a blank wall with noise stays below it."""
 BRIGHTNESS = 0.02
-"""Relative change of an image's mean above which its brightness is matched first: the flow assumes constant brightness."""
+"""Relative change of an image's mean above which its brightness is matched first, since the flow assumes constant brightness."""
 
 PATCH, LEAST_CORRELATION = 4, 0.6
-"""Pixels from the middle to the border of the patches that ``alike`` compares, and their least correlation."""
+"""Half size (pixels) of the patches that ``alike`` compares, and their minimum correlation."""
 
 Grey = UInt8[np.ndarray, "h w"]
 
@@ -32,9 +32,9 @@ Grey = UInt8[np.ndarray, "h w"]
 def flow(
     before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], guess: Float[Tensor, "m 2"]
 ) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, "m"]]:
-    """Return where ``pixels`` (u, v) of one image are in the next, and which of them were found.
+    """Track ``pixels`` (u, v) of one image to the next; return their new positions and a mask of those found.
 
-    The search begins at ``guess``. A point counts as found if the flow from its new place leads back to the old one.
+    The search starts at ``guess``. A point counts as found if the backward flow returns to its old position.
     """
     if not len(pixels):
         return pixels, torch.zeros(0, dtype=torch.bool)
@@ -58,9 +58,9 @@ def flow(
 def alike(
     before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], there: Float[Tensor, "m 2"]
 ) -> Bool[Tensor, "m"]:
-    """Return which patches about ``pixels`` of one image resemble those about ``there`` in the next.
+    """Return a mask of the patches around ``pixels`` of one image that resemble those around ``there`` in the next.
 
-    The flow leaves patches of mere noise wherever its search began; these do not correlate.
+    The flow leaves patches of pure noise where its search started; these do not correlate.
     """
     one, two = (_patches(image, place) for image, place in ((before, pixels), (now, there)))
     spread = np.sqrt((one**2).sum(-1) * (two**2).sum(-1)).clip(min=1e-6)
@@ -68,7 +68,7 @@ def alike(
 
 
 def _patches(image: Grey, pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m p"]:
-    """Return the grey values about pixels, minus their mean."""
+    """Return the grey values around pixels, minus their mean."""
     steps = np.arange(-PATCH, PATCH + 1)
     column, row = np.moveaxis(pixels.floor().long().numpy(), -1, 0)
     rows = (row[:, None] + steps).clip(0, image.shape[0] - 1)
@@ -90,7 +90,7 @@ def _corner_based(pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m 2"]:
 
 
 def _as_bright_as(model: Grey, image: Grey) -> Grey:
-    """Return ``image`` with about the mean and standard deviation of ``model``; unchanged where the means hardly differ."""
+    """Return ``image`` with about the mean and standard deviation of ``model``; unchanged if the means hardly differ."""
     (mean, spread), (wanted, wanted_spread) = _moments(image), _moments(model)
     if abs(wanted - mean) <= BRIGHTNESS * mean or spread < 1:
         return image

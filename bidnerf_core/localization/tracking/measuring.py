@@ -1,4 +1,4 @@
-"""Measuring a pose in one frame from a prediction: by followed and recognised landmarks, by depth, or by colour."""
+"""Measuring a pose in one frame from a prediction: by tracked and recognised landmarks, by depth, or by colour."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ from bidnerf_core.localization.tracking.surface import (
 from bidnerf_core.mapping import SurfaceMap
 
 WIDEST = 0.4
-"""Largest radius, as a share of the image's diagonal, within which landmarks are sought around their prediction."""
+"""Maximum search radius around the predicted landmarks, as a fraction of the image's diagonal."""
 SIGMAS = 3.0
 """Radius of that search, in standard deviations of the prediction."""
 ENOUGH_LANDMARKS = 40
-"""Least number of agreeing followed landmarks at which no new ones are sought, and the pose needs no confirmation."""
+"""Minimum number of tracked inliers at which no new landmarks are needed, and the pose needs no confirmation."""
 SINGLE = LandmarkThresholds(precision=math.inf)
-"""Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
+"""Thresholds for landmarks in one image. The precision is checked after fusing them with depth and the prediction."""
 VAGUE = 0.35
-"""Largest uncertainty of a prediction that shape alone may correct, as a share of the distance to what is seen."""
+"""Maximum uncertainty of a prediction that shape alone may correct, as a fraction of the distance to the scene."""
 TOO_VAGUE = Verdict(
     Outcome.UNDETERMINED, "no colours were recorded, and the prediction is too uncertain for the shape"
 )
@@ -69,27 +69,27 @@ TOO_VAGUE = Verdict(
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A pose measured in a frame, the verdict on it, and what the next frame needs."""
+    """A pose measured in a frame, the verdict on it, and the state for the next frame."""
 
     pose: PoseEstimate
     verdict: Verdict
     loss: float
     state: TrackerState  # with the points of this frame
-    motion: Motion | None = None  # fused with the prediction, where the verdict needed that already
+    motion: Motion | None = None  # fused with the prediction, if the verdict already required it
 
 
 def followed(state: TrackerState, image: Grey | None, frame: Frame, predicted: SE3) -> FollowedPoints:
-    """Return the points of the last image that were found in this one."""
+    """Track the points of the last image to this one, and return those that were found."""
     if image is None or state.image is None or image.shape != state.image.shape or not len(state.points):
         return FollowedPoints.none()
     guess = state.points.projected(frame.intrinsics, predicted)
     pixels, found = flow(state.image, image, state.points.pixels, guess)
-    if float(found.float().mean()) < 0.5:  # the prediction may be what is wrong
+    if float(found.float().mean()) < 0.5:  # the prediction may be wrong
         again, found_again = flow(state.image, image, state.points.pixels, state.points.pixels)
         if int(found_again.sum()) > int(found.sum()):
             pixels, found = again, found_again
     fresh = (state.points.landmark == FRESH) & found
-    if bool(fresh.any()):  # landmarks, unlike corners, are known to be recognisable
+    if bool(fresh.any()):  # unlike corners, landmarks are known to be distinctive
         found[fresh.clone()] = alike(state.image, image, state.points.pixels[fresh], pixels[fresh])
     found &= visible_at(frame, pixels)
     return replace(state.points, pixels=pixels)[found]
@@ -97,7 +97,7 @@ def followed(state: TrackerState, image: Grey | None, frame: Frame, predicted: S
 
 @dataclass(frozen=True, eq=False)
 class ByLandmarks:
-    """Measures poses by landmarks: those that the flow carries over, and new ones where these become few."""
+    """Measures poses by landmarks: those tracked by optical flow, and new ones when these become few."""
 
     map: SceneMap
     detector: LandmarkDetector
@@ -107,7 +107,7 @@ class ByLandmarks:
     def __call__(
         self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> Measurement | None:
-        """Return the pose by landmarks, fused with measured depth; None if too few are seen for any pose."""
+        """Return the pose by landmarks, fused with measured depth; None if too few are visible."""
         threshold = pixel_threshold(frame.intrinsics)
         correlation = self.detector.landmarks.correlation_of(len(points))
         found = fit_pose(
@@ -155,7 +155,7 @@ class ByLandmarks:
         predicted: Motion,
         judged: tuple[LandmarkPose, Verdict] | None,
     ) -> tuple[LandmarkPose, Verdict, FollowedPoints, PointFit, TrackerState] | None:
-        """Seek landmarks about the pose of those that were followed, or else about the prediction."""
+        """Search for landmarks around the pose of the tracked ones, or else around the prediction."""
         camera = frame.intrinsics
         least, most = 1.5 * pixel_threshold(camera), WIDEST * math.hypot(camera.width, camera.height)
         if judged is not None and judged[1].accepted:
@@ -192,7 +192,7 @@ class ByLandmarks:
         verdict: Verdict,
         predicted: Motion,
     ) -> Measurement:
-        """Fuse a pose by landmarks with depth and the prediction, and judge whether it is precise enough then."""
+        """Fuse a pose by landmarks with depth and the prediction, and check whether it is then precise enough."""
         measured = self._with_depth(frame, state, kept, found, verdict)
         motion = predicted.updated(measured.pose)
         verdict = precise_enough(measured.verdict, motion.covariance, found.distance)
@@ -216,7 +216,7 @@ class ByLandmarks:
         return Measurement(pose, verdict, found.noise, state)
 
     def _estimate(self, found: LandmarkPose) -> PoseEstimate:
-        """Split a pose's covariance into noise and bias: errors that an image's landmarks share recur in the next image."""
+        """Split a pose's covariance into noise and bias, as errors shared by an image's landmarks recur in the next image."""
         landmarks = self.detector.landmarks
         correlation = landmarks.correlation_of(len(found.correspondences))
         noise = (found.covariance - found.map_covariance) / correlation
@@ -224,12 +224,12 @@ class ByLandmarks:
 
 
 def search_radius(predicted: Motion, camera: Intrinsics) -> float:
-    """Return the radius (pixels) around its prediction within which a landmark most likely appears."""
+    """Return the radius (pixels) around its prediction within which a landmark is very likely to appear."""
     return SIGMAS * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
 
 
 def is_vague(predicted: Motion, camera: Intrinsics) -> bool:
-    """Return whether a prediction, such as one after a gap, is too uncertain to seek landmarks around it."""
+    """Return whether a prediction, such as one after a gap, is too uncertain for a search for landmarks around it."""
     return search_radius(predicted, camera) > WIDEST * math.hypot(camera.width, camera.height)
 
 
@@ -250,7 +250,7 @@ def by_surface(
 def by_shape(
     surface: SurfaceMap, frame: Frame, state: TrackerState, predicted: Motion, config: TrackerConfig
 ) -> Measurement:
-    """Return the predicted pose corrected by measured depth without colours: fused with the prediction already."""
+    """Return the pose by measured depth without colours, already fused with the prediction."""
     cloud = measured_cloud(frame, config.depth_points, 1.0, Generator().manual_seed(state.frames))
     prediction = PoseEstimate(predicted.T_world_camera, predicted.noise[:6, :6], predicted.bias)
     translation, rotation = prediction.covariance.diagonal().split(3)
@@ -264,7 +264,7 @@ def by_shape(
 def by_colour(
     scene: SceneMap, frame: Frame, state: TrackerState, predicted: Motion, config: ByColourConfig
 ) -> Measurement:
-    """Return the pose by the colours of rendered rays alone, which takes far longer than the other measurements."""
+    """Return the pose by the colours of rendered rays alone, which is far slower than the other measurements."""
     problem = rig(scene, [View(replace(frame, depth=None), SE3.identity())], predicted.T_world_camera)
     T, none = predicted.T_world_camera, torch.zeros(0, dtype=torch.float64)
     start = SearchResult(T[None], torch.zeros(1, dtype=torch.float64), math.inf, T[None], none)
@@ -279,14 +279,14 @@ def by_colour(
 
 
 DETERMINED = 0.02, math.radians(3)
-"""Largest standard deviations of an accepted pose by depth or colour: share of the scene's extent, and radians."""
+"""Maximum standard deviations of an accepted pose by depth or colour: fraction of the scene's extent, and radians."""
 
 
 def not_by_chance(verdict: Verdict, noise: float, threshold: float) -> Verdict:
-    """Return the verdict on followed landmarks, or a rejection if their ``noise`` (pixels) is what chance would give.
+    """Return the verdict on tracked landmarks, or a rejection if their ``noise`` (pixels) is what chance would give.
 
     Points spread evenly over a disc of radius ``threshold`` (pixels) have a standard deviation of half that radius along each
-    axis. Where the flow has gone astray over a long interval, the landmarks agree no better than that.
+    axis. If the flow has failed over a long interval, the landmarks fit no better than that.
     """
     if not verdict.accepted or noise <= threshold / 2:
         return verdict
@@ -294,12 +294,12 @@ def not_by_chance(verdict: Verdict, noise: float, threshold: float) -> Verdict:
 
 
 def unconfirmed(verdict: Verdict) -> Verdict:
-    """Reject a pose by few followed landmarks where none are recognised around it: it may have drifted away."""
+    """Reject a pose by few tracked landmarks if none are recognised around it, since it may have drifted."""
     if not verdict.accepted:
         return verdict
     return Verdict(
         Outcome.TOO_FEW_MATCHES,
-        f"{verdict.reason}, but the image does not confirm these few that were followed",
+        f"{verdict.reason}, but the image does not confirm these few tracked ones",
     )
 
 
@@ -324,25 +324,23 @@ def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float
 def as_certain_as_usual(verdict: Verdict, covariance: Float[Tensor, "6 6"], typical: float) -> Verdict:
     """Return the verdict, or a rejection if the position is far less certain than those of the map's own images.
 
-    ``typical`` is their median error, metres; 0 where it is not known. Frames without colours are judged by it: along a
-    corridor, nothing in them shows the position, which is then predicted rather than measured.
+    ``typical`` is their median error (metres); 0 if unknown. It applies to frames without colours: along a corridor, the
+    position is not observable, and is then predicted instead of measured.
     """
     deviation = position_deviation(covariance)
     if not verdict.accepted or typical <= 0 or deviation <= TYPICAL_ERRORS * typical:
         return verdict
-    why = f"but the position is uncertain by {deviation:.3g} m, that of images by {typical:.3g} m"
+    why = f"but the position is uncertain by {deviation:.3g} m, against {typical:.3g} m for images"
     return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, {why}")
 
 
 def shape_verdict(
     verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float, typical: float, stamped: bool
 ) -> Verdict:
-    """Judge a pose by depth without colours, which relies on the motion before it as well.
+    """Return the verdict on a pose by depth without colours, which also relies on the motion before it.
 
-    Without a time stamp, nothing determines how far the camera has moved in the directions that the shape leaves open.
+    Without a time stamp, the motion along directions that the shape does not determine is unknown.
     """
     if verdict.accepted and not stamped:
-        return Verdict(
-            Outcome.IMPRECISE, f"{verdict.reason}, but without a time stamp the motion is not known"
-        )
+        return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, but without a time stamp the motion is unknown")
     return as_certain_as_usual(precise_enough(verdict, covariance, distance), covariance, typical)

@@ -1,8 +1,8 @@
-"""The motion of a camera: its pose, its velocity, and how uncertain both are.
+"""The motion of a camera: its pose and velocity, with their uncertainties.
 
-An error-state Kalman filter on SE(3) with right errors (Sola et al. 2018) and a white-noise acceleration. Two kinds of error
-are kept apart, as a Schmidt-Kalman filter does: noise, which is independent from frame to frame and averages out, and the
-bias of the map and the camera, which consecutive frames share and which therefore does not shrink however many are fused.
+An error-state Kalman filter on SE(3) with right errors (Sola et al. 2018) and white-noise acceleration. As in a Schmidt-Kalman
+filter, two kinds of error are kept separate: noise, which is independent between frames and averages out, and the bias of the
+map and the camera, which consecutive frames share, so that fusion does not reduce it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Clock:
     stamped: bool = True  # whether the last frame had a time stamp
 
     def step(self, time: Any) -> tuple[Clock, float]:
-        """Return the clock at the next frame, and the seconds since the last one: negative if it came out of order.
+        """Return the clock at the next frame and the seconds since the last one, negative if it is out of order.
 
         ``time`` is in seconds, or None. Raises ``InputError`` for anything else, and for a time that is not finite.
         """
@@ -49,25 +49,25 @@ class Clock:
 
 
 SPEED, TURN_RATE = 1.0, 1.0
-"""Standard deviations of an unknown velocity, per second: reaches (distances to what the camera sees), and radians."""
+"""Standard deviations of an unknown velocity, per second: reaches (distances to the visible scene), and radians."""
 ACCELERATION, TURN_ACCELERATION = 2.0, 4.0
-"""Standard deviations of the acceleration, per second squared: reaches, and radians. They are those of a hand-held camera that
-is moved briskly.
+"""Standard deviations of the acceleration, per second squared: reaches, and radians. They suit a hand-held camera that is moved
+briskly.
 """
 LONGEST_GAP = 0.6
-"""Seconds without a frame after which the velocity is no longer used."""
+"""Interval without frames, in seconds, after which the velocity is no longer used."""
 UNFORESEEN = 60.0
-"""Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is dropped."""
+"""Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is discarded."""
 ADAPTED, LEAST_AGILITY, MOST_SURPRISE = 0.4, 0.1, 9.0
-"""Share of the squared agility that each measured pose renews, its lower limit, and the largest ratio of a squared innovation
-to the expected one that counts.
+"""Fraction of the squared agility that each measured pose updates, the agility's lower limit, and the upper limit of the ratio of
+a squared innovation to its expected value.
 """
 KNOWN = 0.5
-"""Variance of a velocity, as a share of that of an unknown one, up to which predictions show how briskly a camera moves."""
+"""Variance of a velocity, relative to that of an unknown one, below which innovations update the agility."""
 UNSTAMPED = 0.5
-"""Standard deviation, as a share, of an interval between frames that is not recorded: frames may be left out."""
+"""Relative standard deviation of an interval between frames without time stamps, as frames may be missing."""
 LEAST_SECONDS = 1e-3
-"""Least time between two frames for which noise of the motion is added; frames may be repeated or lack distinct times."""
+"""Minimum interval for which process noise is added, in seconds; frames may be repeated or lack distinct times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +90,10 @@ class Motion:
     T_world_camera: SE3
     velocity: Float[Tensor, "6"]  # right update of the pose (metres, radians) per second
     noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
-    bias: Float[Tensor, "6 6"]  # covariance of the pose's error that frames share
-    reach: float  # metres: distance to what the camera sees, which scales translations
+    bias: Float[Tensor, "6 6"]  # covariance of the pose error shared by frames
+    reach: float  # metres: distance to the visible scene, which scales translations
     agility: float = (
-        1.0  # factor on the acceleration: how briskly the camera has changed its velocity of late
+        1.0  # factor on the acceleration: how briskly the camera has recently changed its velocity
     )
 
     @staticmethod
@@ -110,10 +110,10 @@ class Motion:
         return self.noise[:6, :6] + self.bias
 
     def predicted(self, seconds: float, stamped: bool = True) -> Motion:
-        """Return the state ``seconds`` later, or earlier where they are negative.
+        """Return the state ``seconds`` later, or earlier if negative.
 
-        After a gap, the pose stays where it was and its uncertainty grows with the speed that a camera may have. Without a
-        time stamp the interval is an assumption, and the distance covered in it is uncertain in the same proportion.
+        After a gap, the pose is unchanged, and its uncertainty grows with a camera's possible speed. Without a time stamp, the
+        interval is an assumption, and the distance covered in it is uncertain in proportion.
         """
         motion = self.at_rest() if abs(seconds) > LONGEST_GAP else self
         step = motion.velocity * seconds
@@ -135,7 +135,7 @@ class Motion:
     def corrected(self, measured: PoseEstimate) -> Motion:
         """Return the state after fusing it with a measured pose.
 
-        The bias of the measurement and that of the state are taken as fully correlated, so that fusing does not reduce it.
+        The biases of the measurement and the state are assumed to be fully correlated, so fusion does not reduce them.
         """
         off = update_between(self.T_world_camera, measured.T_world_camera)
         innovation = self.noise[:6, :6] + measured.noise
@@ -155,7 +155,7 @@ class Motion:
         )
 
     def refined(self, fused: PoseEstimate) -> Motion:
-        """Return the state with the pose ``fused``, in which a measurement is already included; the velocity follows it."""
+        """Return the state with the pose ``fused``, which already includes a measurement, and the velocity updated accordingly."""
         gain = torch.linalg.solve(self.noise[:6, :6], self.noise[:6]).T
         delta = gain @ update_between(self.T_world_camera, fused.T_world_camera)
         noise = self.noise + gain @ (fused.noise - self.noise[:6, :6]) @ gain.T
@@ -169,7 +169,7 @@ class Motion:
         )
 
     def updated(self, measured: PoseEstimate) -> Motion:
-        """Return the state after fusing it with a measured pose, or at that pose alone if no prediction could foresee it."""
+        """Return the state after fusing it with a measured pose, or reset to that pose if the prediction is incompatible."""
         off = update_between(self.T_world_camera, measured.T_world_camera)
         spread = self.noise[:6, :6] + measured.noise
         if float(off @ torch.linalg.solve(spread, off)) > UNFORESEEN:
@@ -177,10 +177,10 @@ class Motion:
         return replace(self.corrected(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
 
     def _observed_agility(self, off: Float[Tensor, "3"], spread: Float[Tensor, "3 3"]) -> float:
-        """Return the agility after a position that was ``off`` the prediction, of covariance ``spread`` (Mehra 1970).
+        """Return the agility after a position innovation ``off`` with covariance ``spread`` (Mehra 1970).
 
-        While the velocity is not known yet, the agility is unchanged. Turns are left out: they change more abruptly than the
-        motion of somebody walking, and what is measured determines them well.
+        While the velocity is still unknown, the agility is unchanged. Rotations are ignored: they change more abruptly than the
+        translation of a walking person, and measurements determine them well.
         """
         velocity = float(self.noise.diagonal()[6:9].mean()) / (self.reach * SPEED) ** 2
         if velocity > KNOWN:
@@ -213,7 +213,7 @@ class Motion:
 
 
 def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float) -> float:
-    """Return the standard deviation (pixels) of where a point at ``distance`` (metres) appears for an uncertain pose."""
+    """Return the standard deviation (pixels) of the projection of a point at ``distance`` (metres) for an uncertain pose."""
     translation, rotation = covariance.diagonal().split(3)
     return focal * math.sqrt(float(translation.mean()) / distance**2 + float(rotation.mean()))
 

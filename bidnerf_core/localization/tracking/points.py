@@ -1,4 +1,4 @@
-"""Points of the world that are followed from image to image, and the pose that they determine."""
+"""World points tracked from image to image, and the pose that they determine."""
 
 from __future__ import annotations
 
@@ -31,28 +31,28 @@ from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 LEAST_FOLLOWED = 6
-"""Least number of points from which a pose is estimated."""
+"""Minimum number of points from which a pose is estimated."""
 INLIER = 3.0
-"""Largest reprojection error of an inlier, in standard deviations along both axes together."""
+"""Maximum reprojection error (norm) of an inlier, in standard deviations."""
 MAJORITY = 0.7
-"""Share of inliers below which the robust fit is not relied upon, and a sample consensus is tried."""
+"""Inlier fraction below which the robust fit is not trusted, and sample consensus is tried."""
 TRACKED_STEPS = 1
-"""Steps of the fits that judge a motion in a tracked frame: they start so close by that linear algebra does the rest."""
+"""Steps of the fits for the posterior of a motion in a tracked frame: the start is so close that linear algebra does the rest."""
 CAMERAS = camera_hypotheses([])
-"""Hypotheses about the camera of an image; ``CAMERAS[:1]`` is that its intrinsics are right."""
+"""Hypotheses about the camera of an image; ``CAMERAS[:1]`` is the one that its intrinsics are right."""
 FRESH = -1
 """Landmark number of points that are not landmarks."""
 
 
 @dataclass(frozen=True, eq=False)
 class FollowedPoints:
-    """Points in an image, and where they are in the world; all tensors are on the CPU."""
+    """Points in an image and their positions in the world; all tensors are on the CPU."""
 
     pixels: Float[Tensor, "m 2"]  # (u, v) in the last image
     positions: Float[Tensor, "m 3"]  # metres, world; float64
     deviations: Float[Tensor, "m 2"]  # metres, across and along ``directions``; float64
     directions: Float[Tensor, "m 3"]  # unit, world; float64
-    landmark: Int[Tensor, "m"]  # its number in the map; FRESH for points that were measured in an image
+    landmark: Int[Tensor, "m"]  # its number in the map; FRESH for points measured in an image
 
     @staticmethod
     def none() -> FollowedPoints:
@@ -78,12 +78,12 @@ class FollowedPoints:
         return FollowedPoints(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def projected(self, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "m 2"]:
-        """Return where the points appear from a pose; their present pixels where they would lie behind the camera."""
+        """Return the points' projections at a pose; the current pixels of those that would be behind the camera."""
         pixels = camera.project(T_world_camera.inverse().apply(self.positions)).float()
         return torch.where(pixels.isfinite().all(-1, keepdim=True), pixels, self.pixels)
 
     def observed(self, frame: Frame) -> ObservedPoints:
-        """Return the points as the input of a pose solver, seen in ``frame``."""
+        """Return the points and their observations in ``frame`` as input for a pose solver."""
         camera, count = frame.intrinsics, len(self)
         return ObservedPoints(
             self.positions,
@@ -101,12 +101,12 @@ class FollowedPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointFit:
-    """The pose that points determine, and which of them agree with it."""
+    """The pose that points determine, and its inliers."""
 
     fit: ReprojectionFit
     data: ObservedPoints
     inliers: Bool[Tensor, "m"]
-    judged: Posterior | None = None  # what explains the image, with the given intrinsics as the best
+    judged: Posterior | None = None  # over cameras and motions, with the given intrinsics as the best
 
     @property
     def T_world_camera(self) -> SE3:
@@ -114,17 +114,17 @@ class PointFit:
 
     @property
     def moves(self) -> bool:
-        """Whether the camera moved while its rows were exposed, as the fit has it."""
+        """Whether the fit includes a motion of the camera during the readout."""
         return bool(self.fit.motion.any())
 
     @property
     def still_data(self) -> ObservedPoints:
-        """The points as a camera at rest at the pose would have observed them."""
+        """The points displaced so that a static camera at the pose observes them where the moving one did."""
         return self.data.without_motion(self.fit.T_world_rig, self.fit.motion)
 
     @property
     def doubt_of_motion(self) -> Float[Tensor, "6 6"]:
-        """What the doubt about a motion between rows adds to the covariance of the pose."""
+        """Additional covariance of the pose due to uncertainty about a motion during the readout."""
         return torch.zeros_like(self.fit.covariance) if self.judged is None else self.judged.doubt_of_motion
 
     @property
@@ -132,7 +132,7 @@ class PointFit:
         return float(self.inliers.float().mean()) if len(self.inliers) else 0.0
 
     def within(self, threshold: float) -> int:
-        """Return how many points have a reprojection error of at most ``threshold`` pixels."""
+        """Return the number of points with a reprojection error of at most ``threshold`` pixels."""
         off = torch.linalg.vector_norm(self.still_data.residuals(self.T_world_camera), dim=-1)
         return int((off <= threshold).sum())
 
@@ -145,11 +145,11 @@ def fit_pose(
     correlation: float = 1.0,
     moves: bool = False,
 ) -> PointFit | None:
-    """Return the pose that the points in one camera determine, from a start; None if they are too few.
+    """Estimate the pose of one camera from points and a start; None if there are too few points.
 
-    ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. Where
-    most points do not agree with the robust fit, a consensus of samples within ``threshold`` pixels replaces the start. ``moves``:
-    whether the camera is taken to have moved while its rows were exposed, until ``with_motion`` judges that.
+    ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. If the
+    robust fit has too few inliers, sample consensus within ``threshold`` pixels gives another start. ``moves`` is whether a motion
+    during the readout is assumed until ``with_motion`` decides on it.
     """
     if len(data) < LEAST_FOLLOWED:
         return None
@@ -168,9 +168,9 @@ def fit_pose(
 
 
 def with_motion(found: PointFit, landmarks: LandmarkMap, which: Sequence[Hypothesis] = CAMERAS) -> PointFit:
-    """Return a fit with the more probable of a motion while the rows were exposed and none, and with what is left of doubt.
+    """Return a fit with a motion during the readout if that is more probable, and with the remaining uncertainty about it.
 
-    ``which``: the hypotheses about the camera that are judged along with the motion.
+    ``which`` are the hypotheses about the camera that are compared along with the motion.
     """
     inliers = found.data[found.inliers]
     if not len(inliers):
@@ -196,7 +196,7 @@ def _inliers(data: ObservedPoints, fit: ReprojectionFit) -> Bool[Tensor, "m"]:
 
 
 def _nearby(data: ObservedPoints, start: SE3, threshold: float) -> SE3:
-    """Return the pose of least robust reprojection error, without its covariance: a start that costs next to nothing."""
+    """Return the pose with the smallest robust reprojection error, without covariance, as a cheap start."""
     focal = float(data.focal[0])
     inverse = start.inverse()
     pose = poselib.CameraPose()

@@ -1,6 +1,6 @@
-"""Points to follow: landmarks that are recognised around a predicted pose, and corners whose depth was measured.
+"""Points to track: landmarks recognised around a predicted pose, and corners with measured depth.
 
-Landmarks tell where the camera is in the map; corners, the motion between consecutive frames with depth (odometry).
+Landmarks give the camera's pose in the map; corners give the motion between consecutive frames with depth (odometry).
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 NEARBY = EXHAUSTIVE
-"""Largest number of landmarks that are compared with an image: those seen in the most images of the map."""
+"""Maximum number of landmarks that are compared with an image: those seen in the most images of the map."""
 WIDE = 2.0
 """Multiple of the radius of guided matching above which keypoints are compared with all landmarks in view. Guided matching
-compares a keypoint with the few landmarks that project nearest to it, which suits predictions that are off by little.
+compares a keypoint with the few landmarks that project nearest to it, which suits accurate predictions.
 """
 LEAST_CHANCE = 0.5
-"""Least number of matches by chance that is assumed, since it is estimated from few counts."""
+"""Lower limit of the number of matches by chance, since it is estimated from few counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """How well a pose by landmarks is supported; see ``LandmarkPose``."""
+    """The evidence for a pose by landmarks; see ``LandmarkPose``."""
 
     matches: int
     agreeing: int
@@ -65,12 +65,12 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Recognized:
-    """Landmarks that were found in an image by their descriptors, and the pose that they determine."""
+    """Landmarks found in an image by their descriptors, and the pose that they determine."""
 
     points: FollowedPoints
     found: PointFit
     evidence: Evidence
-    usual_distance: float  # largest squared descriptor distance at which a match was allowed
+    usual_distance: float  # maximum squared descriptor distance of a match
     doubt: CameraDoubt  # about the intrinsics
 
 
@@ -92,8 +92,8 @@ class LandmarkDetector:
     ) -> Recognized | None:
         """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
 
-        ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
-        of keypoints (pixels), ``moves`` a guess as for ``fit_pose``. Returns None if too few keypoints match.
+        ``most_distance`` is the maximum squared descriptor distance of a match, ``noise`` a first guess at that of keypoints
+        (pixels), ``moves`` a guess as for ``fit_pose``. Returns None if too few keypoints match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
         image = query_image(frame, SE3.identity(), self.features)
@@ -154,7 +154,7 @@ class LandmarkDetector:
 
 
 def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most: float) -> Evidence:
-    """Compare the number of matches with that around shifted projections, where all of them are due to chance."""
+    """Return the evidence from comparing the number of matches with that around shifted projections, which is due to chance."""
     agreeing, keypoints = int(found.inliers.sum()), len(query.images[0].keypoints)
     projections = projected_landmarks(query.images, query.landmarks, found.T_world_camera, GIVEN, radius)
     chance = matches_by_chance(projections, radius, most)
@@ -164,9 +164,9 @@ def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most:
 
 
 def flow_evidence(found: PointFit, camera: Intrinsics) -> Evidence:
-    """Return the evidence of landmarks that the optical flow has carried over from an earlier image.
+    """Return the evidence of landmarks tracked by optical flow from an earlier image.
 
-    Each is one match, which would fall anywhere in the image if the flow were wrong.
+    Each is one match, which would be anywhere in the image if the flow were wrong.
     """
     threshold, count = pixel_threshold(camera), len(found.inliers)
     agreeing = found.within(threshold)
@@ -182,7 +182,7 @@ def landmark_pose(
     doubt: CameraDoubt,
     camera: Intrinsics,
 ) -> LandmarkPose:
-    """Return a pose by landmarks in the form that ``landmark_verdict`` judges."""
+    """Return a pose by landmarks in the form that ``landmark_verdict`` needs."""
     fit, data, every = found.fit, found.still_data, torch.arange(len(points))
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
@@ -215,7 +215,7 @@ def landmark_pose(
 
 
 def well_spread(pixels: Float[Tensor, "m 2"], camera: Intrinsics, most: int) -> Int[Tensor, "k"]:
-    """Return up to ``most`` indices, from all cells of a grid over the image in turn; ``pixels`` must be sorted best first."""
+    """Return up to ``most`` indices, taken in turn from the cells of a grid over the image; ``pixels`` are sorted best first."""
     if len(pixels) <= most:
         return torch.arange(len(pixels))
     cell = cell_numbers(pixels, camera)
@@ -236,18 +236,18 @@ def _matches_within(query: LandmarkQuery, T_world_camera: SE3, radius: float) ->
 
 
 LEAST_CORNERS = 20
-"""Least number of corners that must agree with a motion."""
+"""Minimum number of inlier corners of a motion."""
 LEAST_SHARE = 0.5
-"""Least share of the corners that must agree with it."""
+"""Minimum inlier fraction of the corners."""
 SIGNIFICANT_NFA = -6.0
-"""Largest logarithm of the number of such agreements expected by chance."""
+"""Maximum log10 of the number of false alarms."""
 REPLENISHED = 0.5
-"""Share of ``count`` below which new corners are detected."""
+"""Fraction of ``count`` below which new corners are detected."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Follows up to ``count`` corners whose depth was measured, with errors of this ``noise``."""
+    """Tracks up to ``count`` corners with measured depth of the given ``noise``."""
 
     count: int
     noise: DepthNoise = UNKNOWN.noise
@@ -255,9 +255,9 @@ class Odometry:
     def moved(
         self, frame: Frame, points: FollowedPoints, motion: Motion, start: SE3, seconds: float
     ) -> tuple[Motion, FollowedPoints] | None:
-        """Return the state ``seconds`` after ``motion`` and the corners that agree with it; None if they are too few.
+        """Return the state ``seconds`` after ``motion`` and its inlier corners; None if there are too few.
 
-        ``start`` is the predicted pose, at which the fit begins.
+        ``start`` is the predicted pose, from which the fit starts.
         """
         threshold = pixel_threshold(frame.intrinsics)
         found = fit_pose(points.observed(frame), start, threshold / 2, threshold, CORNERS_PER_INDEPENDENT)
@@ -277,7 +277,7 @@ class Odometry:
     def replenished(
         self, frame: Frame, image: Grey | None, points: FollowedPoints, T_world_camera: SE3
     ) -> FollowedPoints:
-        """Return the corners among ``points``, or new ones at the pose of this frame where they have become few."""
+        """Return the corners among ``points``, or new ones at the pose of this frame if they have become few."""
         points = points[points.landmark == FRESH]
         if image is None or not frame.has_depth or len(points) >= REPLENISHED * self.count:
             return points

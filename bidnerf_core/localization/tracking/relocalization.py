@@ -1,4 +1,4 @@
-"""Finding the pose of a frame anew, with as little work as a lost tracker can afford."""
+"""Relocalization of a lost tracker, within a limited time per frame."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from bidnerf_core.localization.risk import within_risk
 from bidnerf_core.localization.settings import LEAST_POINTS
 
 FIRST_FULL_SEARCH = 4
-"""The number of lost frames after which the whole surface is searched; then again whenever that number has doubled."""
+"""The number of lost frames after which the whole surface is searched, and again each time that number has doubled."""
 LONG_WAIT = 0.25
-"""Seconds without a search after which every frame is searched: such frames come slowly enough."""
+"""Interval without a search, in seconds, after which every frame is searched, as such frames arrive slowly enough."""
 
 
 def search_due(localizer: Localizer, frame: Frame, lost: int, patience: int, waited: float = 0.0) -> bool:
-    """Return whether to search for the pose of a frame, or to skip the frame to save time.
+    """Return whether to search for the pose of a frame instead of skipping it to save time.
 
-    In maps with landmarks, the first ``patience`` frames after a loss are searched and then every second, or every frame
-    where ``waited``, the time (seconds) without a search, is long. ``lost`` is as for ``relocalized``.
+    In maps with landmarks, the first ``patience`` frames after a loss are searched, then every second one, or every one if
+    ``waited``, the time (seconds) without a search, is long. ``lost`` is as for ``relocalized``.
     """
     if not is_searchable(frame):
         return False
@@ -41,11 +41,11 @@ def search_due(localizer: Localizer, frame: Frame, lost: int, patience: int, wai
 def relocalized(
     localizer: Localizer, frame: Frame, predicted: SE3 | None, lost: int, seed: int
 ) -> Localization | None:
-    """Return the result of a search for the pose, or None; meant for frames for which ``search_due`` holds.
+    """Search for the pose of a frame for which ``search_due`` holds; None if none was found.
 
-    Where the map has landmarks, they are sought first. The search of the whole surface, which takes longer, comes at growing
-    intervals; it is the only one in maps without landmarks. ``lost`` is the number of frames since the last accepted pose
-    that could be searched, 0 at the beginning of a sequence.
+    If the map has landmarks, they are matched first. The search of the whole surface, which takes longer, runs at increasing
+    intervals; it is the only one in maps without landmarks. ``lost`` is the number of searchable frames since the last accepted
+    pose, 0 at the beginning of a sequence.
     """
     if localizer.matches_landmarks:
         problem = localizer.problem(frame)
@@ -59,13 +59,13 @@ def relocalized(
     try:
         return localizer(frame, predicted, seed=seed)
     except InputError:
-        if lost:  # the sequence has begun, so this frame is to blame and not the map or the settings
+        if lost:  # the sequence has begun, so the frame is at fault, not the map or the settings
             return None
         raise
 
 
 def _recognised(problem: Problem, near: SE3 | None, rays: int, seed: int) -> Localization | None:
-    """Return the pose by landmarks, with renderings only where other explanations are open; of two rivals, the one at ``near``."""
+    """Return the pose by landmarks, with renderings only if alternatives are undecided, and preferring rivals close to ``near``."""
     assert problem.matcher is not None
     began = time.perf_counter()
     answer = answer_by_landmarks(replace(problem, start=near), problem.matcher, rays, seed, fused=False)
@@ -73,7 +73,7 @@ def _recognised(problem: Problem, near: SE3 | None, rays: int, seed: int) -> Loc
 
 
 def typical_error(localizer: Localizer) -> float:
-    """Return the median error (metres) of the positions of the map's own images, 0 where it is not known."""
+    """Return the median position error (metres) of the map's own images; 0 if unknown."""
     return 0.0 if localizer.matcher is None else localizer.matcher.landmarks.trial.translation
 
 
@@ -86,7 +86,7 @@ def scene_extent(scene: SceneMap) -> float:
 
 
 def is_searchable(frame: Frame) -> bool:
-    """Return whether the frame shows anything that can be recognised."""
+    """Return whether the frame shows anything recognisable."""
     return has_points(frame) or not is_blank(frame)
 
 
@@ -96,7 +96,7 @@ def has_points(frame: Frame) -> bool:
 
 
 def _searched(localizer: Localizer, frame: Frame, lost: int) -> bool:
-    """Return whether the surface is searched for a frame in which too few landmarks were recognised."""
+    """Return whether the surface is searched for a frame with too few recognised landmarks."""
     assert localizer.matcher is not None
     few = len(localizer.matcher.landmarks) < MANY_LANDMARKS  # else such an answer is not accepted
     return (lost == 0 or _due(lost, FIRST_FULL_SEARCH)) and (

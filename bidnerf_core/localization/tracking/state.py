@@ -1,4 +1,4 @@
-"""What a tracker carries from frame to frame, the file that it can be kept in, and the answers that it gives."""
+"""The state that a tracker keeps between frames, its file, and the tracker's answers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from bidnerf_core.mapping.tensors import Kinds, check_kinds, check_range
 
 @dataclass(frozen=True)
 class CorrectedCamera:
-    """The intrinsics that a frame states, and the better ones that were found for it."""
+    """The stated intrinsics of a frame, and the better ones found for it."""
 
     given: Intrinsics
     found: Intrinsics
@@ -39,11 +39,11 @@ class CorrectedCamera:
     approximate: bool
 
     def applies_to(self, frame: Frame) -> bool:
-        """Return whether the intrinsics of a frame come from the same source."""
+        """Return whether the intrinsics of a frame are from the same source."""
         return frame.focal_is_approximate == self.approximate
 
     def focal_factor(self, frame: Frame) -> float:
-        """Return the ratio of a frame's corrected to its given focal length: the geometric mean across and down."""
+        """Return the ratio of a frame's corrected to its given focal length (geometric mean of both axes)."""
         if not self.applies_to(frame):
             return 1.0
         return math.sqrt(self.found.fx * self.found.fy / (self.given.fx * self.given.fy))
@@ -53,13 +53,13 @@ class CorrectedCamera:
         return replace(frame, intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
 
     def stated_in(self, answer: Localization, frame: Frame) -> Localization:
-        """Return the answer for a frame, completed by the intrinsics that replace the frame's own, if any do."""
+        """Return the answer for a frame with the intrinsics that replace the frame's own, if any."""
         taken = self.corrected(frame).intrinsics
         corrected = None if taken == frame.intrinsics else taken
         return replace(answer, focal_factor=self.focal_factor(frame), intrinsics=corrected)
 
     def changed(self, camera: Intrinsics) -> Intrinsics:
-        """Return corrected intrinsics; those of another focus or size are changed in the same proportion."""
+        """Return corrected intrinsics; those with another focal length or size are changed in proportion."""
         given, found = self.given, self.found
         if camera == given:
             return found
@@ -78,7 +78,7 @@ class CorrectedCamera:
 def after_search(
     frame: Frame, found: Intrinsics, before: CorrectedCamera | None
 ) -> tuple[Frame, CorrectedCamera]:
-    """Return a frame with the intrinsics that a search found for it, and the correction for later frames.
+    """Return a frame with the intrinsics found for it by a search, and the correction for later frames.
 
     ``before`` is the correction that was already applied to the frame, if any.
     """
@@ -106,23 +106,23 @@ MOTION_KINDS: Kinds = {
 
 @dataclass(frozen=True, eq=False)
 class TrackerState:
-    """All that a tracker carries from one frame to the next."""
+    """The complete state of a tracker between frames."""
 
     clock: Clock
     motion: Motion | None = None  # None before the first pose was found
-    frames: int = 0  # number of frames that the tracker has been called with
+    frames: int = 0  # number of frames so far
     lost: int = 0  # consecutive frames without an accepted pose, up to the last one
-    searchable: int = 0  # of these, the frames that could be searched
+    searchable: int = 0  # of these, the searchable frames
     waited: float = 0.0  # seconds since the loss, or since the last search of an image
     points: FollowedPoints = field(default_factory=FollowedPoints.none)
-    image: Grey | None = None  # the last one, in which the points were seen
-    sought: int = 0  # number of points when they were last sought
+    image: Grey | None = None  # the last one, in which the points were observed
+    sought: int = 0  # number of points when they were last detected
     age: int = 0  # frames since then
-    usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
+    usual_distance: float = float("inf")  # maximum squared descriptor distance of a match
     doubt: CameraDoubt = field(default_factory=CameraDoubt)  # about the intrinsics
-    camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are taken
+    camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are used
     noise: float = 1.0  # pixels: of the points in the last image
-    moves: bool = False  # whether the camera moved while the rows of the last image were exposed
+    moves: bool = False  # whether the camera moved during the readout of the last image
 
     @property
     def tracking(self) -> bool:
@@ -132,7 +132,7 @@ class TrackerState:
 
 @dataclass(frozen=True)
 class StoredNumbers:
-    """The numbers of a state, as its file holds them; names as in ``TrackerState`` and ``Motion``."""
+    """The numbers of a state as stored in its file, with the names of ``TrackerState`` and ``Motion``."""
 
     clock: Clock
     camera: CorrectedCamera | None
@@ -144,8 +144,8 @@ class StoredNumbers:
     age: int
     noise: float
     moves: bool
-    usual_distance: float | None  # None for infinity, which JSON does not have
-    reach: float | None  # None where there is no motion
+    usual_distance: float | None  # None for infinity, which JSON cannot represent
+    reach: float | None  # None if there is no motion
     agility: float | None
 
     def __post_init__(self) -> None:
@@ -153,11 +153,11 @@ class StoredNumbers:
             if getattr(self, name) < 0:
                 raise InputError(f"{name} is {getattr(self, name)}, expected 0 or more")
         if self.clock.interval <= 0 or self.noise <= 0:
-            raise InputError("an interval or a noise of 0 or less, expected positive numbers")
+            raise InputError("the interval or the noise is 0 or less, expected positive numbers")
         if (self.reach is None) != (self.agility is None):
-            raise InputError("half of a motion, expected both reach and agility, or neither")
+            raise InputError("only one of reach and agility is given, expected both or neither")
         if self.reach is not None and not 0 < self.reach <= LARGEST_LENGTH:
-            raise InputError(f"reach is {self.reach}, expected a distance")
+            raise InputError(f"reach is {self.reach}, expected a positive distance")
 
     @staticmethod
     def of(state: TrackerState) -> StoredNumbers:
@@ -184,7 +184,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
 
 
 def load_tracker_state(path: Path, key: str) -> TrackerState:
-    """Read a state. Raises ``InputError`` for another file, another version, and another map than ``key``."""
+    """Read a state. Raises ``InputError`` for any other file, another version, or a map other than ``key``."""
     numbers, tensors = _read(path, key)
     try:
         return _state(numbers, tensors)
@@ -193,7 +193,7 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
 
 
 def _read(path: Path, key: str) -> tuple[StoredNumbers, dict[str, Tensor]]:
-    expected = "a file that Tracker.save wrote"
+    expected = "a file written by Tracker.save"
     tensors, metadata = read_tensors_and_metadata(path, expected)
     found = parse_json(metadata.get("bidnerf", "null"), str(path), expected)
     if not isinstance(found, dict) or found.get("format") != STATE_FORMAT:
@@ -225,11 +225,11 @@ def _state(numbers: StoredNumbers, tensors: dict[str, Tensor]) -> TrackerState:
 
 
 def _check_tensors(tensors: dict[str, Tensor], moving: bool) -> None:
-    """Raise ``KeyError`` or ``ValueError`` for tensors that no state has; ``moving``: whether there is a motion."""
+    """Raise ``KeyError`` or ``ValueError`` for tensors of no valid state; ``moving`` is whether there is a motion."""
     check_kinds(tensors, KINDS | (MOTION_KINDS if moving else {}))
     if len({len(tensors[f"points.{f.name}"]) for f in fields(FollowedPoints)}) > 1:
         raise ValueError(
-            "expected equally many pixels, positions, deviations, directions and landmarks of points"
+            "expected equal numbers of pixels, positions, deviations, directions and landmarks of points"
         )
     check_range(tensors, "points.positions", -LARGEST_LENGTH, LARGEST_LENGTH)
     check_range(tensors, "points.deviations", 0.0, LARGEST_LENGTH)
@@ -258,22 +258,22 @@ def _doubt(tensors: dict[str, Tensor]) -> CameraDoubt:
 
 
 def _tensors_of(name: str, record: Any) -> dict[str, Tensor]:
-    """Return the tensors among a record's fields, under names that begin with ``name``."""
+    """Return the tensors among a record's fields, under names prefixed with ``name``."""
     values = {f"{name}.{f.name}": getattr(record, f.name) for f in fields(record)}
     return {key: value for key, value in values.items() if isinstance(value, Tensor)}
 
 
 def _record(kind: type[R], name: str, tensors: dict[str, Tensor]) -> R:
-    """Return a record all of whose fields are tensors, from those that ``_tensors_of`` returns."""
+    """Return a record that consists of tensors, from those that ``_tensors_of`` returned."""
     return kind(**{f.name: tensors[f"{name}.{f.name}"] for f in fields(cast(Any, kind))})
 
 
 METHOD = "track"
-"""Method name of the poses that a tracker finds."""
+"""Method name of a tracker's poses."""
 
 
 def tracked_localization(motion: Motion, verdict: Verdict, predicted: Motion, loss: float) -> Localization:
-    """Return the state of the motion as the answer for a frame; its path leads from the prediction to the pose."""
+    """Convert the state of the motion to the answer for a frame; its path leads from the prediction to the pose."""
     T = motion.T_world_camera
     return Localization(
         T_world_camera=T,
@@ -290,7 +290,7 @@ def tracked_localization(motion: Motion, verdict: Verdict, predicted: Motion, lo
 
 
 def unknown(start: SE3 | None, extent: float) -> Localization:
-    """Return the answer for a frame when neither its pose nor that of any frame before it is known.
+    """Return the answer for a frame if neither its pose nor any earlier one is known.
 
     ``extent`` (metres) is the size of the scene, in which the camera may be anywhere.
     """

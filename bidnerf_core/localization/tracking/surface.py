@@ -1,9 +1,9 @@
-"""Measured depth on the baked surface, from a pose that is nearly right.
+"""Alignment of measured depth with the baked surface, from a nearly correct pose.
 
-Depth without colours corrects a prediction where the shape determines it. Points slide along flat walls at no cost, and in a
-corridor the few that do not, on door frames and edges, fit wrong places about as well as the right one. A weak direction is
-therefore left to the prediction altogether (solution remapping, Zhang et al. 2016, "On degeneracy of optimization-based state
-estimation problems"); its uncertainty then stays that of the prediction.
+Depth without colours corrects a prediction along the directions that the shape determines. Points slide along flat walls at no
+cost, and in a corridor, the few others, on door frames and edges, fit wrong places about as well as the right one. The prediction
+is therefore kept along weak directions (solution remapping, Zhang et al. 2016, "On degeneracy of optimization-based state
+estimation problems"), with its uncertainty.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from bidnerf_core.localization.tracking.motion import PoseEstimate
 from bidnerf_core.mapping import SurfaceMap
 
 SURFACE_BIAS = 0.5
-"""Share of the variance of a pose by depth that consecutive frames share."""
+"""Fraction of the variance of a pose by depth that is common to consecutive frames."""
 DRAWN = 4
-"""Number of pixels that are drawn for each measured point that is wanted."""
+"""Number of pixels drawn per requested measured point."""
 ALIGNMENT_STEPS = 8
-"""Largest number of steps of an alignment without landmarks, at each of its scales."""
+"""Maximum number of steps of an alignment without landmarks, at each scale."""
 ALIGNED_STEP = 1e-4
-"""Length of a step (metres and radians) below which an alignment ends."""
+"""Length of a step (metres, radians) below which an alignment ends."""
 
 
 def measured_cloud(
@@ -57,9 +57,9 @@ def measured_cloud(
 ) -> PointCloud:
     """Return up to ``count`` of a frame's measured points in the camera's frame; depth is multiplied by ``scale``.
 
-    ``motion`` is that of the camera while its rows were exposed, where it is known.
-    Pixels are drawn without scanning the whole image, which would take longer than processing the few that are drawn; a pixel
-    may be drawn twice. Where the depth is sparse, every measured pixel is a candidate.
+    ``motion`` is the camera's during the readout, if known. Pixels are drawn without scanning the whole image, which would take
+    longer than processing the drawn ones, so a pixel may be drawn twice. If the depth is sparse, all measured pixels are
+    candidates.
     """
     view, depth = View(frame, SE3.identity(), motion=motion), frame.depth
     assert depth is not None
@@ -79,7 +79,7 @@ def fused_with_surface(
 ) -> PoseEstimate:
     """Fuse a pose with measured points on the surface, which count as ``USUAL.tracked_points``.
 
-    A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
+    A fraction ``SURFACE_BIAS`` of the variance contributed by the points is bias, as in ``aligned``.
     """
     cost = finest_cost(surface, cloud)
     unmoved = torch.zeros(6, dtype=torch.float64)
@@ -88,7 +88,7 @@ def fused_with_surface(
 
 
 def fused_with_points(T: SE3, pose: PoseEstimate, information: Float[Tensor, "6 6"]) -> PoseEstimate:
-    """Return the estimate at ``T``, its noise and bias covariances updated with the points' ``information`` matrix."""
+    """Return the estimate at ``T``, with its noise and bias covariances updated by the points' ``information`` matrix."""
     fused = torch.linalg.inv(torch.linalg.inv(pose.covariance) + information)
     kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
     return PoseEstimate(
@@ -100,7 +100,7 @@ def fused_with_points(T: SE3, pose: PoseEstimate, information: Float[Tensor, "6 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A pose by measured points on the surface alone, with its covariance and how well the points fit."""
+    """A pose by measured points on the surface alone, with its covariance and the quality of the fit."""
 
     T_world_camera: SE3
     covariance: Float[Tensor, "6 6"]
@@ -114,9 +114,9 @@ def aligned(
     covariance: Float[Tensor, "6 6"],
     spread: float,
 ) -> Alignment:
-    """Align measured points with the surface from a predicted pose; ``spread`` (metres) is how far off they may be.
+    """Align measured points with the surface from a predicted pose; ``spread`` (metres) is their expected initial error.
 
-    Where the points do not constrain the pose, it stays at the prediction.
+    Directions that the points do not constrain stay at the prediction.
     """
     about, finest = cloud.pivot, FINEST * surface.cell
     prior, T = GaussianPrior(predicted, covariance, about), predicted
@@ -134,20 +134,20 @@ def aligned(
 
 
 WEAK = 0.1
-"""Share of the mean information of the three best directions below which a direction is left to the prediction."""
+"""Ratio to the mean information of the three best directions below which the prediction is kept along a direction."""
 SHAPE_STEPS = 8
-"""Largest number of steps at each scale."""
+"""Maximum number of steps at each scale."""
 FORESEEN = 25.0
-"""Largest squared Mahalanobis distance between a prediction and an accepted pose."""
+"""Maximum squared Mahalanobis distance between a prediction and an accepted pose."""
 JUDGED_CELLS = 4.0
-"""Largest scale of distances at which the fit is judged, in cells of the surface's grid. In a large scene, a share of its
-extent would accept points that are far off the surface.
+"""Maximum distance scale at which the fit is evaluated, in cells of the surface's grid. In a large scene, a fraction of its extent
+would accept points far off the surface.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeFit:
-    """A prediction corrected by measured points, and how well these then lie on the surface."""
+    """A prediction corrected by measured points, and how well these then fit the surface."""
 
     pose: PoseEstimate  # fused with the prediction
     diagnostics: SurfaceDiagnostics
@@ -155,12 +155,12 @@ class ShapeFit:
     determined: int  # number of directions that the shape determines, of six
 
     def verdict(self) -> Verdict:
-        """Judge the fit; whether the position is certain enough is judged separately."""
+        """Accept or reject the fit; the uncertainty of the position is checked separately."""
         rejected = self.diagnostics.rejection()
         if rejected is not None:
             return rejected
         if self.surprise > FORESEEN:
-            why = "the measured shape fits a place that the motion does not lead to"
+            why = "the measured shape fits a place that is inconsistent with the motion"
             return Verdict(Outcome.AMBIGUOUS, why)
         share = f"{self.diagnostics.on_surface:.0%} of the measured points lie on the surface"
         of = "" if self.determined == 6 else f", which determines {self.determined} of 6 directions"
@@ -168,7 +168,7 @@ class ShapeFit:
 
 
 def fit_shape(surface: SurfaceMap, cloud: PointCloud, predicted: PoseEstimate, spread: float) -> ShapeFit:
-    """Correct a predicted pose by measured points; ``spread`` (metres) is how far off they may be."""
+    """Correct a predicted pose by measured points; ``spread`` (metres) is their expected initial error."""
     T, moved = predicted.T_world_camera, torch.zeros(6, dtype=torch.float64)
     finest, information = FINEST * surface.cell, torch.zeros((6, 6), dtype=torch.float64)
     kept = information
@@ -193,21 +193,21 @@ def _descended(
     steps: int,
     whole: bool = False,
 ) -> tuple[SE3, Float[Tensor, "6"], Float[Tensor, "6 6"], Float[Tensor, "6 6"]]:
-    """Return the pose, its update of the prediction, the points' information and the projection on what they determine.
+    """Return the pose, its update of the prediction, the points' information, and the projection on the directions they determine.
 
-    ``whole``: weak directions are not left to the prediction.
+    With ``whole``, the points also update weak directions.
     """
     about = cost.cloud.pivot
     at_pivot = torch.linalg.inv(about.update_at_camera(T))
     prior = torch.linalg.inv(predicted.covariance)
     for _ in range(steps):
         here, variance = cost.with_variance(T[None])
-        # The residuals at a prediction that is off do not reflect the noise, so it is estimated anew in each step.
+        # The residuals at an inaccurate prediction do not reflect the noise, so it is re-estimated in each step.
         weight = USUAL.tracked_points / max(float(variance[0]), LEAST_VARIANCE)
         kept = torch.eye(6).double() if whole else _determined(here.hessian[0], cost.cloud)
         hessian = weight * at_pivot.T @ kept.T @ here.hessian[0] @ kept @ at_pivot
         gradient = weight * at_pivot.T @ kept.T @ here.gradient[0]
-        # The steps are short enough to be added as vectors; the prior pulls back by their sum.
+        # The steps are short enough to be added as vectors; the prior acts on their sum.
         step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
         T, moved = retracted(T, step), moved + step
         if float(torch.linalg.vector_norm(step)) < ALIGNED_STEP:
@@ -216,7 +216,7 @@ def _descended(
 
 
 def _determined(hessian: Float[Tensor, "6 6"], cloud: PointCloud) -> Float[Tensor, "6 6"]:
-    """Return the projection on the directions of an update at the cloud's middle that its points determine well."""
+    """Return the projection on the directions, of an update at the cloud's middle, that its points determine well."""
     size = float((cloud.points - cloud.middle).square().sum(-1).mean().sqrt())
     unit = torch.tensor(
         [1.0] * 3 + [1 / size] * 3, dtype=torch.float64
