@@ -111,7 +111,7 @@ def refined(
         (refined(inliers=0.93, step=0.02), Outcome.CONVERGED, "93%"),
         (refined(inliers=0.9), Outcome.RENDERING_MISMATCH, "90% of newly drawn rays agree .*, expected 93%"),
         (refined(inliers=math.nan), Outcome.RENDERING_MISMATCH, "expected 93%"),
-        (refined(step=0.03), Outcome.NOT_SETTLED, "a step of 0.03, expected 0.02 at most"),
+        (refined(step=0.03), Outcome.NOT_SETTLED, "a further step of 0.03, expected 0.02 at most"),
         (refined(step=math.nan), Outcome.NOT_SETTLED, "expected 0.02 at most"),
         (refined(covariance=math.inf), Outcome.UNDETERMINED, "do not determine the pose"),
         (refined(support=replace(SUPPORTED, plain=0.5)), Outcome.UNDETERMINED, "a single-colour image"),
