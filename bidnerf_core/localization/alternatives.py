@@ -102,7 +102,7 @@ def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed
 
 
 def _in_words(odds: float) -> str:
-    """Return what the log odds of a pose say about the other explanation."""
+    """Return a phrase for the other explanation's probability, from the log odds of the pose against it."""
     if abs(odds) < UNTOLD:
         return "nothing tells the two apart"
     if odds < -DECISIVE:

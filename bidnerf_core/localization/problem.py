@@ -194,5 +194,5 @@ def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> 
     if size < 1 or stride < 1:
         raise InputError(f"the window has size {size} and stride {stride}, expected 1 or more for both")
     if not 0 <= last < len(sequence):
-        raise InputError(f"the window ends at item {last}, expected 0 to {len(sequence) - 1}")
+        raise InputError(f"the window ends at item {last} of {len(sequence)}, which does not exist")
     return tuple(sequence[i] for i in range(last, -1, -stride)[:size][::-1])
