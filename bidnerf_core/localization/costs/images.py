@@ -1,7 +1,7 @@
 """The cost of whole small images: photos are compared with renderings of a map from many poses.
 
 Thumbnails are small, smoothed photos. Renderers quickly render the same views, without derivatives, from the baked surface or a
-field. The derivative of a rendered image by the pose follows from the image's gradient and its depth for any renderer; automatic
+field. The derivative of a rendered image with respect to the pose follows from the image's gradient and its depth for any renderer; automatic
 differentiation is not needed.
 """
 
@@ -357,7 +357,7 @@ def exposed(
 def _by_point(
     small: Thumbnail, slope: Float[Tensor, "h 3 n 2"], depth: Float[Tensor, "h n"]
 ) -> Float[Tensor, "h 3 n 3"]:
-    """Return the derivative of each pixel's colour by a displacement of the camera, in the last camera's axes, per metre.
+    """Return the derivative of each pixel's colour with respect to the camera's position, in the last camera's axes, per metre.
 
     A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
     """

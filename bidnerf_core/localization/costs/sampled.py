@@ -62,7 +62,7 @@ class SampledLoss:
 
     @property
     def is_capturable(self) -> bool:
-        """Whether all calls do the same computation apart from random numbers; not with a blur, which fades."""
+        """Whether all calls do the same computation apart from random numbers; false with a blur, which decays."""
         return self.reach.blur == 0
 
     def _field(self) -> RadianceField:

@@ -100,7 +100,7 @@ class PointCloud:
 
     @cached_property
     def basis(self) -> Float[Tensor, "p 3 k"]:
-        """Jacobian of the points, in the camera's axes, by an update about their middle and any shared errors."""
+        """Jacobian of the points, in the camera's axes, with respect to an update about their middle and any shared errors."""
         turned = -skew(self.points - self.middle)
         eye = torch.eye(3, dtype=turned.dtype, device=turned.device)
         by_pose = torch.cat([eye.expand_as(turned), turned], dim=-1)
@@ -231,8 +231,8 @@ class SurfaceCost:
     def colour_differences(
         self, found: Correspondences
     ) -> tuple[Float[Tensor, "h p 3"], Float[Tensor, "h p 3 3"]]:
-        """Return the surface's colour at each point minus the measured one, and its derivative by the point's position (channel
-        by world axis).
+        """Return the surface's colour at each point minus the measured one, and its derivative with respect to the point's
+        position (channel by world axis).
         """
         gradient = self.surface.surfels.rgb_gradient[found.index]
         change = (gradient @ found.along[..., None])[..., 0]

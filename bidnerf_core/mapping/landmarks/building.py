@@ -313,7 +313,7 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
 def _located(
     observations: TrackedKeypoints, depth: Float[Tensor, "k"], config: LandmarkConfig
 ) -> LandmarkMap:
-    """Return the triangulated landmarks, followed by those placed by the measured depth of the remaining keypoints."""
+    """Return the triangulated landmarks, followed by the remaining keypoints' landmarks from measured depth."""
     kept, positions, covariance = _triangulated(observations, radians(config.parallax))
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
