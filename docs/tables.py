@@ -791,6 +791,31 @@ def scans(records: Records) -> str:
 
 
 @table
+def splats(records: Records) -> str:
+    """Splats that were trained here, beside hash grids."""
+    rows = []
+    for scene, found in records["splats"]["scenes"].items():
+        times = found["step_of_2048_rays"]["median_ms"]
+        for name, measured in found["maps"].items():
+            right = (_of(ways[name]["5deg 0.05"]) for ways in found["answers"].values())
+            silent = sum(ways[name]["silent"] for ways in found["answers"].values())
+            quality = (measured["steps"], _decibels(measured["psnr_mean_dB"]))
+            size = f"{measured['weights_MB']:.1f} MB"
+            rows.append((SCENES[scene], f"`{name}`", *quality, size, f"{times[name]:.0f} ms", *right, silent))
+    head = (
+        "scene",
+        "backend",
+        "steps",
+        "PSNR",
+        "weights",
+        "a step of 2048 rays",
+        "RGB: right",
+        "RGB-D: right",
+    )
+    return _table((*head, "accepted but wrong"), rows, records)
+
+
+@table
 def round_trips(records: Records) -> str:
     """Maps beside those that come from their exports."""
     rows = []
