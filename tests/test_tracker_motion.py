@@ -129,6 +129,13 @@ def test_an_unforeseen_pose_restarts_the_motion() -> None:
     assert not motion.updated(far).velocity.any()
 
 
+@pytest.mark.parametrize("unknown", [float("nan"), float("inf")])
+def test_a_pose_of_unknown_covariance_carries_no_information(unknown: float) -> None:
+    motion = Motion.at(measured(path(0.0)), 1.0).predicted(0.1)
+    nothing = torch.full((6, 6), unknown, dtype=torch.float64)
+    assert motion.updated(PoseEstimate(path(0.5), nothing, nothing)) is motion
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.1, 3.1])
 def test_maps_of_single_poses_equal_those_of_batches(angle: float) -> None:
     generator = torch.Generator().manual_seed(1)

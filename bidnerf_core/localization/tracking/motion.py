@@ -169,7 +169,12 @@ class Motion:
         )
 
     def updated(self, measured: PoseEstimate) -> Motion:
-        """Return the state after fusing it with a measured pose, or reset to that pose if the prediction is incompatible."""
+        """Return the state after fusing it with a measured pose, or reset to that pose if the prediction is incompatible.
+
+        A pose whose covariance is not finite carries no information: the state is returned as it is.
+        """
+        if not bool(measured.noise.isfinite().all() and measured.bias.isfinite().all()):
+            return self
         off = update_between(self.T_world_camera, measured.T_world_camera)
         spread = self.noise[:6, :6] + measured.noise
         if float(off @ torch.linalg.solve(spread, off)) > UNFORESEEN:
