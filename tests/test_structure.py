@@ -271,11 +271,16 @@ def test_photos_from_one_place_are_refused(tmp_path: Path) -> None:
 
 
 def test_three_photos_of_one_wall_by_a_known_camera(tmp_path: Path) -> None:
-    """A plane determines poses if the camera is known; the camera that was given is kept."""
+    """A plane determines poses if the camera is known; the camera that was given is kept.
+
+    EXIF turns one photo: the dataset has the camera of the image as stored, and a remark says so.
+    """
     poses = [looking((0.2, -0.9 + 0.8 * n, 0.3 * (n % 2) - 0.2), (2, 0.1 * n, 0.1)) for n in range(4)]
-    write_photos(tmp_path / "wall", poses, walls=1)
+    files = write_photos(tmp_path / "wall", poses, walls=1)
+    write_photo(files[2], np.asarray(Image.open(files[2])), 6)
     found = bn.find_poses(tmp_path / "wall", tmp_path / "out", camera=CAMERA)
-    assert found.placed == 4
+    assert (found.placed, found.turned) == (4, 1)
+    assert "1 photo turned by EXIF: the dataset has the cameras of the images as stored" in str(found)
     views = {view.frame.name: view for view in all_views(bn.open_dataset(tmp_path / "out"))}
     metres, degrees = errors(views, {f"{number:03d}": pose for number, pose in enumerate(poses)})
     assert metres < 0.02

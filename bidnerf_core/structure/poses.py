@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT
 from bidnerf_core.datasets.video import is_video
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io.files import write_file
@@ -280,6 +281,7 @@ class _Search:
             self._source.name, len(images), model.num_reg_images(), tuple(models.sizes), tuple(left), model.num_points3D(),
             error, round(time.monotonic() - self._began, 1), self._inputs, self._pycolmap.__version__,
             is_video(self._source), found_in.pairs, found_in.contradicting,
+            sum(photos[number].orientation != UPRIGHT for number in model.reg_image_ids()),
         )  # fmt: skip
         write_found(self._folder, result)
         for line in str(result).splitlines():

@@ -70,6 +70,7 @@ class FoundPoses:
     video: bool = False  # whether the photos are frames of a video, which were written next to this record
     sure_pairs: int = 0  # of placed photos, with so many matches that they show the same place for certain
     contradicting: int = 0  # of these, pairs whose matches contradict the poses
+    turned: int = 0  # of placed photos, with an EXIF orientation; their cameras are of the images as stored
 
     @property
     def doubt(self) -> str | None:
@@ -91,6 +92,11 @@ class FoundPoses:
             lines.append(
                 f"the photos fall into {len(self.models)} unconnected models of {sizes} photos; the largest"
                 " is kept"
+            )
+        if self.turned:
+            lines.append(
+                f"{amount(self.turned, 'photo')} turned by EXIF: the dataset has the cameras of the images as stored, while"
+                " a photo is localized upright"
             )
         lines += [f"left out {left.photo}: {left.reason}" for left in self.left_out[:LARGEST_NAMED]]
         more = len(self.left_out) - LARGEST_NAMED
