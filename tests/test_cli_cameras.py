@@ -72,7 +72,9 @@ def test_render_compares_with_registered_depth(bidnerf: Run, shared: Path, tmp_p
     assert plain.out != moved.out
 
 
-@pytest.mark.parametrize("command", ["train", "localize", "render", "track", "bake"])
+@pytest.mark.parametrize(
+    "command", ["train", "localize", "render", "track", "bake", "evaluate", "compare", "extend"]
+)
 def test_a_sensor_that_is_missing_is_named(command: str, bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     where = {
         "train": [shared / "data", "--out", tmp_path / "map", *tiny.options()],
@@ -80,8 +82,56 @@ def test_a_sensor_that_is_missing_is_named(command: str, bidnerf: Run, shared: P
         "render": [shared / "map", shared / "data", "--out", tmp_path / "images"],
         "track": [shared / "map", shared / "data", "--out", tmp_path / "path.txt"],
         "bake": [shared / "map", "--data", shared / "data"],
+        "evaluate": [shared / "map", shared / "data", "--out", tmp_path / "results.jsonl"],
+        "compare": [shared / "map", shared / "data"],
+        "extend": [shared / "map", shared / "data"],
     }[command]
     cameras = ["--camera", shared / "camera.json", "--register-depth", tmp_path / "none.json"]
     found = bidnerf(command, *where, *cameras)
     assert found.status == 1
     assert "none.json: no such file" in found.err
+
+
+def test_trials_record_the_camera_and_are_resumed_by_it(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    words = [
+        "evaluate",
+        shared / "map",
+        shared / "data",
+        "--out",
+        tmp_path / "r.jsonl",
+        "--trials",
+        1,
+        "--size",
+        0.5,
+    ]
+    words += [
+        "--method",
+        "bid",
+        "--max-steps",
+        2,
+        "--rays",
+        64,
+        "--workers",
+        1,
+        "--camera",
+        shared / "camera.json",
+    ]
+    first = bidnerf(*words)
+    assert first.status == 0, first.err
+    assert json.loads((tmp_path / "r.jsonl").read_text())["trial"]["camera"] == "camera.json"
+    assert "1 of 1 trials are already there" in bidnerf(*words).err
+    other = bidnerf(*words, "--depth-unit", 0.001)
+    assert other.status == 0, other.err
+    assert "already there" not in other.err
+    assert (tmp_path / "r.jsonl").read_text().count("\n") == 2
+
+
+def test_options_of_datasets_need_one(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    photo = next((shared / "data" / "rgb").iterdir())
+    found = bidnerf("extend", shared / "map", photo, "--camera", shared / "camera.json")
+    assert found.status == 2
+    assert f"--camera is for a dataset, but {photo} is none" in found.err
+    words = ["evaluate", "demo:blobs", "--out", tmp_path / "r.jsonl", "--depth-unit", 0.001]
+    found = bidnerf(*words)
+    assert found.status == 1
+    assert "leave out camera, register_depth and depth_unit" in found.err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -80,6 +80,18 @@ def mask_folder(masks: Path | None, hides: HiddenColour) -> MaskFolder | None:
     if masks is None and hides != "black":
         raise UsageError(f"--mask-hides {hides} was given without --masks, expected the folder of masks")
     return None if masks is None else MaskFolder(masks, hides)
+
+
+def stated_reading(
+    camera: Path | None, register_depth: str | None, depth_unit: float | None
+) -> dict[str, Any]:
+    """Return the options with which a dataset is opened, as the plain values that a plan of trials stores."""
+    registration = depth_registration(register_depth)
+    return {
+        "camera": None if camera is None else str(camera),
+        "register_depth": registration if registration in (None, False) else str(registration),
+        "depth_unit": depth_unit,
+    }
 
 
 def depth_registration(given: str | None) -> DepthRegistration | None:

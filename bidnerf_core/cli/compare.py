@@ -8,7 +8,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidnerf_core.cli.camera_options import MaskHides, Masks, mask_folder
+from bidnerf_core.cli.camera_options import (
+    DatasetCamera,
+    DatasetDepthUnit,
+    MaskHides,
+    Masks,
+    RegisterDepth,
+    mask_folder,
+    stated_reading,
+)
 from bidnerf_core.cli.evaluate import read_sizes
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.method_options import Preset, chosen_settings
@@ -50,6 +58,9 @@ def run(arguments: list[str]) -> None:
         ] = None,
         trials: Annotated[int | None, option("N", "number of starts", "the protocol's")] = None,
         method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = "bid",
+        camera: DatasetCamera = None,
+        register_depth: RegisterDepth = None,
+        depth_unit: DatasetDepthUnit = None,
         masks: Masks = None,
         mask_hides: MaskHides = "black",
         seed: Annotated[int | None, option("N", "seed of every random choice", "the protocol's")] = None,
@@ -76,6 +87,7 @@ def run(arguments: list[str]) -> None:
                 method, changed_settings(method, config), trials, seed, split,
                 tuple(name for group in frame for name in group) or None,
                 masks=None if masks is None else str(masks), mask_hides=mask_hides,
+                **stated_reading(camera, register_depth, depth_unit),
             )  # fmt: skip
         if out is None:
             found = run_comparison(plan, maps, progress=_say)

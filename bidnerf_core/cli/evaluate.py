@@ -8,7 +8,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidnerf_core.cli.camera_options import MaskHides, Masks, mask_folder
+from bidnerf_core.cli.camera_options import (
+    DatasetCamera,
+    DatasetDepthUnit,
+    MaskHides,
+    Masks,
+    RegisterDepth,
+    mask_folder,
+    stated_reading,
+)
 from bidnerf_core.cli.folders import require_outside_maps
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import Device, Names, option, parse, require, wrong_usage
@@ -66,6 +74,9 @@ def run(arguments: list[str]) -> None:
                 "MODEL", "COLMAP sparse model whose points, where frames observe them, are used as depth", ""
             ),
         ] = None,
+        camera: DatasetCamera = None,
+        register_depth: RegisterDepth = None,
+        depth_unit: DatasetDepthUnit = None,
         masks: Masks = None,
         mask_hides: MaskHides = "black",
         fault: Annotated[
@@ -101,6 +112,7 @@ def run(arguments: list[str]) -> None:
                 trials, seed, split, tuple(name for group in frame for name in group) or None, images, angle, device,
                 depth, None if depth_points is None else str(depth_points), None if masks is None else str(masks), mask_hides,
                 tuple(f for group in fault for f in group),
+                **stated_reading(camera, register_depth, depth_unit),
             )  # fmt: skip
             require("--workers", 1 if workers is None else workers, 1, 10_000)
             require("--shards", shards, 1)

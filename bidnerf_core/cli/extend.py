@@ -7,10 +7,18 @@ from typing import Annotated
 
 import tyro
 
+from bidnerf_core.cli.camera_options import (
+    DatasetCamera,
+    DatasetDepthUnit,
+    RegisterDepth,
+    depth_registration,
+)
 from bidnerf_core.cli.options import MapFolder, option, parse, require
 from bidnerf_core.cli.output import show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.errors import amount
+from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.errors import UsageError, amount
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.extending import extend as extend_map
@@ -36,6 +44,9 @@ def extend(
         ),
     ] = None,
     split: Annotated[str, option("NAME", "split of the datasets")] = "train",
+    camera: DatasetCamera = None,
+    register_depth: RegisterDepth = None,
+    depth_unit: DatasetDepthUnit = None,
     steps: Annotated[
         int | None,
         option(
@@ -53,12 +64,23 @@ def extend(
     """
     if steps is not None:
         require("--steps", steps, 1)
-    before = len(load_info(map).cameras)
+    info = load_info(map)
+    before = len(info.cameras)
+
+    def opened(place: Path) -> Path | Dataset:
+        given = camera, depth_registration(register_depth), depth_unit
+        if given == (None, None, None) or find_reader(place) is None:
+            return place
+        return open_dataset(place, info.bounds.background, None, given[0], given[1], given[2])
+
+    photos, images = opened(new), None if data is None else opened(data)
+    if not any(isinstance(each, Dataset) for each in (photos, images)):
+        _refuse_options(new, camera, register_depth, depth_unit)
     with stopped_by_ctrl_c() as cancel, Display() as progress:
         scene = extend_map(
             map,
-            new,
-            data,
+            photos,
+            images,
             split=split,
             steps=steps,
             config=config,
@@ -67,3 +89,11 @@ def extend(
         )
     added = len(scene.info.cameras) - before
     show(f"{map}: {amount(added, 'photo')} added, {amount(len(scene.info.cameras), 'image')} in all")
+
+
+def _refuse_options(new: Path, *given: object) -> None:
+    """Raise ``UsageError`` for options of datasets if there is none."""
+    names = "--camera", "--register-depth", "--depth-unit"
+    for name, value in zip(names, given, strict=True):
+        if value is not None:
+            raise UsageError(f"{name} is for a dataset, but {new} is none; leave it out")

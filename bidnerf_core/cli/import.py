@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from bidnerf_core.cli.camera_options import DatasetCamera
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Device, FeaturesName, Flag, option, parse, require, value_of, wrong_usage
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
@@ -62,6 +63,7 @@ def run(arguments: list[str]) -> None:
             ),
         ] = None,
         split: Annotated[str, option("NAME", "split of the dataset")] = "train",
+        camera: DatasetCamera = None,
         landmark_features: FeaturesName = USUAL_FEATURES,
         overwrite: Annotated[Flag, option(None, "replace the map in --out", "")] = False,
         no_bake: Annotated[
@@ -82,7 +84,7 @@ def run(arguments: list[str]) -> None:
         if T_world_file is not None:
             with wrong_usage():
                 pose = read_pose(T_world_file)
-        dataset = None if photos is None else open_dataset(photos)
+        dataset = None if photos is None else open_dataset(photos, camera=camera)
         with stopped_by_ctrl_c() as cancel, Display() as progress:
             import_map(
                 file, out, as_, None if isinstance(config, NoSettings) else config, scale, None if T_world_file is None else pose, dataset, split,

@@ -11,7 +11,12 @@ import numpy as np
 import torch
 from rich.text import Text
 
-from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
+from bidnerf_core.cli.camera_options import (
+    DatasetCamera,
+    DatasetDepthUnit,
+    RegisterDepth,
+    depth_registration,
+)
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import DataFolder, Flag, MapFolder, Names, option, parse
 from bidnerf_core.cli.output import console, read_views, say, show
@@ -41,6 +46,7 @@ def _render(
     frame: Annotated[Names, option("NAME...", "render only these frames", "all of the split")] = (),
     camera: DatasetCamera = None,
     register_depth: RegisterDepth = None,
+    depth_unit: DatasetDepthUnit = None,
     level: Annotated[
         int | None, option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
@@ -56,7 +62,9 @@ def _render(
         scene = load_map(map)
         names = [name for group in frame for name in group]
         registration = depth_registration(register_depth)
-        dataset = open_dataset(data, scene.bounds.background, camera=camera, register_depth=registration)
+        dataset = open_dataset(
+            data, scene.bounds.background, camera=camera, register_depth=registration, depth_unit=depth_unit
+        )
         views = read_views(dataset, split, names or None)
         _check_file_names([view.frame.name for view in views])
         _render_views(scene, level, views, out)

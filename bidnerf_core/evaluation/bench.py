@@ -80,6 +80,9 @@ class Plan:
     faults: tuple[str, ...] = (
         NO_FAULT,
     )  # see Trial; each is applied to the same frames from the same starts
+    camera: str | None = None  # see Trial, as the next two
+    register_depth: bool | str | None = None
+    depth_unit: float | None = None
 
     def __post_init__(self) -> None:
         protocol = find_protocol(self.protocol)
@@ -136,6 +139,9 @@ def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
             masks=plan.masks,
             mask_hides=plan.mask_hides,
             fault=fault,
+            camera=plan.camera,
+            register_depth=plan.register_depth,
+            depth_unit=plan.depth_unit,
         )
         for fault in plan.faults
         for size in sizes

@@ -28,7 +28,7 @@ from bidnerf_core.evaluation.protocols import Size, find_protocol
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
 from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
 from bidnerf_core.evaluation.trial import Trial
-from bidnerf_core.evaluation.trials import Opened, open_data, open_map, with_masks
+from bidnerf_core.evaluation.trials import Opened, Reading, open_map
 from bidnerf_core.evaluation.workers import workers_for
 from bidnerf_core.fields.contract import device_of
 from bidnerf_core.frames.frame import View
@@ -282,8 +282,8 @@ def _opened(scene: Scene, data: Data, plan: Plan) -> Opened:
 
 def _dataset(data: Data, plan: Plan, stored: Map | None = None) -> Dataset:
     if isinstance(data, str | Path):
-        return open_data(str(data), stored, plan.masks, plan.mask_hides)
-    return with_masks(_in_memory(data), plan.masks, plan.mask_hides)
+        return Reading.of(plan).open(str(data), stored)
+    return Reading.of(plan).in_memory(_in_memory(data))
 
 
 def _in_memory(data: Dataset | Sequence[View]) -> Dataset:

@@ -47,6 +47,9 @@ class Condition:
     depth: bool
     depth_points: str | None = None
     hidden: str | None = None  # the colour of masks, and their folder
+    camera: str | None = None
+    register_depth: bool | str | None = None
+    depth_unit: float | None = None
 
     def facts(self) -> dict[str, Any]:
         """Return all properties that distinguish conditions, by name."""
@@ -55,6 +58,9 @@ class Condition:
             "depth": self.depth,
             "depth_points": self.depth_points,
             "hidden": self.hidden,
+            "camera": self.camera,
+            "register_depth": self.register_depth,
+            "depth_unit": self.depth_unit,
         }
         own |= {"backend": self.backend, "device": self.device}
         return {"method": self.method, **own, **parse_json(self.settings, "settings", "an object")}
@@ -115,6 +121,7 @@ def condition_of(result: TrialResult) -> Condition:
     return Condition(
         result.method, settings, images, result.backend, trial.device, trial.depth, trial.depth_points,
         None if trial.masks is None else f"{trial.mask_hides} of {trial.masks}",
+        trial.camera, trial.register_depth, trial.depth_unit,
     )  # fmt: skip
 
 

@@ -51,11 +51,14 @@ class Trial:
     masks: str | None = None  # folder of masks of the images, see ``MaskFolder``
     mask_hides: HiddenColour = "black"
     fault: str = "none"  # faults of the images and their sizes, such as depth-scale:1.02+exposure:0.7
+    camera: str | None = None  # file or name of the camera of images whose format stores none
+    register_depth: bool | str | None = None  # file of the depth sensor; False: depth is used as it is
+    depth_unit: float | None = None  # metres per step of depth images
 
     def __post_init__(self) -> None:
-        for name in ("map", "data", "depth_points", "masks"):
-            if "\0" in (getattr(self, name) or ""):
-                raise InputError(f"{name} holds a NUL character, expected the name of a folder")
+        for name in ("map", "data", "depth_points", "masks", "camera", "register_depth"):
+            if "\0" in str(getattr(self, name)):
+                raise InputError(f"{name} holds a NUL character, expected the name of a file or folder")
 
     @property
     def frame(self) -> str:
@@ -66,8 +69,12 @@ class Trial:
     def portable(self) -> Trial:
         """This trial with the names of folders instead of their paths, which differ between machines."""
         points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
-        masks = None if self.masks is None else _name(self.masks)
-        return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points, masks=masks)
+        masks, camera = (None if each is None else _name(each) for each in (self.masks, self.camera))
+        sensor = _name(self.register_depth) if isinstance(self.register_depth, str) else self.register_depth
+        return replace(
+            self, map=_name(self.map), data=_name(self.data), depth_points=points, masks=masks, camera=camera,
+            register_depth=sensor,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

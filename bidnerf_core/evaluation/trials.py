@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -135,51 +135,66 @@ def open_map(name: str, device: str = "cpu") -> Map:
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
 
-def open_data(
-    name: str, stored: Map | None = None, masks: str | None = None, hides: HiddenColour = "black"
-) -> Dataset:
-    """Return the dataset in a folder, or of a closed-form scene; a map gives the colour behind its images.
+@dataclass(frozen=True)
+class Reading:
+    """The options with which a trial's dataset is opened, see ``open_dataset``."""
 
-    Masks of the folder ``masks`` hide parts of the images.
-    """
-    if is_closed_form(name):
-        return with_masks(closed_form_data(name), masks, hides)
-    found = open_dataset(name, None if stored is None else stored.bounds.background)
-    return with_masks(found, masks, hides)
+    masks: str | None = None
+    mask_hides: HiddenColour = "black"
+    camera: str | None = None
+    register_depth: bool | str | None = None
+    depth_unit: float | None = None
+
+    @classmethod
+    def of(cls, work: Trial | Plan) -> Reading:
+        """Return the options of a trial or a plan."""
+        return cls(work.masks, work.mask_hides, work.camera, work.register_depth, work.depth_unit)
+
+    def open(self, name: str, stored: Map | None = None) -> Dataset:
+        """Return the dataset in a folder, or of a closed-form scene; a map gives the colour behind its images."""
+        if is_closed_form(name):
+            return self.in_memory(closed_form_data(name))
+        found = open_dataset(
+            name, None if stored is None else stored.bounds.background, camera=self.camera,
+            register_depth=self.register_depth, depth_unit=self.depth_unit,
+        )  # fmt: skip
+        return self._masked(found)
+
+    def in_memory(self, dataset: Dataset) -> Dataset:
+        """Return a dataset that is open already, with its masks. Raises ``InputError`` for options of files."""
+        files = self.camera, self.register_depth, self.depth_unit
+        if any(option is not None for option in files):
+            raise InputError(
+                f"{dataset.path}: has its own cameras and depth; leave out camera, register_depth and depth_unit"
+            )
+        return self._masked(dataset)
+
+    def _masked(self, dataset: Dataset) -> Dataset:
+        return (
+            dataset if self.masks is None else MaskedDataset(dataset, MaskFolder(self.masks, self.mask_hides))
+        )
 
 
-def with_masks(dataset: Dataset, masks: str | None, hides: HiddenColour = "black") -> Dataset:
-    """Return the dataset, whose images hide what the masks of a folder hide if one is given."""
-    return dataset if masks is None else MaskedDataset(dataset, MaskFolder(masks, hides))
-
-
-def opened(
-    map_name: str,
-    data_name: str,
-    device: str = "cpu",
-    masks: str | None = None,
-    hides: HiddenColour = "black",
-) -> Opened:
+def opened(map_name: str, data_name: str, device: str = "cpu", reading: Reading = Reading()) -> Opened:
     """Return the map and dataset with these names, which are read once per process unless the map has changed since."""
     try:
         file = os.stat(Path(map_name) / DESCRIPTION)
     except OSError:  # a closed-form scene, or not a map, which is detected below
-        return _opened(map_name, data_name, device, masks, hides, None)
-    return _opened(map_name, data_name, device, masks, hides, (file.st_ino, file.st_mtime_ns))
+        return _opened(map_name, data_name, device, reading, None)
+    return _opened(map_name, data_name, device, reading, (file.st_ino, file.st_mtime_ns))
 
 
 def opened_for(work: Trial | Plan) -> Opened:
     """Return the map and the dataset that a trial or a plan names, as ``opened`` does."""
-    return opened(work.map, work.data, work.device, work.masks, work.mask_hides)
+    return opened(work.map, work.data, work.device, Reading.of(work))
 
 
 @lru_cache(maxsize=4)
 def _opened(
-    map_name: str, data_name: str, device: str, masks: str | None, hides: HiddenColour,
-    version: tuple[int, int] | None,
-) -> Opened:  # fmt: skip
+    map_name: str, data_name: str, device: str, reading: Reading, version: tuple[int, int] | None
+) -> Opened:
     stored = open_map(map_name, device)
-    return stored, open_data(data_name, stored, masks, hides)
+    return stored, reading.open(data_name, stored)
 
 
 @lru_cache(maxsize=4)
