@@ -30,7 +30,7 @@ from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.rgbd import largest_side
 from bidnerf_core.datasets.trajectories import check_unit
 from bidnerf_core.depth.images import DepthImage
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, amount, enumeration
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import fit_depth
 from bidnerf_core.geometry.se3 import SE3
@@ -41,6 +41,8 @@ LARGEST_SIDE = 640
 LIDAR_RANGE = 5.0
 """Range of the lidar (metres) according to Apple."""
 HIGH_CONFIDENCE = 2
+MOST_VALUES = 4
+"""Number of different confidences up to which a remark lists them."""
 CENTRE_OF_PIXEL = 0.5
 """Added to principal points relative to the centre of the upper left pixel."""
 FRAMES_PER_SECOND = 5.0
@@ -87,20 +89,28 @@ def scan_frame(
     return Frame(name, pixels, small, metres)
 
 
-def sure_depth(
-    measured: DepthImage,
-    confidence: Integer[np.ndarray, "h w"] | None,
-    where: str,
-    high: int = HIGH_CONFIDENCE,
-) -> DepthImage:
-    """Keep depth whose confidence, if there is any, is ``high``, and within the range of the lidar; 0
-    elsewhere.
+class SureDepth:
+    """Filters lidar depth by confidence, and remarks once that an image loses all of its depth."""
 
-    Raises ``InputError``, whose message begins with ``where``, for a confidence of another size or with
-    values above ``high``.
-    """
-    metres = torch.where(measured.metres <= LIDAR_RANGE, measured.metres, 0)
-    if confidence is not None:
+    def __init__(self) -> None:
+        self._remarked = False
+
+    def __call__(
+        self,
+        measured: DepthImage,
+        confidence: Integer[np.ndarray, "h w"] | None,
+        where: str,
+        high: int = HIGH_CONFIDENCE,
+    ) -> DepthImage:
+        """Keep depth whose confidence, if there is any, is ``high``, and within the range of the lidar; 0
+        elsewhere.
+
+        Raises ``InputError``, whose message begins with ``where``, for a confidence of another size or with
+        values above ``high``.
+        """
+        metres = torch.where(measured.metres <= LIDAR_RANGE, measured.metres, 0)
+        if confidence is None:
+            return replace(measured, metres=metres)
         if confidence.shape != tuple(metres.shape):
             found = "x".join(map(str, confidence.shape[::-1]))
             raise InputError(
@@ -110,8 +120,23 @@ def sure_depth(
             raise InputError(
                 f"{where}: has values up to {confidence.max()}, expected confidences from 0 to {high}"
             )
-        metres = torch.where(torch.from_numpy(confidence.astype(np.int64)) == high, metres, 0)
-    return replace(measured, metres=metres)
+        sure = torch.where(torch.from_numpy(confidence.astype(np.int64)) == high, metres, 0)
+        if not self._remarked and bool(metres.any()) and not bool(sure.any()):
+            self._remarked = True
+            remark(
+                where,
+                f"{_values(confidence)}, expected {high} where depth is sure; without it, all depth"
+                " of this image is left out, and so it is in such images that follow",
+            )
+        return replace(measured, metres=sure)
+
+
+def _values(confidence: Integer[np.ndarray, "h w"]) -> str:
+    """Return the values of a confidence image in words."""
+    values = np.unique(confidence)
+    if len(values) > MOST_VALUES:
+        return f"has values from {values[0]} to {values[-1]}"
+    return f"has {'only the value' if len(values) == 1 else 'the values'} {enumeration([str(v) for v in values])}"
 
 
 def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:

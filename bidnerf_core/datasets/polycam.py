@@ -23,7 +23,8 @@ import torch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import present, remark
-from bidnerf_core.datasets.phone_scans import CENTRE_OF_PIXEL, Measured, scan_frame, sure_depth
+from bidnerf_core.datasets.phone_scans import CENTRE_OF_PIXEL, Measured, SureDepth, scan_frame
+from bidnerf_core.datasets.phone_scans import HIGH_CONFIDENCE as ARKIT_CONFIDENCE
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
@@ -35,7 +36,7 @@ from bidnerf_core.geometry.pose_rows import pose_of_rows
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import decode, read_compact_image
+from bidnerf_core.io.images import Background, decode, read_compact_image
 from bidnerf_core.io.json import Record, read_record
 
 BORDER = 15
@@ -94,13 +95,17 @@ class PolycamDataset(SplitDataset[PolycamFrame]):
     unit: LengthUnit | None = "metres"
     up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
 
+    def __init__(self, frames: Splits[PolycamFrame], background: Background | None) -> None:
+        super().__init__(frames, background)
+        self._sure = SureDepth()
+
     def _pose(self, frame: PolycamFrame) -> SE3:
         return frame.T_world_camera
 
     def _frame(self, frame: PolycamFrame, name: str) -> Frame:
         rgb, _ = read_compact_image(frame.image, self._background)
         camera = _camera(frame.record, rgb.shape[1], rgb.shape[0])
-        found = scan_frame(name, rgb, camera, _depth(frame), frame.image)
+        found = scan_frame(name, rgb, camera, _depth(frame, self._sure), frame.image)
         if not frame.corrected:
             return found
         border = max(1, round(BORDER * found.intrinsics.width / rgb.shape[1]))
@@ -178,16 +183,17 @@ def _camera(record: Record, width: int, height: int) -> Intrinsics:
         raise record.error(str(error)) from error
 
 
-def _depth(frame: PolycamFrame) -> Measured | None:
+def _depth(frame: PolycamFrame, filtered: SureDepth) -> Measured | None:
     if frame.depth is None:
         return None
     measured = read_depth_image(frame.depth, MILLIMETRE)
     confidence = None if frame.confidence is None else decode(frame.confidence)
     if confidence is not None and confidence.ndim != 2:
         raise InputError(f"{frame.confidence}: has {confidence.shape[-1]} channels, expected one")
-    high = HIGH_CONFIDENCE if confidence is None or confidence.max() > 2 else 2
+    is_arkit = confidence is not None and 0 < confidence.max() <= ARKIT_CONFIDENCE
+    high = ARKIT_CONFIDENCE if is_arkit else HIGH_CONFIDENCE
     sure = None if confidence is None else confidence.astype(np.int64)
-    return Measured(sure_depth(measured, sure, str(frame.confidence), high), str(frame.depth))
+    return Measured(filtered(measured, sure, str(frame.confidence), high), str(frame.depth))
 
 
 reader = PolycamReader()

@@ -28,9 +28,9 @@ from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.phone_scans import (
     CENTRE_OF_PIXEL,
     Measured,
+    SureDepth,
     pose_of_numbers,
     scan_frame,
-    sure_depth,
     thinned,
 )
 from bidnerf_core.datasets.reader import Reader, ReadOptions
@@ -132,7 +132,7 @@ class Record3DDataset(SplitDataset[Record3DFrame]):
         self, frames: Splits[Record3DFrame], files: _Files, metadata: Record, background: Background | None
     ) -> None:
         super().__init__(frames, background)
-        self._files = files
+        self._files, self._sure = files, SureDepth()
         self._size = metadata.size("dw"), metadata.size("dh")
         self._decompress: Callable[[bytes], bytes] | None = None
         if any(frame.file("depth") in files for _, frame in frames.distinct()):
@@ -161,7 +161,7 @@ class Record3DDataset(SplitDataset[Record3DFrame]):
         if frame.file("conf") in self._files:
             sure = self._unpacked(frame.file("conf"), width * height)
             confidence = np.frombuffer(sure, np.uint8).reshape(height, width)
-        return Measured(sure_depth(measured, confidence, f"{self.path}/{frame.file('conf')}"), where)
+        return Measured(self._sure(measured, confidence, f"{self.path}/{frame.file('conf')}"), where)
 
     def _unpacked(self, name: str, size: int) -> bytes:
         """Return the ``size`` decompressed bytes of a file. Raises ``InputError`` for any other number of bytes."""

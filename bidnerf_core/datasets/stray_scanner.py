@@ -21,9 +21,9 @@ from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.phone_scans import (
     CENTRE_OF_PIXEL,
     Measured,
+    SureDepth,
     pose_of_numbers,
     scan_frame,
-    sure_depth,
     thinned,
 )
 from bidnerf_core.datasets.reader import Reader, ReadOptions
@@ -92,7 +92,7 @@ class StrayDataset(SplitDataset[StrayFrame]):
 
     def __init__(self, frames: Splits[StrayFrame], video: VideoFrames, background: Background | None) -> None:
         super().__init__(frames, background)
-        self._video = video
+        self._video, self._sure = video, SureDepth()
 
     def _pose(self, frame: StrayFrame) -> SE3 | None:
         return frame.T_world_camera
@@ -113,7 +113,7 @@ class StrayDataset(SplitDataset[StrayFrame]):
         sure = decode(files["confidence"]) if is_file(files["confidence"]) else None
         if sure is not None and sure.ndim != 2:
             raise InputError(f"{files['confidence']}: has {sure.shape[-1]} channels, expected one")
-        return Measured(sure_depth(measured, sure, str(files["confidence"])), str(depth))
+        return Measured(self._sure(measured, sure, str(files["confidence"])), str(depth))
 
 
 def _frames(path: Path, video: VideoFrames) -> list[StrayFrame]:
