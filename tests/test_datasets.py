@@ -438,6 +438,8 @@ def test_unknown_split_and_frame(blender: Path) -> None:
         InputError, match=r"split 'train': no frame 'r_11' among its 3 frames, did you mean 'r_1'\?"
     ):
         dataset.views("train", ["r_0", "r_11"])
+    with pytest.raises(InputError, match="split 'train': no frame 'r_4', which is in split 'test'"):
+        dataset.views("train", ["r_4"])
     with pytest.raises(
         InputError, match=r"no frame 'chair' among its 3 frames, expected a name such as 'r_0'"
     ):

@@ -17,6 +17,7 @@ from bidnerf_core.io.files import FileInUse, locked
 from bidnerf_core.maps.anchor import Anchor, load_anchor, save_anchor
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
+from bidnerf_core.maps.scaling import place_of
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, textured_map, unseen
 from commands import Run
 
@@ -73,6 +74,13 @@ def test_a_known_length_gives_the_factor(ground: Map) -> None:
     for bad in ("nobody", "c0@-3,1", "c0@1", "1,2", "1,2,nan"):
         with pytest.raises(InputError, match=r"no place|outside"):
             bn.factor_of_distance(ground, bad, "c1", 1.0)
+    assert bn.factor_of_distance(ground, "c0.png", "c1.JPG", 2.8284271247) == pytest.approx(2)
+    file, name = f"c0.png@{0.25 * CAMERA.width},1", f"c0@{0.25 * CAMERA.width},1"
+    assert torch.equal(place_of(ground, file), place_of(ground, name))
+    with pytest.raises(
+        InputError, match=r"no camera of 'c7.png'; photos held out for tests are not in the map .*'c0'"
+    ):
+        bn.factor_of_distance(ground, "c7.png", "c1", 1.0)
     with pytest.raises(InputError, match="the same place"):
         bn.factor_of_distance(ground, "c0", "c0", 1.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol, TypeAlias, runtime_checkable
 
@@ -68,16 +68,23 @@ class Georeferenced(Protocol):
         ...
 
 
-def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], where: str) -> list[int]:
+def positions(
+    names: Sequence[str],
+    stems: Sequence[str],
+    asked: Sequence[str],
+    where: str,
+    splits: Mapping[str, Sequence[str]] | None = None,
+) -> list[int]:
     """Return the indices of the requested frames in ``names``.
 
-    Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
+    ``splits`` has the names in each split, so that the message about a frame of another split says so. Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
     """
     refuse_text(f"{where}: names", asked)
     index = {name: place for place, name in enumerate(names)}
     for name in asked:
         if name not in index:
-            raise InputError(f"{where}: {_not_there(name, names, stems)}")
+            elsewhere = in_other_split(name, splits or {})
+            raise InputError(f"{where}: {elsewhere or _not_there(name, names, stems)}")
     return [index[name] for name in asked]
 
 
@@ -101,6 +108,12 @@ def _numbered(names: list[str]) -> list[str]:
         seen.add(own)
         found.append(own)
     return found
+
+
+def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
+    """Return a clause that names the split of a frame, given the names in each, or None if it is in no split."""
+    found = next((split for split, names in splits.items() if name in names), None)
+    return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
 
 
 def _not_there(name: str, names: Sequence[str], stems: Sequence[str]) -> str:

@@ -70,7 +70,7 @@ class Splits(Generic[F]):
         frames, known = self._frames[split], self._names[split]
         asked = known if names is None else names
         stems = [frame.stem for frame in frames]
-        places = positions(known, stems, asked, f"{self.path}: split {split!r}")
+        places = positions(known, stems, asked, f"{self.path}: split {split!r}", self._names)
         return [(known[place], frames[place]) for place in places]
 
     def first(self) -> list[F]:

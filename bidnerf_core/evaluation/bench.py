@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidnerf_core.datasets import Dataset
+from bidnerf_core.datasets.dataset import in_other_split
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, Size, find_protocol
@@ -274,7 +275,9 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
     """Return the names of the views for each frame that may be tried."""
     for name in plan.frames or ():
         if name not in names:
-            raise InputError(f"{plan.data}: split {plan.split!r} has no frame {name!r}")
+            others = {split: dataset.frame_names(split) for split in dataset.splits}
+            elsewhere = in_other_split(name, others) or f"no frame {name!r}"
+            raise InputError(f"{plan.data}: split {plan.split!r}: {elsewhere}")
     kept = names if plan.frames is None else [name for name in names if name in plan.frames]
     if plan.images == 1:
         return [(name,) for name in kept]

@@ -5,8 +5,10 @@ to metres.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -23,6 +25,7 @@ from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.similarity import fit_similarity, spread
 from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.io.images import IMAGE_SUFFIXES
 from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
 from bidnerf_core.maps.anchor import scaled_anchor
 from bidnerf_core.maps.description import FieldFrame, MapInfo
@@ -30,9 +33,13 @@ from bidnerf_core.maps.description import FieldFrame, MapInfo
 if TYPE_CHECKING:
     from bidnerf_core.maps.map import Map
 
-Place = str | Sequence[float] | Float[Tensor, "3"]
+Position = Sequence[float] | Float[Tensor, "3"]
+"""Three coordinates."""
+Place = str | Position
 """A point of a map: its three coordinates, the name of one of its cameras, or ``NAME@U,V``, what that camera
 shows at a pixel."""
+DIGITS = re.compile(r"\d+|\.\w+$")
+"""What names of photos of one capture differ in, and their endings."""
 LEAST_CAMERAS = 3
 """Smallest number of cameras with known positions that gives a scale that can be checked."""
 WORST_FIT = 0.2
@@ -151,23 +158,25 @@ def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -
     return metres / apart
 
 
-def factor_of_poses(scene: Map, known: Mapping[str, SE3]) -> ScaleFit:
-    """Return the factor by which the map's cameras fit ``known`` poses (T_world_camera, metres, any world),
-    matched by name.
+def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit:
+    """Return the factor by which the map's cameras fit ``known`` poses (T_world_camera) or positions, in
+    metres in any world, matched by name.
 
     Only positions count. Raises ``InputError`` if fewer than three cameras are known, all are in one place,
     or they do not fit with any factor.
     """
-    poses = {camera.name: camera.pose for camera in scene.info.cameras}
-    names = [name for name in known if name in poses]
-    if len(names) < LEAST_CAMERAS:
-        example = f" such as {next(iter(poses))!r}" if poses else ""
+    found = {name: camera for name in known if (camera := _camera_of(scene, name)) is not None}
+    if len({camera.name for camera in found.values()}) < len(found):
+        raise InputError("two known poses belong to the same camera of the map, expected one for each")
+    if len(found) < LEAST_CAMERAS:
+        cameras = scene.info.cameras
+        example = f" such as {cameras[0].name!r}" if cameras else ""
         raise InputError(
-            f"{len(names)} of {len(known)} known poses belong to cameras of the map, expected at least"
+            f"{len(found)} of {len(known)} known poses belong to cameras of the map, expected at least"
             f" {LEAST_CAMERAS}, matched by name{example}"
         )
-    source = torch.stack([poses[name].translation for name in names])
-    target = torch.stack([known[name].translation.double() for name in names])
+    source = torch.stack([camera.pose.translation for camera in found.values()])
+    target = torch.stack([_position(known[name]) for name in found])
     fit = fit_similarity(source, target)
     off = float((fit.apply(source) - target).square().sum(-1).mean().sqrt())
     if off > WORST_FIT * spread(target):
@@ -175,28 +184,53 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3]) -> ScaleFit:
             f"the cameras are {off:.3g} m (root mean square) from their known positions after the best scaling, expected known"
             " positions of the same capture"
         )
-    return ScaleFit(fit.scale, len(names), off)
+    return ScaleFit(fit.scale, len(found), off)
 
 
 def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
     """Return the coordinates of a place of the map (float64), see ``Place``. Raises ``InputError`` if it has none."""
     if not isinstance(place, str):
-        point = torch.as_tensor(place, dtype=torch.float64).cpu()
-        if point.shape != (3,) or not bool(point.isfinite().all()):
-            raise InputError(f"place is {place!r}, expected three coordinates")
-        return point
-    cameras = {camera.name: camera for camera in scene.info.cameras}
-    if place in cameras:
-        return cameras[place].pose.translation
+        return _position(place)
+    if (camera := _camera_of(scene, place)) is not None:
+        return camera.pose.translation
     name, at, pixel = place.rpartition("@")
     numbers = _numbers(pixel)
-    if at and len(numbers) == 2 and name in cameras:
-        return _seen_at(scene, cameras[name], numbers[0], numbers[1])
+    if at and len(numbers) == 2 and (camera := _camera_of(scene, name)) is not None:
+        return _seen_at(scene, camera, numbers[0], numbers[1])
     if not at and len(numbers) == 3:
         return torch.tensor(numbers, dtype=torch.float64)
-    raise InputError(
-        f"no place {place!r} in the map, expected the name of one of its {len(cameras)} cameras, NAME@U,V for what a camera shows at"
-        f" a pixel, or coordinates X,Y,Z{spelling_hint(name or place, cameras)}"
+    raise InputError(f"no place {place!r} in the map: {_no_camera(scene, name if at else place)}")
+
+
+def _position(place: SE3 | Position) -> Float[Tensor, "3"]:
+    """Return a position, or that of a pose (float64). Raises ``InputError`` for anything but three coordinates."""
+    given = place.translation if isinstance(place, SE3) else place
+    point = torch.as_tensor(given, dtype=torch.float64).cpu()
+    if point.shape != (3,) or not bool(point.isfinite().all()):
+        raise InputError(f"place is {place!r}, expected three coordinates")
+    return point
+
+
+def _camera_of(scene: Map, name: str) -> StoredCamera | None:
+    """Return the camera with a name, which may end like an image file's, or None if there is none."""
+    cameras = {camera.name: camera for camera in scene.info.cameras}
+    stem = name[: -len(Path(name).suffix)] if name.lower().endswith(IMAGE_SUFFIXES) else name
+    return cameras.get(name) or cameras.get(stem)
+
+
+def _no_camera(scene: Map, name: str) -> str:
+    """Return why a map has no camera of a photo, and what else names a place."""
+    names = [camera.name for camera in scene.info.cameras]
+    others = "NAME@U,V for what a camera shows at a pixel, or coordinates X,Y,Z"
+    if not names:
+        return "it has no cameras; expected coordinates X,Y,Z"
+    alike = [each for each in names if DIGITS.sub("", each) == DIGITS.sub("", name)]
+    if not alike:
+        hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}")
+        return f"none of its {len(names)} cameras is called {name!r}{hint}; or give {others}"
+    return (
+        f"it has no camera of {name!r}; photos held out for tests are not in the map (every eighth, unless trained with --split"
+        f" all), so take another, such as {alike[0]!r}, {others}"
     )
 
 
