@@ -35,6 +35,8 @@ HELD_OUT, MOST_HELD_OUT = 8, 24
 """One in ``HELD_OUT`` images is held out, ``MOST_HELD_OUT`` in all at most."""
 ENOUGH_ANSWERS = 6
 """Smallest number of localized images from which scatter is estimated."""
+LARGEST_SHARE = 3
+"""Of few images, one in ``LARGEST_SHARE`` is held out, until there are ``HELD_OUT``: fewer would leave the scatter unknown."""
 QUANTILE = 0.9
 """Quantile at which the error model is fitted: it covers the tails, and allows one image in ten to have a
 wrong pose."""
@@ -94,7 +96,7 @@ def tried_landmarks(
 
 def _held_out(count: int) -> list[int]:
     """Return the indices of the held-out images, evenly spread."""
-    wanted = min(count // HELD_OUT, MOST_HELD_OUT)
+    wanted = max(min(count // HELD_OUT, MOST_HELD_OUT), min(count // LARGEST_SHARE, HELD_OUT))
     return [int((i + 0.5) * count / wanted) for i in range(wanted)]
 
 
