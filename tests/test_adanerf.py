@@ -378,7 +378,7 @@ def test_rooms_are_learnt_from_within() -> None:
 def test_settings_are_judged() -> None:
     with pytest.raises(InputError, match="bins is 0, expected 1 to"):
         AdaNerfConfig(bins=0)
-    with pytest.raises(InputError, match=r"make 1\.2, expected 1 or less"):
+    with pytest.raises(InputError, match=r"sum to 1\.2, expected at most 1"):
         AdaNerfConfig(dense_part=0.7, soft_part=0.5)
     with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
         AdaNerfConfig(learning_rate=0)

@@ -281,7 +281,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
     assert built == [24]
     assert seen[0] > 100
     assert stored.landmarks is not None
-    assert stored.landmarks.trial.images == 3
+    assert stored.landmarks.trial.images == 8
     assert stored.bounds.contracted
 
 

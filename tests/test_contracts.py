@@ -118,7 +118,7 @@ def stretched(view: View) -> View:
     ("mistake", "test", "says"),
     [
         (reversed_axes, "test_axes_are_those_of_opencv", "x right, y down and z forward"),
-        (millimetres, "test_depth_has_the_unit_of_the_poses", "times as long as the poses"),
+        (millimetres, "test_depth_has_the_unit_of_the_poses", "times the depth that the poses"),
         (stretched, "test_poses_are_rigid", "not a rigid transform"),
     ],
 )

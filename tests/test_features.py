@@ -117,7 +117,7 @@ UNUSABLE: list[tuple[Any, str]] = [
     (None, "returned a NoneType, expected Keypoints"),
     (replace(SOUND, descriptors=np.zeros((5, 8), np.uint8)), "Tensor, Tensor and ndarray, expected tensors"),
     (replace(SOUND, descriptors=SOUND.descriptors[:3]), r"shapes \(5, 2\), \(5,\) and \(3, 8\), expected"),
-    (replace(SOUND, descriptors=SOUND.descriptors.float()), "of torch.float32, expected torch.uint8"),
+    (replace(SOUND, descriptors=SOUND.descriptors.float()), "dtype torch.float32, expected torch.uint8"),
     (replace(SOUND, pixels=SOUND.pixels * torch.nan), "outside the image of 40x30 pixels"),
     (replace(SOUND, pixels=SOUND.pixels + 40), "outside the image of 40x30 pixels"),
 ]

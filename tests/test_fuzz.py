@@ -404,4 +404,4 @@ def test_a_pipe_in_the_place_of_a_page_does_not_hang_a_report(bidnerf: Run, tmp_
     os.mkfifo(tmp_path / "out" / "index.html")
     status, _, err = bidnerf("report", tmp_path / "r.jsonl", "--out", tmp_path / "out")
     assert status == 1
-    assert "holds something that is no report" in err
+    assert "holds something other than a bidnerf report" in err

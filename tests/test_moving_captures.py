@@ -264,7 +264,7 @@ def test_landmarks_tell_how_many_of_their_images_moved() -> None:
     assert landmarks.moving == 0.75
     assert landmarks_from_tensors(landmark_tensors(landmarks)).moving == 0.75
     tensors = landmark_tensors(landmarks)
-    with pytest.raises(ValueError, match=r"moving is 1\.5, expected a share"):
+    with pytest.raises(ValueError, match=r"moving is 1\.5, expected a fraction"):
         landmarks_from_tensors(tensors | {"moving": torch.tensor(1.5, dtype=torch.float64)})
     assert share_moving(landmarks) == 0.75 * SHARE_AS_MAP
     assert share_moving(replace(landmarks, moving=0.0)) == SHARE_MOVING

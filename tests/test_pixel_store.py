@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 
 import tiny
+from bidnerf_core.camera import source
 from bidnerf_core.camera.batch import CameraBatch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.photos import nearby
@@ -192,7 +193,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
         assert side == 20 or 0.9 < count * 3 * side**2 * 120 / 192 / 10_000 <= 1
     for wrong in (0, 2.5, True):
         with pytest.raises(InputError, match=r"largest is .*, expected a positive whole number of pixels"):
-            views_of_map.checked_side(wrong)  # type: ignore[arg-type]
+            source.checked_side(wrong)  # type: ignore[arg-type]
 
 
 def test_a_map_of_reduced_images_is_resumed_at_their_size(tmp_path: Path) -> None:
