@@ -89,6 +89,7 @@ if TYPE_CHECKING:
     from bidnerf_core.results.pose_files import PosedImage as PosedImage
     from bidnerf_core.results.pose_files import read_pose as read_pose
     from bidnerf_core.results.pose_files import read_poses as read_poses
+    from bidnerf_core.results.pose_files import read_positions as read_positions
     from bidnerf_core.results.pose_files import write_poses as write_poses
     from bidnerf_core.results.tracked_path import TrackedPath as TrackedPath
     from bidnerf_core.results.tracked_path import track as track
@@ -179,6 +180,7 @@ HOMES = {
     "pose_error": "results.errors",
     "read_pose": "results.pose_files",
     "read_poses": "results.pose_files",
+    "read_positions": "results.pose_files",
     "register": "registry",
     "render": "fields.rendering",
     "render_image": "fields.rendering",

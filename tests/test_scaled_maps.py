@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -103,6 +105,31 @@ def test_known_poses_give_the_factor(ground: Map) -> None:
     }
     with pytest.raises(InputError, match="known positions of the same capture"):
         bn.factor_of_poses(ground, wrong)
+
+
+def test_known_positions_come_from_a_file(ground: Map, tmp_path: Path) -> None:
+    known, file = {c.name: 3 * c.pose.translation for c in ground.info.cameras}, tmp_path / "known.json"
+    file.write_text(json.dumps({f"{name}.jpg": place.tolist() for name, place in known.items()}))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(3)
+    poses = [{"frame": c.name, "T_world_camera": c.pose.matrix().tolist()} for c in ground.info.cameras]
+    file.write_text(json.dumps(poses))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    file.write_text("\n".join(map(json.dumps, poses)))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    form = re.escape(
+        'expected {"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_camera": 4x4 rows}, ...]'
+    )
+    for wrong in (
+        '{"c0": [1, 2]}',
+        '{"frames": [{"file_path": "c0"}]}',
+        "[[1, 2, 3]]",
+        "[]",
+        '{"c0": [1, 2, "3"]}',
+        "c0 1 2 3",
+    ):
+        file.write_text(wrong)
+        with pytest.raises(InputError, match=f"known.json: .*{form}$"):
+            bn.read_positions(file)
 
 
 @pytest.mark.parametrize("factor", [0, -1.0, float("nan"), float("inf"), 1e300, "2", True])

@@ -15,7 +15,7 @@ from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.files import map_folder
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scaling import factor_of_distance, factor_of_poses
-from bidnerf_core.results.pose_files import read_poses
+from bidnerf_core.results.pose_files import read_positions
 
 one_way = tyro.conf.create_mutex_group(required=True, title="length of a unit (one of them)")
 
@@ -40,7 +40,10 @@ def scale(
         Path | None,
         one_way,
         option(
-            "JSON", "true positions of the map's cameras in metres, in the format of --out POSES.json", ""
+            "JSON",
+            "file with the true positions of three or more of the map's cameras in metres, in any world:"
+            " {NAME: [x, y, z], ...}, or poses as localize --out POSES.json writes them",
+            "",
         ),
     ] = None,
     factor: Annotated[
@@ -72,7 +75,7 @@ def _factor(
     scene: Map, distance: tuple[str, str, str] | None, poses: Path | None, factor: float | None
 ) -> float:
     if poses is not None:
-        fit = factor_of_poses(scene, read_poses(poses))
+        fit = factor_of_poses(scene, read_positions(poses))
         say(f"{poses}: {fit}")
         return fit.factor
     if distance is not None:

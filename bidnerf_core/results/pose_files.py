@@ -31,6 +31,7 @@ from bidnerf_core.registry import Plugins, interface_defects
 TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 OPENCV_AXES = "camera axes x right, y down, z forward (OpenCV)"
 EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
+EXPECTED_POSITIONS = '{"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_camera": 4x4 rows}, ...]'
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -262,6 +263,32 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
     if not found:
         raise InputError(f"{path}: holds no pose, expected {EXPECTED_POSE}")
     return found
+
+
+def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
+    """Read the positions (float64) of cameras by name: one object of names with x, y and z, or poses as in ``read_poses``.
+
+    Raises ``InputError`` for anything else.
+    """
+    path = Path(path)
+    try:
+        found = parse_json(read_file(path, "a pose file"), str(path), EXPECTED_POSITIONS)
+    except InputError:
+        found = None  # unreadable, or one object per line
+    if not isinstance(found, dict) or not found or "T_world_camera" in found:
+        try:
+            return {name: pose.translation for name, pose in read_poses(path).items()}
+        except InputError as error:
+            raise InputError(
+                f"{str(error).partition(', expected')[0]}, expected {EXPECTED_POSITIONS}"
+            ) from error
+    return {name: _position(f"{path}: {name!r}", value) for name, value in found.items()}
+
+
+def _position(where: str, value: Any) -> Float[Tensor, "3"]:
+    if not isinstance(value, list) or len(value) != 3 or any(type(x) not in (int, float) for x in value):
+        raise InputError(f"{where} has no three coordinates, expected {EXPECTED_POSITIONS}")
+    return torch.tensor(value, dtype=torch.float64)
 
 
 def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
