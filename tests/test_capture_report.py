@@ -19,7 +19,9 @@ from bidnerf_core.captures.links import groups
 from bidnerf_core.captures.photos import exposures, nearby, photo_measures
 from bidnerf_core.captures.report import CaptureReport, CoverageRecord, Gap, PhotoRecord
 from bidnerf_core.captures.survey import surveyed
+from bidnerf_core.captures.up_direction import UpDirection, given_up
 from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.mapping import HeldOutTrial, LandmarkConfig, tracked_views
 from bidnerf_core.results.capture_plot import draw_capture
@@ -122,6 +124,61 @@ def test_one_side_is_no_gap() -> None:
     assert report.coverage.gaps == ()
     assert report.coverage.open_side is not None
     assert report.coverage.open_side.degrees == pytest.approx(360 - 11 * math.degrees(0.105), abs=3)
+
+
+def towards(eye: tuple[float, float, float], forward: tuple[float, float, float]) -> SE3:
+    return look_at(eye, [e + f for e, f in zip(eye, forward, strict=True)])
+
+
+def surroundings(poses: list[SE3], stretch: float, up: UpDirection | None = None) -> CaptureReport:
+    """Survey photos of points in a box, which is long along x."""
+    points = Points(count=900)
+    points.positions = points.positions * points.positions.new_tensor([stretch, 1, 1])
+    views = [
+        replace(view := points.view(T), frame=replace(view.frame, name=f"{i}")) for i, T in enumerate(poses)
+    ]
+    return surveyed(tracked_views(views, points), views, up=up)
+
+
+def test_photos_from_inside_a_room_have_no_open_side() -> None:
+    """All look to one half of the room, from its middle, and down."""
+    angles = [math.pi * (i / 23 - 0.5) for i in range(24)]
+    poses = [
+        towards((0.4 * math.cos(3 * a), 0.4 * math.sin(3 * a), 0.2), (math.cos(a), math.sin(a), -0.4))
+        for a in angles
+    ]
+    report = surroundings(poses, 1)
+    assert report.coverage.arrangement == "inside"
+    assert (report.coverage.open_side, report.coverage.gaps) == (None, ())
+    words = sentences(report)
+    assert any("taken from inside the scene, looking 22° to 22° down" in sentence for sentence in words)
+    assert not any("no photos" in sentence for sentence in words)
+
+
+def test_photos_along_a_corridor_are_inside_although_their_axes_meet_far_ahead() -> None:
+    poses = [
+        towards((-7.5 + 0.5 * i, 0.1 * (-1) ** i, 0.0), (1.0, -0.01 * (-1) ** i, 0.05)) for i in range(24)
+    ]
+    report = surroundings(poses, 8)
+    assert report.coverage.arrangement == "inside"
+    assert report.coverage.open_side is None
+
+
+def test_photos_past_a_facade_are_from_one_side_and_above() -> None:
+    """Parallel axes meet nowhere, but the scene is in front of all cameras."""
+    poses = [towards((0.3 * i - 1.5, -5.0, 3.0), (0.0, 1.0, -0.6)) for i in range(11)]
+    report = surroundings(poses, 1, given_up((0, 0, 1)))
+    assert report.coverage.arrangement == "one side"
+    assert report.coverage.heights_deg == pytest.approx((31, 31), abs=3)
+
+
+@pytest.mark.parametrize(
+    ("tilts", "words"),
+    [((-62, -10), "62° to 10° down"), ((-5, 8), "5° down to 8° up"), ((2, 30), "2° to 30° up")],
+)
+def test_tilts_in_words(tilts: tuple[float, float], words: str) -> None:
+    report = CaptureReport((), CoverageRecord("inside", heights_deg=tilts, landmarks=9))
+    assert f"inside the scene, looking {words}; " in sentences(report)[0]
 
 
 def test_photos_of_two_places_are_two_groups() -> None:

@@ -69,8 +69,11 @@ def _overview(report: CaptureReport) -> str:
     covered = report.coverage
     count = len(report.photos)
     low, high = covered.heights_deg
-    around = covered.arrangement in ("around", "one side")
-    heights = f", {low:.0f}° to {high:.0f}° above the horizon" if around else ""
+    heights = ""
+    if covered.arrangement == "inside":
+        heights = f", looking {_tilts(low, high)}"
+    elif covered.arrangement in ("around", "one side"):
+        heights = f", {low:.0f}° to {high:.0f}° above the horizon"
     first = f"{_photos(count)}, {ARRANGEMENTS[covered.arrangement]}{heights}"
     if not covered.landmarks:
         return f"{first}; no landmark seen by several of them could be triangulated"
@@ -78,6 +81,13 @@ def _overview(report: CaptureReport) -> str:
         f"{first}; {covered.landmarks} triangulated landmarks, typically seen in {covered.seen_by:.0f}"
         f" photos within {covered.seen_within_deg:.0f}°"
     )
+
+
+def _tilts(low: float, high: float) -> str:
+    """Return a range of elevations (degrees) of optical axes in words."""
+    if low >= 0:
+        return f"{low:.0f}° to {high:.0f}° up"
+    return f"{-low:.0f}° to {-high:.0f}° down" if high < 0 else f"{-low:.0f}° down to {high:.0f}° up"
 
 
 def _trial(report: CaptureReport) -> Iterator[str]:

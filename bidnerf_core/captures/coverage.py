@@ -21,6 +21,12 @@ FACING = 0.9
 it."""
 CONVERGING = 0.5
 """Largest distance at which a typical optical axis passes the centre, relative to the cameras' distance."""
+BEYOND = 1.5
+"""Distance of the point where the optical axes meet, relative to what the photos show, beyond which it does not
+count: they look along a corridor."""
+BEHIND = 0.05
+"""Share of the landmarks behind a camera, on average, above which the scene surrounds the cameras (up to 0.02 in
+captures of things seen from outside, 0.08 to 0.5 in those of rooms and corridors)."""
 OPEN_SIDE = 120.0
 """Smallest range of directions (degrees) without a camera in a one-sided capture."""
 LEAST_GAP = 15.0
@@ -39,22 +45,28 @@ FEW = 4
 
 
 def coverage(
-    views: Sequence[View], matched: TrackedKeypoints, seen: TrackedKeypoints, least_parallax: float,
-    up: UpDirection | None = None,
+    views: Sequence[View], matched: TrackedKeypoints, seen: TrackedKeypoints, positions: Float[Tensor, "n 3"],
+    least_parallax: float, up: UpDirection | None = None,
 ) -> CoverageRecord:  # fmt: skip
     """Return how well the views cover their scene.
 
-    ``matched`` are all matched keypoints, ``seen`` those consistent with a triangulated point, and
-    ``least_parallax`` is the angle (degrees) between rays below which a point cannot be triangulated. ``up``
+    ``matched`` are all matched keypoints, ``seen`` those consistent with a triangulated point,
+    ``positions`` these points, and ``least_parallax`` is the angle (degrees) between rays below which a point cannot be triangulated. ``up``
     is the upward direction of the scene, estimated from the cameras by default.
     """
     angle = parallax_deg(matched)
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
     rotations = torch.stack([v.T_ref_camera.rotation.cpu().double() for v in views])
     upward = (up or up_direction(SE3(rotations, centres))).tensor()
-    centre, converge = _meeting_point(centres, rotations[:, :, 2])
-    directions = centres - centre if converge else rotations[:, :, 2]
-    arrangement, open_side, gaps, heights = _around(views, directions, upward, converge)
+    axes, depths = rotations[:, :, 2], seen.sightings.in_camera(positions)[:, 2]
+    centre, converge = _meeting_point(centres, axes, _median(depths) or None)
+    if not converge and len(positions):
+        centre = positions.median(dim=0).values
+    if not converge and (not len(positions) or _share_behind(centres, axes, positions) > BEHIND):
+        arrangement: Arrangement = "inside" if len(positions) else "unknown"
+        open_side, gaps, heights = None, (), _range_deg(axes @ upward)
+    else:
+        arrangement, open_side, gaps, heights = _around(views, centres - centre, upward)
     if angle is not None and angle < least_parallax:
         arrangement, open_side, gaps = "one place", None, ()
     views_of = torch.bincount(seen.point).double()
@@ -66,32 +78,46 @@ def coverage(
 
 
 def _around(
-    views: Sequence[View], directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"], converge: bool
+    views: Sequence[View], directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"]
 ) -> tuple[Arrangement, Gap | None, tuple[Gap, ...], tuple[float, float]]:
-    """Return how ``directions`` (of the cameras from the centre, or of their axes) are arranged about the
-    vertical.
+    """Return how the ``directions`` of the cameras from the centre are arranged about the vertical.
 
     Also returns the open side, the gaps and the range of elevations (degrees) for a ``CoverageRecord``.
     """
     unit = torch.nn.functional.normalize(directions, dim=-1)
-    heights = (unit @ up).clamp(-1, 1).asin().rad2deg()
-    low, high = heights.quantile(torch.tensor([0.05, 0.95], dtype=heights.dtype)).tolist()
-    flat = (heights.abs() < STEEP).nonzero()[:, 0]
+    sines = unit @ up
+    heights = _range_deg(sines)
+    flat = (sines.abs() < math.sin(math.radians(STEEP))).nonzero()[:, 0]
     if len(views) < FEW or len(flat) < FEW:
-        return "unknown", None, (), (low, high)
+        return "unknown", None, (), heights
     names = [views[i].frame.name for i in flat.tolist()]
     steps, named = _steps(_azimuths_deg(unit[flat], up), names)
-    hidden = 0.0 if converge else _field_of_view_deg(views)
     order = steps.argsort(descending=True).tolist()
-    is_open = float(steps[order[0]]) - hidden >= OPEN_SIDE
+    is_open = float(steps[order[0]]) >= OPEN_SIDE
     open_side = named[order[0]] if is_open else None
     # Random directions have exponentially distributed steps: among n, one exceeds mean * log(n / p) with
     # probability p.
     mean = float(steps.median()) / math.log(2)
-    least = hidden + min(max(LEAST_GAP, mean * math.log(len(names) / RARE)), WIDE_GAP)
+    least = min(max(LEAST_GAP, mean * math.log(len(names) / RARE)), WIDE_GAP)
     gaps = tuple(named[i] for i in order[int(is_open) :] if float(steps[i]) > least)
-    arrangement: Arrangement = "one side" if is_open else "around" if converge else "inside"
-    return arrangement, open_side, gaps, (low, high)
+    return "one side" if is_open else "around", open_side, gaps, heights
+
+
+def _range_deg(sines: Float[Tensor, "v"]) -> tuple[float, float]:
+    """Return the 5th and 95th percentiles of the angles (degrees) with these sines."""
+    angles = sines.clamp(-1, 1).asin().rad2deg()
+    low, high = angles.quantile(torch.tensor([0.05, 0.95], dtype=angles.dtype)).tolist()
+    return low, high
+
+
+def _share_behind(
+    centres: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3"], positions: Float[Tensor, "n 3"]
+) -> float:
+    """Return the mean share of the points that lie behind a camera."""
+    shares = [
+        ((positions - centre) @ axis < 0).double().mean() for centre, axis in zip(centres, axes, strict=True)
+    ]
+    return float(torch.stack(shares).mean())
 
 
 def _steps(azimuths: Float[Tensor, "v"], names: Sequence[str]) -> tuple[Float[Tensor, "v"], list[Gap]]:
@@ -119,9 +145,12 @@ def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[T
 
 
 def _meeting_point(
-    centres: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3"]
+    centres: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3"], depth: float | None
 ) -> tuple[Float[Tensor, "3"], bool]:
-    """Return the point nearest to the optical axes, and whether they converge there."""
+    """Return the point nearest to the optical axes, and whether they converge there, at what the cameras see.
+
+    ``depth`` is the median distance of what they see, None if it is unknown.
+    """
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None]
     matrix = across.sum(0) + 1e-9 * len(axes) * torch.eye(3, dtype=axes.dtype)  # parallel axes never converge
     point = torch.linalg.solve(matrix, (across @ centres[..., None]).sum(0))[:, 0]
@@ -129,12 +158,9 @@ def _meeting_point(
     before = ((away * axes).sum(-1) > 0).double().mean()
     missed = torch.linalg.vector_norm(torch.linalg.cross(away, axes), dim=-1)
     distance = torch.linalg.vector_norm(away, dim=-1)
-    return point, bool(before >= FACING and missed.median() <= CONVERGING * distance.median())
-
-
-def _field_of_view_deg(views: Sequence[View]) -> float:
-    cameras = [view.frame.intrinsics for view in views]
-    return _median(torch.tensor([2 * math.degrees(math.atan(0.5 * c.width / c.fx)) for c in cameras]))
+    typical = distance.median()
+    here = depth is None or bool(typical <= BEYOND * depth)
+    return point, here and bool(before >= FACING and missed.median() <= CONVERGING * typical)
 
 
 def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool:

@@ -59,7 +59,7 @@ class CoverageRecord:
         0.0,
         0.0,
         0.0,
-    )  # metres: where the optical axes converge, as far as they do
+    )  # metres: where the optical axes converge, or the median landmark
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit, world: the upward direction of the scene
     parallax_deg: float = 0.0  # median angle between the rays to a point
     landmarks: int = 0  # triangulated
@@ -73,7 +73,7 @@ class CoverageRecord:
     heights_deg: tuple[float, float] = (
         0.0,
         0.0,
-    )  # elevation of the cameras above the centre's horizon: 5th and 95th percentiles
+    )  # elevation of the cameras above the centre's horizon, or of the axes of cameras inside: 5th and 95th percentiles
 
 
 @dataclass(frozen=True)

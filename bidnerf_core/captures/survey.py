@@ -76,7 +76,7 @@ def surveyed(
         )  # fmt: skip
         photos.append(found.onto(record) if found else record)
     spread = exposure.quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
-    covered = coverage(_sound(views, problems), tracked.matched, seen, config.parallax, up)
+    covered = coverage(_sound(views, problems), tracked.matched, seen, positions, config.parallax, up)
     return CaptureReport(tuple(photos), covered, trial, float(spread[1] - spread[0]))
 
 
