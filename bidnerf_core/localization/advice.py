@@ -70,7 +70,7 @@ ADVICE = {
     ),
     Outcome.TOO_FEW_MATCHES: Advice(
         "The map has many landmarks, but hardly any appear in the image.",
-        "Take a sharper, brighter image from nearer to where the map's images were taken, and give its camera.",
+        "Ask the map of the place that it shows, or take a sharper, brighter image from nearer to where the map's images were taken, and give its camera.",
     ),
 }
 """Advice for each outcome but ``CONVERGED``; a test compares it with the page."""
