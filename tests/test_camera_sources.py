@@ -89,6 +89,8 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
         assert source.approximate
         assert source.intrinsics == Intrinsics.from_focal(300 * 4032 / 400, *raster.upright_size)
         assert "assumed to be that of the map's images" in source.description
+    same = find_camera(Raster(400, 300), Exif(), assumed=[wide, replace(small, width=800, height=600), wide])
+    assert same.intrinsics == wide  # images of exactly this size come before others of the same shape
     square = find_camera(Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
     assert square.intrinsics == Intrinsics.from_focal(300 * 250 / 300, 250, 250)
     assert "assumed to be that of centre crops of the map's images" in square.description

@@ -308,4 +308,5 @@ def test_intrinsics_that_are_also_the_maps_are_mistaken_less_often(landmarks: La
     ],
 )
 def test_a_correction_reads_as_words(correction: Calibration, words: str) -> None:
-    assert correction.sentence == words
+    assert correction.compared("given") == words
+    assert correction.compared("assumed") == words.replace("given", "assumed")

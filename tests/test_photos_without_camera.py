@@ -86,6 +86,7 @@ def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo:
     found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))(frame)
     assert found.converged
     assert found.focal_factor == pytest.approx(1 / factor, rel=0.01)
+    assert "than assumed" in found.reason
     assert pose_error(found.T_world_camera, unseen().T_ref_camera).translation < 0.02
 
 

@@ -263,13 +263,14 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
-    """Return the camera with the median focal length among those of the same aspect ratio, or else among
-    centre crops.
+    """Return the camera with the median focal length among those of the same size, or else of the same aspect
+    ratio, or else among centre crops.
 
     If it is unknown to which side the camera was turned, only the focal length is used.
     """
     size = raster.upright_size
-    whole = cameras_at_size(tuple(cameras), *size)
+    exact = tuple(camera for camera in cameras if (camera.width, camera.height) == size)
+    whole = cameras_at_size(exact or tuple(cameras), *size)
     groups = whole or centre_crop_cameras(tuple(cameras), *size)
     if not groups:
         return None

@@ -62,9 +62,11 @@ def coverage(
     centre, converge = _meeting_point(centres, axes, _median(depths) or None)
     if not converge and len(positions):
         centre = positions.median(dim=0).values
+    arrangement: Arrangement
+    open_side, gaps = None, tuple[Gap, ...]()
     if not converge and (not len(positions) or _share_behind(centres, axes, positions) > BEHIND):
-        arrangement: Arrangement = "inside" if len(positions) else "unknown"
-        open_side, gaps, heights = None, (), _range_deg(axes @ upward)
+        arrangement = "inside" if len(positions) else "unknown"
+        heights = _range_deg(axes @ upward)
     else:
         arrangement, open_side, gaps, heights = _around(views, centres - centre, upward)
     if angle is not None and angle < least_parallax:

@@ -159,9 +159,13 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     if found.expected_shift > thresholds.expected_shift:
         return Verdict(Outcome.MISCALIBRATED, f"{share}{_doubted(found)}")
     if found.better_camera is not None:
-        return Verdict(Outcome.MISCALIBRATED, f"{share}, but far more with {found.better_camera.sentence}")
+        return Verdict(
+            Outcome.MISCALIBRATED, f"{share}, but far more with {found.better_camera.compared(found.stated)}"
+        )
     if found.calibration.is_stretched and not found.takes_map_camera:
-        return Verdict(Outcome.MISCALIBRATED, f"{share}, but only with {found.calibration.sentence}")
+        return Verdict(
+            Outcome.MISCALIBRATED, f"{share}, but only with {found.calibration.compared(found.stated)}"
+        )
     deviation = position_deviation(found.stated_covariance + found.doubt.covariance)
     if not deviation <= thresholds.precision * found.distance:
         cause = ", as the intrinsics had to be estimated" if found.estimates_calibration else ""
@@ -173,7 +177,7 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     if found.takes_map_camera or found.estimates_calibration:
         whose = "the map's" if found.takes_map_camera else "estimated"
         with_others = f", with {whose} intrinsics" + (
-            f": {found.calibration.sentence}" if found.changes_camera else ""
+            f": {found.calibration.compared(found.stated)}" if found.changes_camera else ""
         )
     moving = ", with the motion of a rolling shutter" if found.has_motion else ""
     return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{moving}{with_others}")
@@ -183,14 +187,14 @@ def _doubted(found: LandmarkPose) -> str:
     """Return the part of the reason that explains why other intrinsics may be right."""
     taken = " with the map's intrinsics" if found.takes_map_camera else ""
     taken = " with estimated intrinsics" if found.estimates_calibration else taken
-    with_taken = f"{taken} ({found.calibration.sentence})" if taken else ""
+    with_taken = f"{taken} ({found.calibration.compared(found.stated)})" if taken else ""
     if not found.doubt.other_is_known:
-        return f"{with_taken}, but they suggest {found.doubt.other.sentence}"
+        return f"{with_taken}, but they suggest {found.doubt.other.compared(found.stated)}"
     if found.estimates_calibration:
-        return f"{with_taken}, but they do not show whether the given ones are right"
+        return f"{with_taken}, but they do not show whether the {found.stated} ones are right"
     other = found.calibration if found.takes_map_camera else found.doubt.other
-    choice = "the given intrinsics or those of the map's images"
-    return f", but they do not show whether {choice} are right: {other.sentence}"
+    choice = f"the {found.stated} intrinsics or those of the map's images"
+    return f", but they do not show whether {choice} are right: {other.compared(found.stated)}"
 
 
 def is_blank(frame: Frame) -> bool:

@@ -14,7 +14,7 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED, Posterior, Whose
 from bidnerf_core.localization.landmarks.refinement import GuidedPose
-from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
+from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration
 
 ESTIMATED_INFLATION = 3.0
 """Factor on the covariance of poses with estimated intrinsics.
@@ -111,6 +111,11 @@ class LandmarkPose:
         if self.intrinsics is not None:
             return self.intrinsics
         return None if self.calibration == GIVEN else self.calibration.applied(given)
+
+    @property
+    def stated(self) -> str:
+        """How the query's intrinsics are known: "given", or "assumed" if their focal length is approximate."""
+        return "given" if self.guided is None or self.guided.query.prior == FIXED else "assumed"
 
     @property
     def changes_camera(self) -> bool:

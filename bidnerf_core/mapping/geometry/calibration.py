@@ -81,13 +81,12 @@ class Calibration:
             return self.log_focal
         return min((self.log_focal + share * self.log_stretch for share in (0, -0.5, 0.5)), key=abs)
 
-    @property
-    def sentence(self) -> str:
-        """The significant parts of the correction, as a phrase."""
+    def compared(self, stated: str) -> str:
+        """Return the significant parts of the correction as a phrase; ``stated`` is "given" or "assumed"."""
         return (
-            f"{enumeration(self.considerable)} than given"
+            f"{enumeration(self.considerable)} than {stated}"
             if self.considerable
-            else "nearly the same as given"
+            else f"nearly the same as {stated}"
         )
 
     @property
