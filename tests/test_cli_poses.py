@@ -21,6 +21,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import TrackedViews, tracked_views
 from bidnerf_core.maps.description import cameras_of, load_info
 from bidnerf_core.maps.files import load_capture
+from bidnerf_core.maps.views import read_views
 from commands import Run
 from landmark_scene import Points, ring
 from test_cli import assert_same_map, stop_at
@@ -164,6 +165,22 @@ def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPat
 def test_depth_in_another_unit_is_refused(ratio: float) -> None:
     with pytest.raises(InputError, match=r"times the depth that the poses .*depth_unit_scale_factor"):
         training_views.check_depth_unit(measured(ratio))
+
+
+def test_another_unit_of_depth_is_named_where_it_can_be_given() -> None:
+    with pytest.raises(
+        InputError, match=r"0.2 times .* 0.001 m and not 0.0002 m \(--depth-unit 0.001, .*by 0.2$"
+    ):
+        training_views.check_depth_unit(measured(0.2), 1 / 5000)
+    with pytest.raises(InputError, match=r"--depth-unit 0.00328, "):
+        training_views.check_depth_unit(measured(0.3048), 0.001)
+
+
+def test_datasets_tell_the_unit_of_their_depth(tmp_path: Path) -> None:
+    folder = tiny.write_dataset(tmp_path / "data")
+    assert read_views(folder).depth_unit == 0.001
+    centimetres = open_dataset(folder, depth_unit=0.01)
+    assert read_views(centimetres, "all").depth_unit == 0.01
 
 
 @pytest.mark.parametrize(("ratio", "said"), [(1.08, True), (0.94, True), (1.02, False)])

@@ -38,6 +38,8 @@ RUN, MOST_RUNS = 5, 12
 not needed otherwise."""
 UNUSUAL_RATIO = 0.05
 """Smallest relative error of measured depth, compared with triangulated points, that is reported."""
+USUAL_UNITS = (1.0, 0.01, 0.001, 1e-4, 1 / 4000, 1 / 5000)
+"""Metres per step of depth images: floats, and integers of sensors and datasets."""
 OTHER_UNIT = 2.0
 """Ratio between measured and triangulated depth, in either direction, that only a different unit explains."""
 
@@ -56,21 +58,22 @@ class TrainingViews:
 def prepared(
     views: Sequence[View], refinement: RefinementChoice = "auto",
     progress: ProgressCallback | None = None, cancel: Cancel | None = None, features: str = USUAL_FEATURES,
-    trust_poses: bool = False,
+    trust_poses: bool = False, depth_unit: float | None = None,
 ) -> TrainingViews:  # fmt: skip
     """Refine the poses of the views if requested, and find the landmarks that they show.
 
     ``features`` is the name of the keypoint detector. Raises ``InputError`` if the poses contradict most
-    pairs of images, unless ``trust_poses`` is set, and if depth is clearly in another unit.
+    pairs of images, unless ``trust_poses`` is set, and if depth is clearly in another unit than
+    ``depth_unit`` (metres per step of depth images, if another can be given), with which it was read.
     """
     if refinement == "never":
-        tracked, seeing = located(views, progress, cancel, features, trust_poses)
+        tracked, seeing = located(views, progress, cancel, features, trust_poses, depth_unit)
         if tracked is None and not trust_poses:
             _check_poses(posed_keypoints(_sample(views), SIFT))
         return TrainingViews(
             seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
         )
-    tracked = _tracked(views, progress, cancel, features, trust_poses)
+    tracked = _tracked(views, progress, cancel, features, trust_poses, depth_unit)
     least = 0.0 if refinement == "always" else INCONSISTENT
     report = counter("poses", "image pairs", progress, cancel)
     found = training_poses(tracked, views, least, progress=report)
@@ -104,6 +107,7 @@ def located(
     cancel: Cancel | None = None,
     features: str = USUAL_FEATURES,
     trust_poses: bool = False,
+    depth_unit: float | None = None,
 ) -> tuple[TrackedViews | None, list[View]]:
     """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
@@ -112,7 +116,7 @@ def located(
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
-    tracked = _tracked(views, progress, cancel, features, trust_poses)
+    tracked = _tracked(views, progress, cancel, features, trust_poses, depth_unit)
     return tracked, _with_landmarks(views, tracked)
 
 
@@ -127,6 +131,7 @@ def _tracked(
     cancel: Cancel | None,
     features: str,
     trust_poses: bool,
+    depth_unit: float | None,
 ) -> TrackedViews:
     """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images, or depth is in
     another unit.
@@ -136,7 +141,7 @@ def _tracked(
     tracked = tracked_views(views, features, progress=counter("landmarks", "steps", progress, cancel))
     if not trust_poses:
         _check_poses(tracked.observations.images)
-    check_depth_unit(tracked)
+    check_depth_unit(tracked, depth_unit)
     return tracked
 
 
@@ -153,21 +158,37 @@ def _check_poses(images: Sequence[PosedKeypoints]) -> None:
         raise InputError(f"{found.sentence} (--trust-poses, trust_poses in Python, trains with them anyway)")
 
 
-def check_depth_unit(tracked: TrackedViews) -> None:
+def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> None:
     """Raise ``InputError`` if measured depth is in another unit than the poses; log a scale that is a few
     percent off.
+
+    ``depth_unit`` is the one with which depth images were read, if another can be given.
     """
     seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
     ratio = depth_ratio(seen.sightings, points, tracked.depth[seen.number])
     if ratio is None or abs(ratio - 1) < UNUSUAL_RATIO:
         return
     remark = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"
-    if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
-        raise InputError(
-            f"{remark}; expected depth and poses in the same unit: check the unit of the depth images"
-            " (depth_unit_scale_factor in a transforms.json) and the scale of the poses"
+    if 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+        log.info(f"{remark}; training takes both as they are")
+        return
+    if depth_unit is None:
+        remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
+    else:
+        right = usual_unit(depth_unit / ratio)
+        remedy = (
+            f"if the poses are in metres, a step of the depth images is {right:.3g} m and not {depth_unit:.3g} m (--depth-unit"
+            f" {right:.3g}, depth_unit in Python, or depth_unit_scale_factor in a transforms.json)"
         )
-    log.info(f"{remark}; training takes both as they are")
+    raise InputError(
+        f"{remark}; expected depth and poses in the same unit: {remedy}; otherwise scale the poses by {ratio:.3g}"
+    )
+
+
+def usual_unit(estimated: float) -> float:
+    """Return the usual unit of depth images (metres per step) near an estimated one, or the estimate if none is."""
+    nearest = min(USUAL_UNITS, key=lambda unit: abs(math.log(unit / estimated)))
+    return nearest if abs(nearest / estimated - 1) < UNUSUAL_RATIO else estimated
 
 
 def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:

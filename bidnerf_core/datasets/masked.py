@@ -46,6 +46,11 @@ class MaskedDataset:
         return getattr(self.unmasked, "unit", None)
 
     @property
+    def depth_unit(self) -> float | None:
+        """Metres per step of the depth images, if the format accepts another unit."""
+        return getattr(self.unmasked, "depth_unit", None)
+
+    @property
     def up(self) -> tuple[float, float, float] | None:
         """The upward direction in the world, if the capture measured gravity."""
         return getattr(self.unmasked, "up", None)

@@ -157,7 +157,8 @@ class SevenScenesDataset(SplitDataset[SceneFrame]):
         depth_unit: float,
     ) -> None:
         super().__init__(frames, background)
-        self._camera, self._sensor, self._depth_unit = camera, sensor, depth_unit
+        self._camera, self._sensor = camera, sensor
+        self.depth_unit = self._metres_per_step = depth_unit
         self._read_depth = DepthReader(documented=("65535",))
 
     def _pose(self, frame: SceneFrame) -> SE3 | None:
@@ -171,7 +172,7 @@ class SevenScenesDataset(SplitDataset[SceneFrame]):
     def _frame(self, frame: SceneFrame, name: str) -> Frame:
         depth = None
         if frame.depth.is_file():
-            depth = DepthFile(frame.depth, self._depth_unit, self._read_depth, self._sensor)
+            depth = DepthFile(frame.depth, self._metres_per_step, self._read_depth, self._sensor)
         return read_rgbd(name, frame.image, self._camera.at(frame.image), self._background, depth)
 
 

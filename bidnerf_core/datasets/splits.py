@@ -102,11 +102,13 @@ class Splits(Generic[F]):
 class SplitDataset(ABC, Generic[F]):
     """A ``Dataset`` whose frames are described by ``Splits``; subclasses read the image and pose of a frame.
 
-    Subclasses set ``unit`` and ``up`` if their format specifies them, see ``Georeferenced``.
+    Subclasses set ``unit`` and ``up`` if their format specifies them, see ``Georeferenced``, and
+    ``depth_unit`` (metres per step of depth images) if the format accepts another.
     """
 
     unit: LengthUnit | None = None
     up: tuple[float, float, float] | None = None
+    depth_unit: float | None = None
 
     def __init__(self, frames: Splits[F], background: Background | None = None) -> None:
         self._frames = frames

@@ -87,7 +87,8 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         units = {frame.unit for group in frames.values() for frame in group}
         self.unit = units.pop() if len(units) == 1 else None
         self._read_depth = DepthReader()
-        self._depth_unit = depth_unit
+        steps = {frame.depth_unit for group in frames.values() for frame in group}
+        self.depth_unit = depth_unit or (steps.pop() if len(steps) == 1 else None)
         self._by_images = background is None
         self._scaled: set[tuple[int, int, int, int]] = set()  # sizes of images and cameras already reported
         self._first: tuple[str, int, int] | None = (
@@ -109,7 +110,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
     def _frame(self, frame: FrameRecord, name: str) -> Frame:
         path, depth = self._files.images[frame], None
         if frame in self._files.depth:
-            unit = frame.depth_unit if self._depth_unit is None else self._depth_unit
+            unit = self.depth_unit or frame.depth_unit
             depth = DepthFile(self._files.depth[frame], unit, self._read_depth)
 
         def camera_of(width: int, height: int) -> Camera:

@@ -152,13 +152,14 @@ class TumDataset(SplitDataset[TumFrame]):
         depth_unit: float,
     ) -> None:
         super().__init__(frames, background)
-        self._camera, self._sensor, self._depth_unit = camera, sensor, depth_unit
+        self._camera, self._sensor = camera, sensor
+        self.depth_unit = self._metres_per_step = depth_unit
         self._read_depth = DepthReader(documented=("65535",))
 
     def _frame(self, frame: TumFrame, name: str) -> Frame:
         depth = None
         if frame.depth is not None:
-            depth = DepthFile(frame.depth.image, self._depth_unit, self._read_depth, self._sensor)
+            depth = DepthFile(frame.depth.image, self._metres_per_step, self._read_depth, self._sensor)
         return read_rgbd(name, frame.image, self._camera.at(frame.image), self._background, depth)
 
     def _pose(self, frame: TumFrame) -> SE3 | None:

@@ -52,7 +52,9 @@ class TwelveScenesReader(Reader):
     def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Read the poses. Raises ``InputError`` if a description is invalid, and if no frame has a pose."""
         frames = images_posed(path, _frames(path, options))
-        return MetricImageDataset(Splits(path, _splits(path, frames)), options.background)
+        dataset = MetricImageDataset(Splits(path, _splits(path, frames)), options.background)
+        dataset.depth_unit = _metres_per_step(options)
+        return dataset
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         frames = _frames(path, options)
@@ -82,16 +84,19 @@ def _frames(path: Path, options: ReadOptions) -> list[ImageFrame]:
     assert info is not None
     colour, own = _cameras(info)
     camera = CameraSource(options.camera or colour)
-    unit = MILLIMETRE if options.depth_unit is None else options.depth_unit
     read, sensor = DepthReader(documented=("65535",)), options.sensor(path, own)
     images = [file for file in folder.iterdir() if COLOUR.fullmatch(file.name)]
     frames = []
     for image in sorted(images, key=lambda file: natural_order(file.name)):
         stem = image.name.partition(".")[0]
         depth = folder / f"{stem}.depth.png"
-        measured = DepthFile(depth, unit, read, sensor) if is_file(depth) else None
+        measured = DepthFile(depth, _metres_per_step(options), read, sensor) if is_file(depth) else None
         frames.append(ImageFrame(image, camera, _pose(folder / f"{stem}.pose.txt"), None, measured))
     return frames
+
+
+def _metres_per_step(options: ReadOptions) -> float:
+    return MILLIMETRE if options.depth_unit is None else options.depth_unit
 
 
 def _pose(file: Path) -> SE3 | None:

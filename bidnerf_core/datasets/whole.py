@@ -40,6 +40,11 @@ class WholeDataset:
         return getattr(self.parts, "unit", None)
 
     @property
+    def depth_unit(self) -> float | None:
+        """Metres per step of the depth images, if the format accepts another unit."""
+        return getattr(self.parts, "depth_unit", None)
+
+    @property
     def up(self) -> tuple[float, float, float] | None:
         """The upward direction in the world, if the capture measured gravity."""
         return getattr(self.parts, "up", None)

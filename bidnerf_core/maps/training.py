@@ -123,7 +123,7 @@ def train(
         part = f" in split {split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
             log.info(f"{read.place}: no measured depth{part}; training on colour only")
-        taken = prepared(read.views, refine_poses, progress, cancel, features, trust_poses)
+        taken = prepared(read.views, refine_poses, progress, cancel, features, trust_poses, read.depth_unit)
         if not taken.distances:
             log.info(
                 f"{read.place}: the photos are from one place and do not determine distances; the map's"
@@ -183,7 +183,7 @@ def resume(
             scene = load_map(out, work.device, baked=False)
             return scene.with_baked_parts(views, work.bake or USUAL_BAKE, progress=progress, cancel=cancel)
         tracked, views = located(
-            views, progress, cancel, info.landmark_features, trust_poses=True
+            views, progress, cancel, info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
         )  # the same as when training began
         return _trained(load_backend(info.backend, str(out)), info, views, tracked, work)
 

@@ -43,6 +43,7 @@ class ReadViews:
         None  # upward direction (world), if the capture measured gravity
     )
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
+    depth_unit: float | None = None  # metres per step of depth images, if their format accepts another
 
 
 def read_views(
@@ -70,6 +71,7 @@ def read_views(
     """
     stated: LengthUnit | None = None
     up: tuple[float, float, float] | None = None
+    step: float | None = None
     if isinstance(data, str | Path):
         data, camera = open_dataset(data, background, camera=camera), None
         background = None
@@ -82,7 +84,7 @@ def read_views(
             raise InputError(f"{data.path}: was opened with background {data.background}, got {background!r}")
         if isinstance(data, Georeferenced):
             stated, up = data.unit, data.up
-        data = with_all(data, split)
+        step, data = getattr(data, "depth_unit", None), with_all(data, split)
         if not data.frame_names(split):
             raise InputError(f"{data.path}: split {split!r} has no frames")
         views = _read(data, split, largest, folder, counter("reading", "images", progress, cancel))
@@ -97,9 +99,9 @@ def read_views(
     hidden = _hidden(views, place)
     unit = stated or _unit_of(views)
     if depth_points is None:
-        return ReadViews(views, source, place, colour, hidden, unit, up)
+        return ReadViews(views, source, place, colour, hidden, unit, up, depth_unit=step)
     views, count = _with_depth(views, Path(depth_points), point_choice or SparseChoice(), split)
-    return ReadViews(views, source, place, colour, hidden, unit, up, count)
+    return ReadViews(views, source, place, colour, hidden, unit, up, count, step)
 
 
 def _hidden(views: Sequence[View], place: str) -> int:
