@@ -234,3 +234,40 @@ def test_answers_in_a_format_of_poses_hold_the_accepted_ones(
         answers.save(tmp_path / "poses.tum")
     assert len((tmp_path / "poses.tum").read_text().splitlines()) == 3  # a heading, a name and a pose
     assert "1 without an accepted pose are left out" in caplog.text
+
+
+def answers_with(poses: list[SE3], truths: list[SE3]) -> Answers:
+    found, frame = replace(FOUND, outcome=Outcome.CONVERGED), Frame("a", torch.zeros((3, 4, 3)), CAMERA)
+    answers = Answers("hashgrid")
+    for pose, truth in zip(poses, truths, strict=True):
+        moved = replace(found, T_world_camera=pose)
+        answers.append(replace(Answer.of(frame, len(answers), moved), truth=truth))
+    return answers
+
+
+@pytest.mark.parametrize("line", [False, True])
+def test_errors_by_another_world_are_told_from_errors_of_poses(line: bool) -> None:
+    """Also where all cameras are on a line, about which positions alone do not determine the rotation."""
+    generator = torch.Generator().manual_seed(0)
+    tangents = torch.randn((6, 6), dtype=torch.float64, generator=generator)
+    truths = [SE3.exp(tangent) for tangent in tangents]
+    if line:
+        truths = [
+            SE3(truth.rotation, truth.translation * T.translation.new_tensor([1, 0, 0])) for truth in truths
+        ]
+    there = [SE3(T.rotation @ truth.rotation, T.apply(1.7 * truth.translation)) for truth in truths]
+    noise = 0.01 * torch.randn((6, 6), dtype=torch.float64, generator=generator)
+    noisy = [pose.retract(step) for pose, step in zip(there, noise, strict=True)]
+    remark = answers_with(noisy, truths).remark
+    assert remark is not None
+    assert remark.startswith("all 6 accepted poses differ from the dataset's by one transformation")
+    scale = float(remark.partition("a scale of ")[2].split()[0])
+    assert scale == pytest.approx(1.7, rel=0.02)
+    for others in (
+        truths,
+        [truth.retract(step) for truth, step in zip(truths, noise, strict=True)],
+        [*noisy[:5], noisy[5].retract(50 * noise[5])],
+        noisy[::-1],
+    ):
+        assert answers_with(others, truths).remark is None
+    assert answers_with(noisy[:2], truths[:2]).remark is None

@@ -272,6 +272,8 @@ class _Output:
         answers, out, accepted = self.answers, self._out, len(self.answers.accepted)
         if self._total > 1:
             say(f"{accepted} of {self._total} converged{answers.question}")
+        if answers.remark is not None:
+            say(answers.remark)
         if out is not None:
             if not accepted and pose_format(out) != ".json":
                 raise InputError(

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
+
+import torch
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.queries import Query, QuerySource
@@ -15,13 +18,14 @@ from bidnerf_core.depth.noise import noise_remark
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.geometry.units import LengthUnit, symbol
 from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization, Localizer, Outcome
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, LandmarkThresholds
 from bidnerf_core.localization.problem import unit_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
-from bidnerf_core.results.errors import PoseError, pose_error
+from bidnerf_core.results.errors import PoseError, pose_error, rotation_angle
+from bidnerf_core.results.other_world import world_of_truth
 from bidnerf_core.results.pose_files import PosedImage, pose_format, write_poses
 
 log = logging.getLogger("bidnerf")
@@ -142,6 +146,25 @@ class Answers:
         of the map.
         """
         return question_about_scene([answer.found for answer in self.answers])
+
+    @property
+    def remark(self) -> str | None:
+        """A remark on all errors together: the true poses may be those of another world; None if there is none."""
+        known = [(answer.found.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
+        if not known:
+            return None
+        worlds = world_of_truth(*(SE3.stack(list(poses)) for poses in zip(*known, strict=True)))
+        if worlds is None:
+            return None
+        T = worlds.T_target_source
+        turn, shift = (
+            float(part) for part in (rotation_angle(T.rotation), torch.linalg.vector_norm(T.translation))
+        )
+        return (
+            f"all {len(known)} accepted poses differ from the dataset's by one transformation (a rotation by"
+            f" {math.degrees(turn):.3g}°, a scale of {worlds.scale:.4g} and a shift of {shift:.3g} {symbol(self.unit)}): the"
+            " dataset's world is not that of the map"
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the poses atomically, in the format selected by the file extension.
