@@ -157,7 +157,7 @@ BAD_DATA: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no folder": (shutil.rmtree, ("no such folder",)),
     "empty folder": (
         empty,
-        ("no dataset found", "expected transforms.json"),
+        ("contains no photos and is no dataset", "docs/datasets.md: transforms, tum,"),
     ),
     "a file": (
         lambda folder: (folder.rename(f"{folder}.away"), folder.touch())[1],

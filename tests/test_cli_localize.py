@@ -134,7 +134,7 @@ def test_a_photo_without_a_camera_is_refused_in_a_line(
 def test_a_folder_without_photos_is_refused(bidnerf: Run, place: list[object], tmp_path: Path) -> None:
     status, out, err = bidnerf(*place, tmp_path)
     assert (status, out) == (1, "")
-    assert "contains no photos and is not a dataset" in err
+    assert "the folder is empty" in err
 
 
 # Datasets.

@@ -423,9 +423,10 @@ def test_bad_folders(tmp_path: Path, blender: Path) -> None:
     assert "is a file, expected the folder of a dataset" in message(blender / "transforms_test.json")
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert message(empty).startswith(
-        f"{empty}: no dataset found, expected transforms.json or transforms_train.json"
-    )
+    assert message(empty).startswith(f"{empty}: the folder is empty; expected photos or a dataset in one of")
+    (empty / "notes.txt").touch()
+    assert message(empty).startswith(f"{empty}: contains no photos and is no dataset; expected photos or a")
+    assert len(message(empty)) - len(str(empty)) < 300
 
 
 def test_unknown_split_and_frame(blender: Path) -> None:

@@ -208,7 +208,7 @@ def test_what_has_no_photos_or_has_poses(search: Search, tmp_path: Path, bidnerf
     (tmp_path / "empty").mkdir()
     cases = [
         (tmp_path / "nothing", "no such file or folder"),
-        (tmp_path / "empty", "contains no photos"),
+        (tmp_path / "empty", "the folder is empty"),
         (search.out, "dataset whose poses are known"),
         (search.photos / "000.png", "expected a folder of photos or a video"),
         (tmp_path / "clip.mp4", "no such file"),

@@ -17,9 +17,10 @@ from bidnerf_core.datasets.reader import (
     Reader,
     ReadOptions,
     checked_unit,
-    expected_files,
+    expected_formats,
     find_reader,
     may_hold,
+    no_dataset,
     opened,
     opened_sequence,
 )
@@ -192,7 +193,9 @@ def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:
     if inside:
         return f"no dataset found, expected one of the folders in it, such as {inside[0]}"
     photos, _ = photos_in(folder)
-    expected = "expected " + expected_files(readers)
+    if not photos and readers is None:
+        return no_dataset(folder)
+    expected = expected_formats(readers)
     if not photos:
         return f"no dataset found, {expected}"
     return (

@@ -15,7 +15,7 @@ from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.dataset import unique_names
 from bidnerf_core.datasets.masked import MaskedDataset
 from bidnerf_core.datasets.points import read_depth_points
-from bidnerf_core.datasets.reader import expected_files
+from bidnerf_core.datasets.reader import no_dataset
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
@@ -195,8 +195,7 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
         found, others = photos_in(path)
         others = [file for file in others if file not in depth]
         if not found:
-            formats = expected_files()
-            raise InputError(f"{path}: contains no photos and is not a dataset ({formats})")
+            raise InputError(f"{path}: {no_dataset(path)}")
         if others:
             named = ", ".join(file.name for file in others[:NAMED])
             more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""

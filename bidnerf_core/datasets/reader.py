@@ -168,11 +168,17 @@ def _answer(reader: Reader, folder: Path, expected: type, ask: Callable[[], Answ
     return answer
 
 
-def expected_files(readers: Sequence[Reader] | None = None) -> str:
-    """Return what the folders of the formats contain, for messages; by default for all readers."""
-    if readers is None:
-        readers = [*(READERS[name] for name in ORDER), *(reader for _, reader in _others())]
-    return "; or ".join(reader.expected for reader in readers)
+def no_dataset(folder: Path) -> str:
+    """Return that a folder has neither photos nor a dataset, and where the formats are described."""
+    found = "contains no photos and is no dataset" if any(folder.iterdir()) else "the folder is empty"
+    return f"{found}; {expected_formats()}"
+
+
+def expected_formats(readers: Sequence[Reader] | None = None) -> str:
+    """Return which formats are read, for messages: all, by name, or the files of those of some readers."""
+    if readers is not None:
+        return "expected " + "; or ".join(reader.expected for reader in readers)
+    return f"expected photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
 
 
 def _others() -> Iterator[tuple[str, Reader]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bidnerf_core.datasets.dataset import unique_names
-from bidnerf_core.datasets.reader import expected_files, find_reader
+from bidnerf_core.datasets.reader import find_reader, no_dataset
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, is_video
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.photos import natural_order, photos_in
@@ -54,7 +54,7 @@ def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
         )
     files = _listed(folder, out)
     if not files:
-        raise InputError(f"{folder}: contains no photos, and neither do its subfolders ({expected_files()})")
+        raise InputError(f"{folder}: {no_dataset(folder)}")
     names = unique_names([(*file.relative_to(folder).parts[:-1], file.stem) for file in files])
     return [SourceImage(name, file) for name, file in zip(names, files, strict=True)]
 

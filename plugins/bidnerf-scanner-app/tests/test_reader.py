@@ -275,7 +275,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no photos": (remove_photos, r"scan: has frame_N.json but no photo"),
     "number twice": (
         lambda f: (f / "frame_02.jpg").write_bytes((f / "frame_2.jpg").read_bytes()),
-        r"frame_02\.jpg and frame_2\.jpg have one number",
+        r"frame_02\.jpg and frame_2\.jpg have the same number",
     ),
 }
 
@@ -299,7 +299,7 @@ def test_unknown_split_and_frame(scan: Path) -> None:
 
 def test_folder_of_other_json_is_not_a_scan(tmp_path: Path) -> None:
     (tmp_path / "frame_0.json").write_text('{"pose": []}')
-    with pytest.raises(InputError, match=r"no dataset found, expected .* or frame_0\.jpg, frame_0\.json"):
+    with pytest.raises(InputError, match=r"is no dataset; expected .*scanner-app"):
         open_dataset(tmp_path)
 
 
