@@ -131,6 +131,21 @@ def test_a_photo_without_a_camera_is_refused_in_a_line(
     assert "no focal length in EXIF" in err
 
 
+def test_arguments_in_another_order_are_told_apart(
+    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
+) -> None:
+    swapped = bidnerf("localize", shared / "photos", shared / "map")
+    assert swapped.status == 2
+    assert f"'{shared / 'photos'}' is not a map, but '{shared / 'map'}' is: MAP comes first" in swapped.err
+    shutil.copytree(shared / "map", tmp_path / "other")
+    maps = bidnerf("localize", shared / "map", tmp_path / "other")
+    assert maps.status == 2
+    assert f"'{shared / 'map'}' and '{tmp_path / 'other'}' are maps, and no QUERY follows them" in maps.err
+    status, _, err = bidnerf(*place, shared / "data" / "transforms.json")
+    assert status == 1
+    assert f"transforms.json: is a file of a dataset; give its folder, {shared / 'data'}" in err
+
+
 def test_a_folder_without_photos_is_refused(bidnerf: Run, place: list[object], tmp_path: Path) -> None:
     status, out, err = bidnerf(*place, tmp_path)
     assert (status, out) == (1, "")

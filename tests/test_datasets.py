@@ -420,7 +420,7 @@ def test_another_reader_can_join(tmp_path: Path, blender: Path) -> None:
 
 def test_bad_folders(tmp_path: Path, blender: Path) -> None:
     assert message(tmp_path / "none") == f"{tmp_path / 'none'}: no such folder"
-    assert "is a file, expected the folder of a dataset" in message(blender / "transforms_test.json")
+    assert "is a file of a dataset; give its folder" in message(blender / "transforms_test.json")
     empty = tmp_path / "empty"
     empty.mkdir()
     assert message(empty).startswith(f"{empty}: the folder is empty; expected photos or a dataset in one of")

@@ -27,7 +27,13 @@ from bidnerf_core.cli.options import Flag, MapFolder, Names, option, parse, requ
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
-from bidnerf_core.cli.several_maps import check_for_several, collected, localize_in_several, named_maps
+from bidnerf_core.cli.several_maps import (
+    check_for_several,
+    collected,
+    localize_in_several,
+    named_maps,
+    no_query,
+)
 from bidnerf_core.cli.starts import StartSpec
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.queries import DepthPoints, Photos, Query, QuerySource
@@ -167,7 +173,7 @@ def run(arguments: list[str]) -> None:
             part.check()
         maps, query = named_maps(map, query)
         if not query:
-            raise UsageError("no QUERY, expected image files, folders of photos, or a folder of a dataset")
+            raise no_query(maps)
         require_start(method, begin.given)
         if depth_points is not None:
             require_use_of_depth(method)

@@ -11,7 +11,7 @@ from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets.queries import Query, QuerySource
 from bidnerf_core.datasets.reader import find_reader
-from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.errors import InputError, UsageError, enumeration
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.images import IMAGE_SUFFIXES
 from bidnerf_core.maps.collection import MapCollection, maps_in
@@ -27,6 +27,21 @@ def named_maps(first: Path, others: Sequence[Path]) -> tuple[list[Path], tuple[P
     while count < len(others) and _holds_maps(others[count]):
         count += 1
     return [first, *others[:count]], tuple(others[count:])
+
+
+def no_query(maps: Sequence[Path]) -> UsageError:
+    """Return the error for arguments that all count as maps: no query is among them, or it comes first."""
+    expected = "expected image files, folders of photos, or a folder of a dataset"
+    first, *others = maps
+    if not others:
+        return UsageError(f"no QUERY, {expected}")
+    if first.exists() and not maps_in(first):
+        return UsageError(
+            f"{str(first)!r} is not a map, but {str(others[0])!r} is: MAP comes first, then QUERY"
+        )
+    return UsageError(
+        f"{enumeration([repr(str(path)) for path in maps])} are maps, and no QUERY follows them; {expected}"
+    )
 
 
 def _holds_maps(path: Path) -> bool:

@@ -18,6 +18,7 @@ from bidnerf_core.datasets.reader import (
     ReadOptions,
     checked_unit,
     expected_formats,
+    file_of_dataset,
     find_reader,
     may_hold,
     no_dataset,
@@ -181,6 +182,8 @@ def _options(
 
 def _not_a_dataset(file: Path) -> str:
     """Return why a file is not a dataset."""
+    if (instead := file_of_dataset(file)) is not None:
+        return instead
     packed = file.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
     return f"is a file, expected the folder of a dataset{'; unpack the archive first' if packed else ''}"
 

@@ -15,7 +15,7 @@ from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.dataset import unique_names
 from bidnerf_core.datasets.masked import MaskedDataset
 from bidnerf_core.datasets.points import read_depth_points
-from bidnerf_core.datasets.reader import no_dataset
+from bidnerf_core.datasets.reader import file_of_dataset, no_dataset
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
@@ -24,7 +24,7 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.masks import MaskFolder
 from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import Background
+from bidnerf_core.io.images import Background, looks_like_image
 from bidnerf_core.localization import window as windowed
 
 log = logging.getLogger("bidnerf")
@@ -190,6 +190,8 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
     files = list[Path]()
     for path in paths:
         if not path.is_dir():
+            if (instead := file_of_dataset(path)) is not None and not looks_like_image(path):
+                raise InputError(f"{path}: {instead}")
             files.append(path)
             continue
         found, others = photos_in(path)

@@ -14,7 +14,7 @@ from bidnerf_core.datasets.sequence import FrameSequence, sequence_of
 from bidnerf_core.depth.images import FARTHEST
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, enumeration
-from bidnerf_core.io.images import Background
+from bidnerf_core.io.images import IMAGE_SUFFIXES, Background
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
@@ -166,6 +166,16 @@ def _answer(reader: Reader, folder: Path, expected: type, ask: Callable[[], Answ
     if not isinstance(answer, expected):
         raise InputError(f"{who} returned a {type(answer).__name__}, expected a {expected.__name__}")
     return answer
+
+
+def file_of_dataset(path: Path) -> str | None:
+    """Return a clause that names the folder to give instead of a file in it that describes a dataset, or None."""
+    is_photo = path.suffix.lower() in IMAGE_SUFFIXES or not path.is_file()
+    return (
+        None
+        if is_photo or find_reader(path.parent) is None
+        else f"is a file of a dataset; give its folder, {path.parent}"
+    )
 
 
 def no_dataset(folder: Path) -> str:
