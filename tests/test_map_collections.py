@@ -20,6 +20,8 @@ from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps.collection import maps_in
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
+from bidnerf_core.service.worker import Served, Worker
+from bidnerf_core.service.worker import _together as together_of
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, POSES, ground, training_views, view
 from commands import Run
 
@@ -62,6 +64,26 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
         assert found.runner_up[0] == found.ranking[1].map
         alone = bn.Localizer(grounds[SEEDS.index(seed)])(image.frame)
         assert torch.equal(found.found.T_world_camera.matrix(), alone.T_world_camera.matrix())
+
+
+@pytest.mark.slow
+def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
+    """Under the names by which the maps are served, and with the localizers that serve them."""
+    served = {name: Served(scene, bn.Localizer(scene)) for name, scene in zip("ab", grounds, strict=False)}
+    together = together_of(served)
+    assert together is not None
+    assert together.localizer("b") is served["b"].localizer
+    assert together_of({"a": served["a"]}) is None
+    worker = Worker(served, together, 1e6, tmp_path, "cpu")
+    png = iio.imwrite("<bytes>", (255 * photo(SEEDS[1]).frame.rgb).byte().numpy(), extension=".png")
+    request = {"id": "1", "kind": "localize", "map": None, "parameters": {"name": "<i>", "focal": CAMERA.fx}}
+    reply = worker.answer(request, {"photo": png})
+    assert reply["status"] == 200, reply
+    body = reply["body"]
+    assert (body["frame"], body["map"], body["converged"]) == ("<i>", "b", True)
+    assert body["runner_up"]["map"] == "a"
+    alone = worker.answer(request | {"map": "b"}, {"photo": png})["body"]
+    assert alone["T_world_camera"] == body["T_world_camera"]
 
 
 @pytest.mark.slow

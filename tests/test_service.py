@@ -310,7 +310,11 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
 
 def test_what_is_missing_is_named(service: Service, place: Place) -> None:
     for path, part in (
-        ("/localize", "expected map as one of map, hall"),
+        (
+            f"/localize?focal=32&start={place.start.replace(' ', '')}",
+            "start was given without map, expected map as one of",
+        ),
+        ("/localize?focal=32", "needs a start"),
         ("/localize?map=map&fcal=3", "did you mean 'focal'?"),
         ("/localize?map=map&focal=x", 'focal is "x", expected a number'),
         ("/localize?map=map&focal=1&focal=2", "focal is given twice"),
@@ -319,6 +323,11 @@ def test_what_is_missing_is_named(service: Service, place: Place) -> None:
     ):
         assert part in service.post(path, place.photo).json["detail"]
     assert service.post("/localize?map=map").json["detail"].startswith("no photo, expected")
+    body = b'{"type": "geopose"}'
+    assert (
+        "expected map as one of map, hall"
+        in service.post("/geopose", body, "application/json").json["detail"]
+    )
     assert service.get("/localize").status == 405
     assert service.get("/nothing").json["status"] == 404
 

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -78,17 +78,19 @@ class MapCollection:
 
     def __init__(
         self,
-        maps: str | Path | Sequence[Map | str | Path],
+        maps: str | Path | Sequence[Map | str | Path] | Mapping[str, Map],
         method: str = USUAL_METHOD,
         config: Any = None,
         asked: int = ASKED,
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
+        localizers: Mapping[str, Localizer] | None = None,
     ) -> None:
-        """Read the landmarks of all maps: those in the subfolders of one folder, or a list of maps and of
-        folders of maps.
+        """Read the landmarks of all maps: those in the subfolders of one folder, a list of maps and of folders
+        of maps, or maps by name.
 
-        ``asked`` is the largest number of maps that are tried. Raises ``InputError`` if there is no map, or
+        ``asked`` is the largest number of maps that are tried, and ``localizers`` are existing ones by the
+        names of their maps. Raises ``InputError`` if there is no map, or
         two have the same name, and ``Cancelled`` once ``cancel`` returns True.
         """
         if asked < 1:
@@ -96,6 +98,7 @@ class MapCollection:
         self.method, self.config, self.asked = method, config, asked
         self._maps = _named([maps] if isinstance(maps, str | Path) else maps)
         self._localizers: OrderedDict[str, Localizer] = OrderedDict()
+        self._given_localizers = localizers or {}
         self._infos = {name: _info(scene) for name, scene in self._maps.items()}
         self._pooled: dict[str, Float[Tensor, "v p"]] = {}
         self._vocabularies: dict[tuple[str, int], Vocabulary] = {}
@@ -120,6 +123,8 @@ class MapCollection:
         """
         if name not in self._maps:
             raise InputError(f"no map {name!r}, expected one of {', '.join(self._maps)}")
+        if name in self._given_localizers:
+            return self._given_localizers[name]
         if name not in self._localizers:
             scene = self._maps[name]
             stored = scene if isinstance(scene, Map) else load_map(scene)
@@ -211,7 +216,9 @@ def maps_in(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob(f"*/{DESCRIPTION}"))
 
 
-def _named(maps: Sequence[Map | str | Path]) -> dict[str, Map | Path]:
+def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str, Map | Path]:
+    if isinstance(maps, Mapping):
+        return maps
     found: dict[str, Map | Path] = {}
     for given in maps:
         scenes: list[Map | Path] = [given] if isinstance(given, Map) else [*maps_in(Path(given))]

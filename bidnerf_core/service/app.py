@@ -174,7 +174,7 @@ async def _maps(request: Request) -> Response:
 
 async def _map(request: Request) -> Response:
     pool: Pool = request.app.state.pool
-    return _json(pool.described[_chosen(request, None)])
+    return _json(pool.described[str(_chosen(request, None))])
 
 
 async def _localize(request: Request) -> Response:
@@ -184,7 +184,7 @@ async def _localize(request: Request) -> Response:
         content = await body_of(request, pool.config)
         query = await query_of(request, content)
         del content
-        name = _chosen(request, query.parameters.pop("map", None))
+        name = _chosen(request, query.parameters.pop("map", None))  # without one, the map is found
         answer = await _answer(request, pool, "localize", name, query, None)
     return _json(answer["body"]) if "body" in answer else _failed(answer)
 
@@ -197,6 +197,9 @@ async def _geopose(request: Request) -> Response:
     with _place(pool):
         body = json_of(await body_of(request, pool.config))
         name = _chosen(request, request.query_params.get("map"))
+        if name is None:  # the answer refers to one anchor, and prior poses to one world
+            names = ", ".join(pool.described)
+            raise Refused(400, f"several maps are served, expected map as one of {names}")
         answer = await _answer(request, pool, "geopose", name, Query(), body)
     if "body" not in answer:
         return _failed(answer)
@@ -214,21 +217,21 @@ def _place(pool: Pool) -> Any:
         raise Refused(429, f"all {pool.config.places} places are taken, try again later", headers) from error
 
 
-def _chosen(request: Request, asked: str | None) -> str:
-    """Return the name of the map that a request is for. Raises ``Refused`` for an unknown one."""
+def _chosen(request: Request, asked: str | None) -> str | None:
+    """Return the name of the map that a request is for; None if it is for any of several. Raises ``Refused``
+    for an unknown one.
+    """
     names = list(request.app.state.pool.described)
     asked = request.path_params.get("map", asked)
-    if asked is None and len(names) == 1:
-        return str(names[0])
     if asked is None:
-        raise Refused(400, f"several maps are served, expected map as one of {', '.join(names)}")
+        return str(names[0]) if len(names) == 1 else None
     if asked not in names:
         raise Refused(404, f"no map with that name, expected one of {', '.join(names)}")
     return str(asked)
 
 
 async def _answer(
-    request: Request, pool: Pool, kind: str, name: str, query: Query, body: Mapping[str, Any] | None
+    request: Request, pool: Pool, kind: str, name: str | None, query: Query, body: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """Return a worker's answer; stop the work if the client disconnects. Raises ``Refused``."""
     loop = asyncio.get_running_loop()
@@ -252,7 +255,7 @@ async def _answer(
         await asyncio.gather(answering, leaving, return_exceptions=True)
         facts |= {"attempts": job.attempts, "waited": None if job.waited is None else round(job.waited, 4)}
     outcome = answer.get("outcome", "bad input" if answer["status"] < 500 else "fault")
-    pool.metrics.outcomes[name, outcome] += 1
+    pool.metrics.outcomes[name or "", outcome] += 1
     facts |= {"outcome": outcome, "worker": answer["worker"]}
     if "fault" in answer:
         facts["fault"] = answer["fault"]

@@ -32,7 +32,7 @@ class ServiceClient:
     def localize(self, photo: str | Path | bytes, **given: Any) -> dict[str, Any]:
         """Return the JSON of ``bidnerf localize`` for a photo, given as a file or its bytes.
 
-        ``given``: ``map`` and ``name``; ``depth``, a file or its bytes, with ``depth_unit``; ``focal``,
+        ``given``: ``map`` (by default the one that the photo shows) and ``name``; ``depth``, a file or its bytes, with ``depth_unit``; ``focal``,
         ``hfov``, or ``camera``, a path or such a file's content as bytes; ``start``, 4x4 rows of
         T_world_camera; ``seed``. Raises ``ServiceError``.
         """

@@ -12,6 +12,7 @@ from bidnerf_core.settings import LARGEST_SEED
 
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}
 MATRIX = {"type": "array", "items": {"type": "array", "items": NUMBER}}
+DEFAULT_MAP = "by default the one that the photo shows"
 ERRORS = {
     400: "The request is malformed: the detail states what was found and what is expected.",
     401: "The service has a token, and the request does not carry it.",
@@ -112,11 +113,7 @@ def _fields() -> dict[str, Any]:
 
 
 def _query(maps: Sequence[str] | None) -> list[Any]:
-    chosen = (
-        {"map": {"type": "string", "enum": [*maps], "description": "needed if there are several"}}
-        if maps
-        else {}
-    )
+    chosen = {"map": {"type": "string", "enum": [*maps], "description": DEFAULT_MAP}} if maps else {}
     return [{"name": n, "in": "query", "schema": schema} for n, schema in (chosen | _fields()).items()]
 
 
@@ -127,13 +124,13 @@ def _localize(maps: Sequence[str] | None) -> Any:
         "properties": {
             "photo": {**file, "description": "an image file"},
             "depth": {**file, "description": "a depth image, or the .npy of an array: planar z"},
-            **({"map": {"type": "string", "enum": [*maps]}} if maps else {}), **_fields(),
+            **({"map": {"type": "string", "enum": [*maps], "description": DEFAULT_MAP}} if maps else {}), **_fields(),
         },
     }  # fmt: skip
     answer = {"application/json": {"schema": {"$ref": "#/components/schemas/Localization"}}}
     return {
         "summary": "Find the pose of a photo.",
-        "description": "The response is that of 'bidnerf localize --json'. Never use a pose whose 'converged' is"
+        "description": "The response is that of 'bidnerf localize --json', in several maps if none is named. Never use a pose whose 'converged' is"
                 " false.",
         "parameters": _query(maps),
         "requestBody": {
@@ -177,7 +174,11 @@ def _geopose(maps: Sequence[str] | None) -> Any:
         "description": "A map without an anchor responds with localpose, in the map's frame, instead of"
         " geopose. The quaternion rotates from x forward, y left, z up at the camera. An"
         " untrusted pose results in status 422.",
-        "parameters": [p for p in _query(maps) if p["name"] == "map"],
+        "parameters": [
+            p | {"required": len(maps or ()) > 1, "schema": {"type": "string", "enum": [*(maps or ())]}}
+            for p in _query(maps)
+            if p["name"] == "map"
+        ],
         "requestBody": {"required": True, "content": {"application/json": {"schema": request}}},
         "responses": {"200": {"description": "The pose and its accuracy.", "content": answered}}
         | _errors(400, 401, 403, 404, 408, 413, 422, 429, 503, 504),

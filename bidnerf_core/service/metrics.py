@@ -34,7 +34,7 @@ class Metrics:
 
     def __init__(self) -> None:
         self.requests = Counter[tuple[str, int]]()  # by documented path and status
-        self.outcomes = Counter[tuple[str, str]]()  # by map and outcome
+        self.outcomes = Counter[tuple[str, str]]()  # by map asked for, "" if none, and outcome
         self.restarts = Counter[str]()  # of workers, by reason
         self.seconds, self.waited = Histogram(), Histogram()
         self.gauges: dict[str, tuple[str, Callable[[], float]]] = {}

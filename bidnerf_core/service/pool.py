@@ -55,7 +55,7 @@ class Job:
     """A request that waits for a worker, or is being processed."""
 
     kind: str  # "localize" or "geopose"
-    map: str
+    map: str | None  # None: the one that the photo shows
     parameters: Mapping[str, Any]
     blocks: Mapping[str, bytes]
     deadline: float  # in the event loop's clock

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.queries import Photos
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import read_header
+from bidnerf_core.io.images import Background, read_header
 from bidnerf_core.io.tensors import read_array
-from bidnerf_core.localization import Localizer
 from bidnerf_core.results.pose_files import read_pose
 
 NUMPY, HEIF_BRANDS = b"\x93NUMPY", (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"heim", b"heis")
@@ -31,8 +31,19 @@ class Upload:
         """The name of the frame in the answer."""
         return str(self.parameters.get("name") or "photo")
 
-    def read(self, localizer: Localizer, folder: Path, max_pixels: float) -> tuple[Photos, SE3 | None]:
-        """Write the files into ``folder``, check the sizes in their headers, and return the photo and the start."""
+    @property
+    def seed(self) -> int:
+        """The seed of the search."""
+        return int(self.parameters.get("seed") or 0)
+
+    def read(
+        self, assumed: tuple[Intrinsics, ...], background: Background, folder: Path, max_pixels: float
+    ) -> tuple[Photos, SE3 | None]:
+        """Write the files into ``folder``, check the sizes in their headers, and return the photo and the start.
+
+        ``assumed`` are the cameras that a photo without a focal length may have, and ``background`` is what lies
+        behind transparent pixels.
+        """
         photo = _written(folder, "photo", self.blocks["photo"])
         _check_size(photo, max_pixels)
         depth = _written(folder, "depth", self.blocks["depth"]) if "depth" in self.blocks else None
@@ -43,16 +54,13 @@ class Upload:
             raise InputError(
                 "depth_unit was given without depth, expected the depth image that it belongs to"
             )
-        scene = localizer.map
         camera = CameraSource(
             self._file(folder, "camera"),
             self.parameters.get("focal"),
             self.parameters.get("hfov"),
-            localizer.assumed_cameras,
+            assumed,
         )
-        photos = Photos(
-            [photo], camera, {} if depth is None else {photo: depth}, unit, background=scene.bounds.background
-        )
+        photos = Photos([photo], camera, {} if depth is None else {photo: depth}, unit, background=background)
         start = self._file(folder, "start")
         return photos, None if start is None else read_pose(start)
 

@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import BLACK
 from bidnerf_core.localization import Localizer, settings_of
+from bidnerf_core.maps.collection import MapCollection
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.answers import Answer, localize_each
+from bidnerf_core.results.placements import place_each
 from bidnerf_core.service import geopose, wire
 from bidnerf_core.service.settings import ChosenMethod
 from bidnerf_core.service.upload import Upload
@@ -46,6 +49,7 @@ class Worker:
     """Everything needed to answer requests, loaded before workers are forked."""
 
     maps: Mapping[str, Served]
+    together: MapCollection | None  # several maps, for photos whose map is not known
     max_pixels: float
     folder: Path  # where request files are stored, each request in its own folder
     device: str
@@ -62,7 +66,7 @@ class Worker:
             scene = load_map(place)
             localizer = Localizer(scene, method.name, config, warm_up=method.device == "cpu")
             served[name] = Served(scene, localizer)
-        return Worker(served, max_pixels, folder, method.device)
+        return Worker(served, _together(served), max_pixels, folder, method.device)
 
     @property
     def described(self) -> dict[str, Any]:
@@ -87,19 +91,23 @@ class Worker:
             name: Served(s.scene, Localizer(s.scene, s.localizer.method, s.localizer.config, self.device))
             for name, s in self.maps.items()
         }
-        return Worker(moved, self.max_pixels, self.folder, self.device)
+        return Worker(moved, _together(moved), self.max_pixels, self.folder, self.device)
 
     def answer(self, request: dict[str, Any], blocks: Mapping[str, bytes]) -> dict[str, Any]:
         """Return the status and body of the response to a request."""
         folder = self.folder / request["id"]
         try:
             folder.mkdir(mode=0o700)
+            upload = Upload(request["parameters"], blocks)
+            if request["map"] is None and self.together is not None:
+                answer, plain = self._placed(self.together, upload, folder)
+                return {"status": OK, "body": plain, "outcome": str(answer.found.outcome)}
             served = self.maps[request["map"]]
             if request["kind"] == "geopose":
                 return geopose.answer(
                     served.scene.anchor, request["body"], lambda query: self._localize(served, query, folder)
                 )
-            answer, plain = self._localize(served, Upload(request["parameters"], blocks), folder)
+            answer, plain = self._localize(served, upload, folder)
             return {"status": OK, "body": plain, "outcome": str(answer.found.outcome)}
         except InputError as error:
             return {"status": UNUSABLE, "detail": str(error).replace(f"{folder}{os.sep}", "")}
@@ -112,8 +120,27 @@ class Worker:
 
     def _localize(self, served: Served, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
         """Localize a photo; return the answer, and its JSON values as printed by ``bidnerf localize --json``."""
-        photos, start = upload.read(served.localizer, folder, self.max_pixels)
-        seed = int(upload.parameters.get("seed") or 0)
-        answers = localize_each(served.localizer, photos, start=lambda _: start, seed=seed)
+        assumed, background = served.localizer.assumed_cameras, served.scene.bounds.background
+        photos, start = upload.read(assumed, background, folder, self.max_pixels)
+        answers = localize_each(served.localizer, photos, start=lambda _: start, seed=upload.seed)
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}
+
+    def _placed(self, maps: MapCollection, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
+        """Localize a photo in the map that it shows; return the answer and its JSON values, with that map."""
+        photos, start = upload.read(maps.cameras, BLACK, folder, self.max_pixels)
+        if start is not None:
+            raise InputError(f"start was given without map, expected map as one of {', '.join(self.maps)}")
+        answers = place_each(maps, photos, seed=upload.seed)
+        (answer,) = answers.answers
+        return answer, {**answers.plain(answer), "frame": upload.name}
+
+
+def _together(maps: Mapping[str, Served]) -> MapCollection | None:
+    """Return several maps as a collection that uses their localizers; None for a single one."""
+    if len(maps) == 1:
+        return None
+    first = next(iter(maps.values())).localizer
+    localizers = {name: served.localizer for name, served in maps.items()}
+    scenes = {name: served.scene for name, served in maps.items()}
+    return MapCollection(scenes, first.method, first.config, localizers=localizers)
