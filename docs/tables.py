@@ -732,7 +732,7 @@ def imported(records: Records) -> str:
 @table
 def photos(records: Records) -> str:
     """Maps from photos whose poses are unknown, beside maps from the poses of the datasets."""
-    names = {"photos_doll": "doll", "photos_tum_video": "TUM, as a video"}
+    names = {"photos_doll": "doll", "photos_tum_video": "TUM, as a video", "photos_corridor": "corridor"}
     rows = []
     for name, title in names.items():
         result = records[name]
