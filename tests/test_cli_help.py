@@ -11,6 +11,7 @@ import tyro
 
 from bidnerf_core.cli import COMMANDS, main, options
 from bidnerf_core.localization import METHODS
+from commands import Run
 
 CHOICES = {
     "train": [["--backend", name] for name in ("adanerf", "hashgrid", "vanilla")],
@@ -73,3 +74,47 @@ def test_boxes_are_whole_on_a_terminal_of_80_columns(
     assert rows
     assert len(rows[0]) <= 80
     assert [line for line in rows if len(line) != len(rows[0]) or line[-1] not in "╮│╯+|"] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train", "--outt", "X", "photos"], "no option '--outt', did you mean '--out'?"),
+        (
+            ["train", "d", "--out", "x", "--depth_uni=2"],
+            "no option '--depth-uni', did you mean '--depth-unit'?",
+        ),
+        (["train", "d"], "--out (folder for the map) is missing"),
+        (["train", "d", "--out"], "no value for --out (folder for the map)"),
+        (
+            ["train", "d", "--out", "x", "--steps", "a"],
+            "--steps is 'a', expected a whole number (steps of the",
+        ),
+        (
+            ["localize", "m", "p", "--focal=abc"],
+            "--focal is 'abc', expected a number (focal length in pixels",
+        ),
+        (["scale", "m", "--distance", "a", "b"], "--distance is 'a b', expected A B METRES (true distance"),
+        (["scale", "m"], "one of --distance, --poses and --factor is missing"),
+        (["scale", "m", "--factor", "1", "--poses", "x"], "--factor and --poses exclude each other"),
+        (
+            ["localize", "m", "p", "--mask-hides", "red"],
+            "--mask-hides is 'red', expected one of black, white",
+        ),
+        (["info", "m", "extra"], "1 argument too many, from 'extra' on"),
+    ],
+)
+def test_wrong_arguments_are_told_in_a_line(bidnerf: Run, words: list[str], message: str) -> None:
+    status, out, err = bidnerf(*words)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"bidnerf {words[0]}: {message}")
+    assert err.endswith(f"; 'bidnerf {words[0]} --help' describes all arguments\n")
+
+
+def test_a_parser_without_the_hook_tells_it_in_its_own_way(
+    bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("tyro._errors.on_parse_error")
+    status, _, err = bidnerf("info", "m", "--nonsense")
+    assert status == 2
+    assert "Unrecognized options" in err

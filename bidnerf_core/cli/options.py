@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import io
 import math
 import os
+import re
 import shutil
 import sys
 from collections import Counter
@@ -18,11 +20,13 @@ import tyro
 
 from bidnerf_core.cli.help_page import Page, retyped, without_expert_settings
 from bidnerf_core.cli.output import PrintableStream
+from bidnerf_core.cli.parser_errors import refusals_in_a_line
 from bidnerf_core.errors import InputError, UsageError, printable
 
 _T = TypeVar("_T")
 
 DEFAULT_BACKEND = "hashgrid"
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 LEAST_WIDTH = 40
 """Minimum line width of help, even in narrower terminals."""
 
@@ -76,10 +80,19 @@ def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> 
     with (
         contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext(),
         _wide_enough(),
+        refusals_in_a_line(arguments, lambda: _options_of(command, function)),
     ):
         return tyro.cli(
             function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
         )
+
+
+def _options_of(command: str, function: Callable[..., Any]) -> set[str]:
+    """Return the names of a command's options, from its help page."""
+    page = io.StringIO()
+    with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
+        _called(command, function, ["--help"])
+    return set(OPTION.findall(page.getvalue()))
 
 
 @contextlib.contextmanager

@@ -1,0 +1,106 @@
+"""Messages for arguments that the parser refuses: one line, as for every other mistake.
+
+The parser (tyro) reports them through a hook that is not part of its stable interface. If a version lacks the
+hook, or reports something unknown here, the parser prints its own message.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import types
+import typing
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Any
+
+from bidnerf_core.errors import UsageError, amount, enumeration, spelling_hint
+
+NUMBERS = {int: "a whole number", float: "a number"}
+
+
+@contextlib.contextmanager
+def refusals_in_a_line(arguments: Sequence[str], options: Callable[[], Collection[str]]) -> Iterator[None]:
+    """Raise ``UsageError`` where the parser refuses ``arguments``; ``options`` returns the names of all options."""
+    try:
+        from tyro import _errors
+    except ImportError:
+        hooked = None
+    else:
+        hooked = getattr(_errors, "on_parse_error", None)
+
+    def refuse(event: Any) -> None:
+        message = _unknown_option(arguments, options()) or _message(event, arguments)
+        if message is not None:
+            raise UsageError(f"{message}; '{event.prog} --help' describes all arguments")
+
+    with contextlib.nullcontext() if hooked is None else hooked(refuse):
+        yield
+
+
+def _unknown_option(arguments: Sequence[str], options: Collection[str]) -> str | None:
+    for word in arguments:
+        name = word.partition("=")[0].replace("_", "-")
+        if name.startswith("--") and len(name) > 2 and name not in options:
+            return f"no option {name!r}{spelling_hint(name, options)}"
+    return None
+
+
+def _message(event: Any, arguments: Sequence[str]) -> str | None:
+    """Return what is wrong, or None for an event that is not known here."""
+    kind = type(event).__name__
+    if kind == "MissingArgs":
+        missing = [f"{_name(each.arg)} ({_help(each.arg)})" for each in event.missing_arguments]
+        return f"{enumeration(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+    if kind == "MissingMutexGroup":
+        names = [_name(each.arg) for each in event.groups[0]]
+        return f"one of {enumeration(names)} is missing"
+    if kind == "MutexConflict":
+        return f"{event.first_token} and {event.second_token} exclude each other, expected only one of them"
+    if kind == "UnrecognizedArgs":
+        return f"{amount(len(event.tokens), 'argument')} too many, from {event.tokens[0]!r} on"
+    if kind == "BadValue" and event.reason == "too_few_values":
+        return f"no value for {_name(event.argument)} ({_help(event.argument)})"
+    if kind == "InvalidChoice":
+        hint = spelling_hint(event.value, event.choices)
+        listed = ", ".join(event.choices)
+        return f"{_name(event.argument)} is {event.value!r}, expected one of {listed}{hint}"
+    if kind == "InstantiationFailure" and event.argument is not None:
+        return _wrong_value(event.argument, arguments)
+    return None
+
+
+def _wrong_value(argument: Any, arguments: Sequence[str]) -> str:
+    given = " ".join(_values(argument.lowered.name_or_flags, arguments))
+    expected = _expected(argument.field.type_stripped) or argument.lowered.metavar
+    return f"{_name(argument)} is {given!r}, expected {expected} ({_help(argument)})"
+
+
+def _values(names: Sequence[str], arguments: Sequence[str]) -> list[str]:
+    """Return the values given to an option; the last occurrence counts."""
+    found: list[str] = []
+    for place, word in enumerate(arguments):
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") in names:
+            rest = arguments[place + 1 :]
+            end = next((n for n, each in enumerate(rest) if each.startswith("--")), len(rest))
+            found = [value] if equals else list(rest[:end])
+    return found
+
+
+def _expected(kind: Any) -> str | None:
+    """Return a type in words, or None if its name in the help page says more."""
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        kinds = [each for each in typing.get_args(kind) if each is not type(None)]
+        return _expected(kinds[0]) if len(kinds) == 1 else None
+    return NUMBERS.get(kind)
+
+
+def _name(argument: Any) -> str:
+    """Return an option, or a positional argument as the help page calls it."""
+    name = argument.lowered.metavar if argument.is_positional() else argument.lowered.name_or_flags[0]
+    return str(name)
+
+
+def _help(argument: Any) -> str:
+    text = argument.field.helptext
+    found = text() if callable(text) else text
+    return " ".join((found or argument.lowered.metavar or "").split())
