@@ -25,6 +25,7 @@ SIZE = (4032, 3024)
 PHOTO = Raster(*SIZE, UPRIGHT)
 PORTRAIT = Raster(*SIZE, Orientation.from_exif(6))
 WAYS = r"--camera FILE, --focal PX or --hfov DEG \(camera=, focal=, hfov= in Python\)"
+WAYS_OF_PHOTO = r"--camera FILE, --focal PX or --hfov DEG \(in Python camera=, focal=, hfov=, or assumed= with a map's cameras\)"
 
 
 def found(exif: Exif = Exif(), raster: Raster = PHOTO, **given: Any) -> Intrinsics:  # noqa: B008
@@ -68,7 +69,9 @@ def test_a_portrait_photo_is_as_wide_as_it_was_high() -> None:
 def test_a_photo_that_was_cropped_since_is_refused() -> None:
     for taken in (SIZE, SIZE[::-1]):
         assert found(Exif(size=taken, equivalent_mm=26)).fx > 0
-    with pytest.raises(InputError, match=rf"is 4032x3024, but was 4032x2268 when EXIF was written.*{WAYS}"):
+    with pytest.raises(
+        InputError, match=rf"is 4032x3024, but was 4032x2268 when EXIF was written.*{WAYS_OF_PHOTO}"
+    ):
         found(Exif(size=(4032, 2268), equivalent_mm=26))
 
 
@@ -76,7 +79,7 @@ def test_a_photo_that_was_cropped_since_is_refused() -> None:
 def test_without_a_focal_length_the_ways_to_give_one_are_named(exif: Exif) -> None:
     with pytest.raises(
         InputError,
-        match=rf"^a\.jpg: no focal length in EXIF, expected a camera: {WAYS}, or assumed= with a map's cameras$",
+        match=rf"^a\.jpg: no focal length in EXIF, expected a camera: {WAYS_OF_PHOTO}$",
     ):
         found(exif)
 

@@ -32,6 +32,7 @@ CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 NO_EXIF = Exif()
 MIDDLE = "the principal point is assumed to be the image centre"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
+WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, focal=, hfov=, or assumed= with a map's cameras)"
 
 
 @dataclass(frozen=True)
@@ -222,8 +223,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
     if taken and _is_cropped(raster, taken):
         size = f"{raster.width}x{raster.height}"
         raise InputError(
-            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}, "
-            "or assumed= with a map's cameras"
+            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS_OF_PHOTO}"
         )
     return _by_exif(where, raster, exif, raster.size)
 
@@ -257,9 +257,7 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
         return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
-    raise InputError(
-        f"{where}: no focal length in EXIF, expected a camera: {WAYS}, or assumed= with a map's cameras"
-    )
+    raise InputError(f"{where}: no focal length in EXIF, expected a camera: {WAYS_OF_PHOTO}")
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
