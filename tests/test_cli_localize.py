@@ -131,6 +131,23 @@ def test_a_photo_without_a_camera_is_refused_in_a_line(
     assert "no focal length in EXIF" in err
 
 
+def test_all_splits_of_a_dataset_are_localized(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    words = [
+        "localize",
+        *QUICK,
+        "--start",
+        shared / "start.json",
+        shared / "map",
+        shared / "data",
+        "--split",
+        "all",
+    ]
+    found = bidnerf(*words, "--json", "--out", tmp_path / "transforms.json")
+    dataset = open_dataset(shared / "data")
+    count = sum(len(dataset.frame_names(split)) for split in dataset.splits)
+    assert len(objects(found.out)) == count, found.err
+
+
 def test_arguments_in_another_order_are_told_apart(
     bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
 ) -> None:

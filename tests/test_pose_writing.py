@@ -142,6 +142,18 @@ def test_transforms_with_times_are_a_sequence(tmp_path: Path) -> None:
         torch.testing.assert_close(timed.truth.matrix(), image.T_world_camera.matrix(), atol=1e-9, rtol=0)
 
 
+def test_heads_state_the_direction_of_the_poses_and_no_unit_where_there_is_no_pose(tmp_path: Path) -> None:
+    write_poses(tmp_path / "none.tum", [])
+    assert (tmp_path / "none.tum").read_text().startswith("# timestamp tx ty tz qx qy qz qw (camera to world")
+    assert "lengths" not in (tmp_path / "none.tum").read_text()
+    image = PosedImage("a", 0, CAMERA, SE3.identity(), unit="metres")
+    write_poses(tmp_path / "images.txt", [image])
+    head = (tmp_path / "images.txt").read_text()
+    assert "world to camera" in head
+    assert "lengths in metres" in head
+    assert "camera to world" not in head
+
+
 def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         InputError,

@@ -107,6 +107,17 @@ def test_known_poses_give_the_factor(ground: Map) -> None:
         bn.factor_of_poses(ground, wrong)
 
 
+def test_a_map_in_metres_that_is_scaled_again_is_remarked(
+    ground: Map, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "bidnerf")
+    metric = ground.scaled(2.0)
+    metric.scaled(1.0)
+    assert not caplog.text
+    metric.scaled(2.0)
+    assert "was in metres before; its lengths are multiplied by 2 all the same" in caplog.text
+
+
 def test_known_positions_come_from_a_file(ground: Map, tmp_path: Path) -> None:
     known, file = {c.name: 3 * c.pose.translation for c in ground.info.cameras}, tmp_path / "known.json"
     file.write_text(json.dumps({f"{name}.jpg": place.tolist() for name, place in known.items()}))

@@ -33,6 +33,7 @@ from bidnerf_core.localization.recording import (
     recorded,
 )
 from bidnerf_core.progress import stopped_by
+from bidnerf_core.results.pose_files import PosedImage, write_poses
 from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid, shown_answer
 from bidnerf_core.viewer.explanations import contests
 from bidnerf_core.viewer.figures import Bar, acceptance_figures
@@ -41,6 +42,7 @@ from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.rendering import field_image, quick_image
 from bidnerf_core.viewer.saving import MODULES, page_html
 from bidnerf_core.viewer.scene import shown_map, towards
+from bidnerf_core.viewer.trajectories import shown_trajectory
 from bidnerf_core.viewer.view import localized
 from commands import Run
 
@@ -53,6 +55,21 @@ def localizer() -> Localizer:
 @pytest.fixture(scope="module")
 def found(localizer: Localizer) -> ShownAnswer:
     return localized(localizer, viewed.query())
+
+
+def test_a_trajectory_in_another_unit_than_the_map_is_remarked(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "bidnerf")
+    image = PosedImage("a", 0, Intrinsics(50, 50, 32, 24, 64, 48), SE3.identity(), time=1.0, unit="units")
+    for ending in ("json", "tum"):
+        write_poses(tmp_path / f"path.{ending}", [image])
+        for unit in ("units", None):
+            shown_trajectory(tmp_path / f"path.{ending}", unit)
+        assert not caplog.text
+        shown_trajectory(tmp_path / f"path.{ending}", "metres")
+        assert f"path.{ending}: is in units, but the map is in metres" in caplog.text
+        caplog.clear()
 
 
 @pytest.fixture(scope="module")

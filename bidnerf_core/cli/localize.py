@@ -106,7 +106,7 @@ def run(arguments: list[str]) -> None:
             Names,
             option("NAME...", "frames of a dataset, together as a rig", "each frame of the split on its own"),
         ] = (),
-        split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+        split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
         method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
         start: Annotated[
             Path | None,

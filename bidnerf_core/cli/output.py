@@ -62,6 +62,9 @@ def print_table(table: Table) -> None:
 
 def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None) -> list[View]:
     """Read the views of a split, with a progress display if there are many. Raises ``InputError`` for an empty split."""
+    from bidnerf_core.datasets.whole import with_all  # imported here, since it imports torch
+
+    dataset = with_all(dataset, split)
     total = len(dataset.frame_names(split)) if names is None else len(names)
     if total == 0:
         raise InputError(f"{dataset.path}: split {split!r} has no frames")

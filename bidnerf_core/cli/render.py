@@ -42,7 +42,7 @@ def _render(
     map: MapFolder,
     data: DataFolder,
     out: Annotated[Path, option("DIR", "folder for the images")],
-    split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+    split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
     frame: Annotated[Names, option("NAME...", "render only these frames", "all of the split")] = (),
     camera: DatasetCamera = None,
     register_depth: RegisterDepth = None,

@@ -52,7 +52,7 @@ def view(
     hfov: FieldOfView = None,
     depth_unit: Annotated[float | None, option("METRES", "metres per step of depth images", "")] = None,
     frame: Annotated[Names, option("NAME...", "frames of a dataset, each on its own", "all of the split")] = (),
-    split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+    split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
     most: Annotated[int, option("N", "number of images in a saved page, spread over all")] = 24,
     method: Annotated[str, option("NAME", "how poses are found")] = "auto",
     host: Annotated[
@@ -70,6 +70,7 @@ def view(
     """
     # Imported when a page is made, since help pages do not need it.
     from bidnerf_core.localization import Localizer
+    from bidnerf_core.maps.description import load_info
     from bidnerf_core.maps.map import load_map
     from bidnerf_core.viewer.trajectories import shown_trajectory
     from bidnerf_core.viewer.view import page_of
@@ -81,7 +82,7 @@ def view(
         raise UsageError("--frame names frames of a dataset, expected the dataset as QUERY")
     if save is not None:
         check_output(save, (*query, *depth, results, trajectory))
-    path = None if trajectory is None else shown_trajectory(trajectory)
+    path = None if trajectory is None else shown_trajectory(trajectory, load_info(map).unit)
     rows = () if results is None else rows_of(results)
     scene = load_map(map, device)
     localizer = Localizer(scene, method, warm_up=save is None)

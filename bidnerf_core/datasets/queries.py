@@ -17,6 +17,7 @@ from bidnerf_core.datasets.masked import MaskedDataset
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.reader import file_of_dataset, no_dataset
 from bidnerf_core.datasets.transforms import TransformsDataset
+from bidnerf_core.datasets.whole import WholeDataset, with_all
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
 from bidnerf_core.fields.observations import Observations
@@ -150,7 +151,8 @@ class DatasetFrames:
         window: int = 1,
         points: DepthPoints | None = None,
     ) -> None:
-        self._dataset, self._split, self._points = dataset, split, points
+        self._dataset = dataset = with_all(dataset, split)
+        self._split, self._points = split, points
         listed = dataset.frame_names(split)
         if not listed:
             raise InputError(f"{dataset.path}: split {split!r} has no frames")
@@ -165,12 +167,19 @@ class DatasetFrames:
 
     def read(self, place: int) -> Query:
         views = tuple(self._dataset.views(self._split, self._rigs[place]))
-        file = None
-        dataset = self._dataset.unmasked if isinstance(self._dataset, MaskedDataset) else self._dataset
-        if isinstance(dataset, TransformsDataset):
-            file = dataset.image_file(self._split, views[-1].frame.name)
+        file = self._file(views[-1].frame.name)
         rays = None if self._points is None else self._points.rays(views, self._split)
         return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, file)
+
+    def _file(self, name: str) -> Path | None:
+        """Return the image file of a frame, if the format can tell."""
+        dataset, split = self._dataset, self._split
+        if isinstance(dataset, WholeDataset):
+            split, name = dataset.origin(name)
+            dataset = dataset.parts
+        if isinstance(dataset, MaskedDataset):
+            dataset = dataset.unmasked
+        return dataset.image_file(split, name) if isinstance(dataset, TransformsDataset) else None
 
     def _with_window(self, rig: tuple[str, ...], listed: list[str], size: int) -> tuple[str, ...]:
         if size == 1 or rig[0] not in listed:  # an unknown name is rejected on reading

@@ -69,6 +69,10 @@ class WholeDataset:
             raise InputError(f"{self.path}: no split {split!r}, expected {ALL}")
         return list(self._names)
 
+    def origin(self, name: str) -> tuple[str, str]:
+        """Return the split of a view, and its name there."""
+        return self._listed[self._names.index(name)]
+
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
     ) -> list[View]:

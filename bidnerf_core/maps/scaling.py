@@ -4,6 +4,7 @@ to metres.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,8 @@ from bidnerf_core.maps.description import FieldFrame, MapInfo
 
 if TYPE_CHECKING:
     from bidnerf_core.maps.map import Map
+
+log = logging.getLogger("bidnerf")
 
 Position = Sequence[float] | Float[Tensor, "3"]
 """Three coordinates."""
@@ -70,6 +73,8 @@ def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
     where = scene.name
     if scene.info.interruption is not None:
         raise InputError(f"{where}: cannot be scaled: {scene.info.interruption}")
+    if scene.unit == unit == "metres" and factor != 1:
+        log.info("%s: was in metres before; its lengths are multiplied by %.6g all the same", where, factor)
     whole = scene.whole()
     extent = max(map(abs, (*scene.bounds.lower, *scene.bounds.upper, scene.bounds.far)))
     if not extent * factor <= LARGEST_LENGTH or not factor >= 1 / LARGEST_LENGTH:

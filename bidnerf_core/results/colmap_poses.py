@@ -41,16 +41,14 @@ def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
         intrinsics, T_world_camera = as_stored(image, orientation)
         camera = cameras.setdefault(intrinsics, len(cameras) + 1)
         rows.append(image_rows(number, T_world_camera, camera, name))
-    head = f"{HEAD}; {frame_of(images)}\n"
+    head = f"{HEAD}; {frame_of(images, 'world to camera')}\n"
     listed = "".join(camera_row(number, camera) for camera, number in cameras.items())
     points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
     write_file(
         path.with_name("cameras.txt"), f"{head}# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n{listed}".encode()
     )
     write_file(path.with_name("points3D.txt"), f"{head}{points}".encode())
-    columns = (
-        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (world to camera), then an empty line\n"
-    )
+    columns = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then an empty line\n"
     write_file(path, f"{head}{columns}{''.join(rows)}".encode())
 
 

@@ -50,11 +50,13 @@ class PosedImage:
     unit: LengthUnit = "units"  # of the position
 
 
-def frame_of(images: Sequence[PosedImage]) -> str:
-    """Return a file header's statement on its poses: their direction, the axes, and the unit of lengths."""
+def frame_of(images: Sequence[PosedImage], direction: str = "camera to world") -> str:
+    """Return a file header's statement on its poses: their direction, the axes, and the unit of lengths if there are any."""
     units = {image.unit for image in images}
+    if not units:
+        return f"{direction}, {OPENCV_AXES}"
     lengths = "metres" if units == {"metres"} else "units of the map (not known to be metres)"
-    return f"camera to world, {OPENCV_AXES}, lengths in {lengths}"
+    return f"{direction}, {OPENCV_AXES}, lengths in {lengths}"
 
 
 def tum_trajectory(images: Sequence[PosedImage]) -> str:

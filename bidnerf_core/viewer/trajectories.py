@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +14,13 @@ import torch
 from bidnerf_core.datasets.trajectories import read_trajectory
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.files import read_file
 from bidnerf_core.results.errors import standard_deviations
 from bidnerf_core.results.pose_files import pose_entries
 from bidnerf_core.viewer.packing import Packed, packed
+
+log = logging.getLogger("bidnerf")
 
 MOST_POSES = 20_000
 """Poses that are shown; of more, every second, third ... one."""
@@ -40,16 +45,22 @@ class _Posed:
     time: float | None = None
     sigma: float | None = None
     outcome: str = ""
+    unit: str | None = None  # None if the file does not say
 
 
-def shown_trajectory(path: Path) -> ShownTrajectory:
+def shown_trajectory(path: Path, unit: LengthUnit | None = None) -> ShownTrajectory:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or one of TUM, EuRoC or KITTI.
 
-    Raises ``InputError`` where it holds no pose.
+    A remark is logged if the file says that its lengths are not in the ``unit`` of the map. Raises ``InputError`` where it holds no pose.
     """
     found = _from_json(path) if path.suffix.lower() in (".json", ".jsonl") else _from_rows(path)
     if not found:
         raise InputError(f"{path}: holds no pose, expected those of a trajectory")
+    other = {each.unit for each in found} - {unit, None}
+    if unit is not None and other:
+        log.info(
+            "%s: is in %s, but the map is in %s; its poses are shown as they are", path, other.pop(), unit
+        )
     some = found[:: max(1, math.ceil(len(found) / MOST_POSES))]
     return ShownTrajectory(
         path.name,
@@ -62,9 +73,16 @@ def shown_trajectory(path: Path) -> ShownTrajectory:
 
 
 def _from_rows(path: Path) -> list[_Posed]:
-    found = read_trajectory(path)
+    found, unit = read_trajectory(path), _stated_unit(path)
     rows = zip(found.times.tolist(), found.rotations, found.translations, strict=True)
-    return [_Posed(SE3(rotation, translation), time=time) for time, rotation, translation in rows]
+    return [_Posed(SE3(rotation, translation), time=time, unit=unit) for time, rotation, translation in rows]
+
+
+def _stated_unit(path: Path) -> str | None:
+    """Return the unit of lengths in the first line of a file that bidnerf wrote."""
+    head = read_file(path, "a trajectory").partition(b"\n")[0]
+    found = re.search(rb"^#.*lengths in (metres|units)", head)
+    return None if found is None else found[1].decode()
 
 
 def _from_json(path: Path) -> list[_Posed]:
@@ -87,8 +105,9 @@ def _posed(entry: dict[str, Any], path: Path) -> _Posed:
         raise InputError(
             f"{path}: {entry.get('frame')!r} has no matrices of numbers, expected poses"
         ) from error
+    unit = entry.get("unit")
     finite = sigma is not None and math.isfinite(sigma)
     return _Posed(
         pose_from_matrix(rows, f"{path}: T_world_camera"), str(entry.get("frame", "")), time,
-        sigma if finite else None, str(entry.get("outcome", "")),
+        sigma if finite else None, str(entry.get("outcome", "")), unit if isinstance(unit, str) else None,
     )  # fmt: skip
