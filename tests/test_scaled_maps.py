@@ -127,6 +127,8 @@ def test_known_positions_come_from_a_file(ground: Map, tmp_path: Path) -> None:
     assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
     file.write_text("\n".join(map(json.dumps, poses)))
     assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    file.write_text(json.dumps({pose["frame"]: pose["T_world_camera"] for pose in poses}))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
     form = re.escape(
         'expected {"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_camera": 4x4 rows}, ...]'
     )

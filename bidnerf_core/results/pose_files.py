@@ -257,18 +257,22 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
             )
         if name in found:
             raise InputError(f"{path}: holds two poses of frame {name!r}, expected one")
-        try:
-            matrix = torch.tensor(rows, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise InputError(f"{path}: contains no matrix of numbers, expected {EXPECTED_POSE}") from error
-        found[name] = pose_from_matrix(matrix, f"{path}: T_world_camera")
+        found[name] = _pose(str(path), rows, EXPECTED_POSE)
     if not found:
         raise InputError(f"{path}: holds no pose, expected {EXPECTED_POSE}")
     return found
 
 
+def _pose(where: str, rows: Any, expected: str) -> SE3:
+    try:
+        matrix = torch.tensor(rows, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(f"{where}: contains no matrix of numbers, expected {expected}") from error
+    return pose_from_matrix(matrix, f"{where}: T_world_camera")
+
+
 def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
-    """Read the positions (float64) of cameras by name: one object of names with x, y and z, or poses as in ``read_poses``.
+    """Read the positions (float64) of cameras by name: one object of names with x, y and z or 4x4 rows, or poses as in ``read_poses``.
 
     Raises ``InputError`` for anything else.
     """
@@ -288,6 +292,9 @@ def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
 
 
 def _position(where: str, value: Any) -> Float[Tensor, "3"]:
+    """Return three coordinates, or those of a pose of 4x4 rows. Raises ``InputError`` for anything else."""
+    if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
+        return _pose(where, value, EXPECTED_POSITIONS).translation
     if not isinstance(value, list) or len(value) != 3 or any(type(x) not in (int, float) for x in value):
         raise InputError(f"{where} has no three coordinates, expected {EXPECTED_POSITIONS}")
     return torch.tensor(value, dtype=torch.float64)
