@@ -175,9 +175,9 @@ async def _photo(request: Request) -> Response:
     def read() -> Query:
         with tempfile.TemporaryDirectory(prefix="bidnerf-view-") as folder:
             try:
-                photos, _ = upload.read(
-                    state.shown.localizer, Path(folder), state.config.max_megapixels * 1e6
-                )
+                localizer, pixels = state.shown.localizer, state.config.max_megapixels * 1e6
+                background = localizer.map.bounds.background
+                photos, _ = upload.read(localizer.assumed_cameras, background, Path(folder), pixels)
                 return named(photos.read(0), upload.name)
             except InputError as error:
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
