@@ -750,6 +750,23 @@ LIMITS = {"5deg 0.05": "within 5°, 0.05", "1deg 0.02": "within 1°, 0.02"}
 
 
 @table
+def service(records: Records) -> str:
+    """The service under load, and while its workers are killed."""
+    result = records["service"]
+    levels = {f"{level['clients']} clients": level for level in result["load"]["levels"]}
+    levels["1 client"] = levels.pop("1 clients")
+    levels["4 clients, while workers are killed"] = result["kills"]
+    rows = []
+    for title, level in sorted(levels.items(), key=lambda item: (item[1]["clients"], item[0])):
+        taken = (f"{level['latency_seconds'][of]:.2f} s" for of in ("p50", "p95", "p99"))
+        memory = level.get("memory_MiB")
+        grown = "" if memory is None else f"{memory['after'] - memory['before']:+.0f} MiB"
+        rows.append((title, str(level["requests"]), str(level["identical"]), *taken, grown))
+    head = ("load", "requests", "answered as by `localize`", "p50", "p95", "p99", "memory")
+    return _table(head, rows, records)
+
+
+@table
 def masks(records: Records) -> str:
     """A person in half of the images, with and without masks."""
     result = records["masks"]
