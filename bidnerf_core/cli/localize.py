@@ -222,7 +222,7 @@ def _localize(
     source: QuerySource, localizer: Localizer, begin: StartSpec, seed: int, output: _Output
 ) -> None:
     total = len(source.names)
-    with counted("localizing", "images", total) as report:
+    with counted(output.stage, "images", total) as report:
         try:
             localize_each(
                 localizer, source, start=lambda query: begin.pose(query, seed), seed=seed, answers=output.answers,
@@ -243,6 +243,7 @@ class _Output:
     def __init__(self, stored: Map, out: Path | None, draw: Path | None, json: bool, total: int) -> None:
         self._stored, self._out, self._draw, self._json, self._total = stored, out, draw, json, total
         self._not_drawn = 0
+        self.stage = "localizing" if draw is None else "localizing and rendering"
         self.answers = Answers(stored.info.backend, stored.unit)
 
     def show(self, query: Query, answer: Answer | Failure, start: SE3 | None) -> None:

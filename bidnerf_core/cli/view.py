@@ -112,7 +112,7 @@ def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, 
     from bidnerf_core.viewer.view import read_and_localized
 
     answers, count = [], len(source.names)
-    with counted("localizing", "images", count) as report:
+    with counted("localizing and rendering", "images", count) as report:
         for place in range(count):
             answers.append(read_and_localized(localizer, source, place))
             report(place + 1, count)
