@@ -131,6 +131,17 @@ def test_a_photo_without_a_camera_is_refused_in_a_line(
     assert "no focal length in EXIF" in err
 
 
+@pytest.mark.parametrize("command", ["localize", "view", "evaluate"])
+def test_a_frame_of_another_split_is_told_where_it_is(
+    bidnerf: Run, shared: Path, tmp_path: Path, command: str
+) -> None:
+    name = open_dataset(shared / "data").frame_names("train")[0]
+    out = {"view": ["--save", tmp_path / "page.html"], "evaluate": ["--out", tmp_path / "r.jsonl"]}
+    found = bidnerf(command, shared / "map", shared / "data", "--frame", name, *out.get(command, []))
+    assert found.status == 1
+    assert f"no frame {name!r}, which is in split 'train'; choose that split" in found.err
+
+
 def test_all_splits_of_a_dataset_are_localized(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     words = [
         "localize",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +15,8 @@ from bidnerf_core.cli.options import Device, MapFolder, Names, option, parse, re
 from bidnerf_core.cli.output import console, say, show
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
-from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.datasets.dataset import in_other_split
+from bidnerf_core.datasets.queries import DatasetFrames, Query, QuerySource
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
 from bidnerf_core.viewer import server
 
@@ -90,7 +91,8 @@ def view(
     source = None
     if query:
         source = open_queries(query, photos, FrameOptions(split), scene.bounds.background, None)
-        source = Chosen(source, places_of(source.names, names, most if save else len(source.names)))
+        splits = source.names_by_split if isinstance(source, DatasetFrames) else None
+        source = Chosen(source, places_of(source.names, names, most if save else len(source.names), splits))
     if save is not None:
         answers = () if source is None else _localized(localizer, source)
         with console.status("drawing the map"):
@@ -149,11 +151,14 @@ class Chosen:
         return self._source.read(self._places[place])
 
 
-def places_of(names: Sequence[str], asked: Sequence[str], most: int) -> list[int]:
-    """Return the indices of the requested frames, or of at most ``most`` spread over all."""
-    unknown = [name for name in asked if name not in names]
-    if unknown:
-        raise InputError(f"no frame {unknown[0]!r}{spelling_hint(unknown[0], names)}")
+def places_of(
+    names: Sequence[str], asked: Sequence[str], most: int, splits: Mapping[str, Sequence[str]] | None = None
+) -> list[int]:
+    """Return the indices of the requested frames, or of at most ``most`` spread over all; ``splits`` has the names in each."""
+    for name in asked:
+        if name not in names:
+            elsewhere = in_other_split(name, splits or {})
+            raise InputError(elsewhere or f"no frame {name!r}{spelling_hint(name, names)}")
     if asked:
         return [names.index(name) for name in asked]
     return list(range(0, len(names), -(-len(names) // most)))

@@ -165,6 +165,11 @@ class DatasetFrames:
     def names(self) -> Sequence[str]:
         return [rig[-1] for rig in self._rigs]
 
+    @property
+    def names_by_split(self) -> dict[str, list[str]]:
+        """The names of the dataset's frames in each split."""
+        return {split: self._dataset.frame_names(split) for split in self._dataset.splits}
+
     def read(self, place: int) -> Query:
         views = tuple(self._dataset.views(self._split, self._rigs[place]))
         file = self._file(views[-1].frame.name)
