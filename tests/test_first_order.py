@@ -96,7 +96,7 @@ def test_an_image_of_a_single_colour_determines_nothing() -> None:
     away = SE3(TRUTH.rotation, TRUTH.translation + 10)
     found = localize(single(FIELD, BOUNDS, plain, away), "bid", {"rays": 64, "max_steps": 2})
     assert found.outcome is Outcome.UNDETERMINED
-    assert "fit about as well" in found.reason or "single colour" in found.reason
+    assert "fit about as well" in found.reason or "single-colour" in found.reason
 
 
 @pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.CONVERGED), (1e-6, Outcome.RENDERING_MISMATCH)])
