@@ -36,7 +36,7 @@ HELD_OUT, MOST_HELD_OUT = 8, 24
 ENOUGH_ANSWERS = 6
 """Smallest number of localized images from which scatter is estimated."""
 LARGEST_SHARE = 3
-"""Of few images, one in ``LARGEST_SHARE`` is held out, until there are ``HELD_OUT``: fewer would leave the scatter unknown."""
+"""One in ``LARGEST_SHARE`` of few images is held out, up to ``HELD_OUT``; fewer would leave the scatter unknown."""
 QUANTILE = 0.9
 """Quantile at which the error model is fitted: it covers the tails, and allows one image in ten to have a
 wrong pose."""

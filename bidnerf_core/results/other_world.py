@@ -11,7 +11,7 @@ from bidnerf_core.geometry.similarity import Similarity
 
 LEAST = 3
 """Smallest number of poses for which a common transformation means anything: it has seven degrees of freedom."""
-EXPLAINED = 0.1
+UNEXPLAINED = 0.1
 """Largest error, relative to the median error, that may remain in any pose after the transformation."""
 
 
@@ -35,7 +35,7 @@ def world_of_truth(found: SE3, true: SE3) -> Similarity | None:
         return None
     worlds = Similarity(scale, SE3(rotation, target.mean(0) - scale * source.mean(0)))
     left, error = _distances(worlds.apply(true.translation), target), _distances(true.translation, target)
-    return worlds if bool(left.max() < EXPLAINED * error.median()) else None
+    return worlds if bool(left.max() < UNEXPLAINED * error.median()) else None
 
 
 def _distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

@@ -13,7 +13,7 @@ import numpy as np
 
 LEAST_MATCHES = 100
 """Verified matches of a pair that surely shows one place; pairs of different places with repeated details have up to 80."""
-AGREEING = 0.5
+FITTING = 0.5
 """Share of a pair's matches that must fit the model's poses for the pair to agree with the model."""
 TOLERANCE = 4.0
 """Distance from the epipolar line within which a match fits the poses, in pixels of the photos in which keypoints were found."""
@@ -41,7 +41,7 @@ def agreement(model: Any, database: Any, pycolmap: Any) -> Agreement:
         seen = keypoints[i][geometry.inlier_matches[:, 0]], keypoints[j][geometry.inlier_matches[:, 1]]
         pairs += 1
         fitting = _epipolar_distances(model, i, j, *seen) < TOLERANCE
-        contradicting += int(np.mean(fitting) < AGREEING)
+        contradicting += int(np.mean(fitting) < FITTING)
     return Agreement(pairs, contradicting)
 
 

@@ -58,7 +58,7 @@ from bidnerf_core.structure.sources import SourceImage, photos_of
 
 log = logging.getLogger("bidnerf")
 
-ADVICE = "photos that overlap by two thirds, taken while moving sideways"
+GOOD_PHOTOS = "photos that overlap by two thirds, taken while moving sideways"
 
 
 def find_poses(
@@ -177,7 +177,7 @@ class _Search:
         with self._pycolmap.Database.open(self._database) as database:
             overlaps = Overlaps(database, self._pycolmap)
         if not models.all:
-            raise InputError(f"{self._source}: {_unplaced(found, overlaps)}; expected {ADVICE}")
+            raise InputError(f"{self._source}: {_unplaced(found, overlaps)}; expected {GOOD_PHOTOS}")
         return self._written(images, found, models, left_out(found, models, overlaps, keypoints))
 
     def _counter(self, stage: str, unit: str) -> Callable[[int, int], None]:
