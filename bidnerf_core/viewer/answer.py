@@ -30,15 +30,15 @@ from bidnerf_core.viewer.rendering import quick_image
 from bidnerf_core.viewer.scene import CameraShape, rows_of
 
 PICTURE_SIDE, RUNNER_UP_SIDE = 320, 240
-"""Pixels of the longer side of a photo beside its rendering, and beside that of the runner-up: each rendered pixel takes time."""
+"""Longer sides (pixels) of a photo and its rendering, and of the runner-up and its rendering; rendering takes time."""
 MOST_MATCHES = 600
-"""Matches that are shown; of more, every second, third ... one."""
+"""Maximum number of matches that are shown; larger sets are subsampled at a regular stride."""
 SIGMAS = 2.0
 """Semi-axes of the ellipsoid of the position, in standard deviations."""
 APART, TURNED_DEG = 0.1, 10.0
-"""Share of the distance of the scene's middle, and degrees, beyond which another pose of a search is a different answer."""
+"""Distance (fraction of that to the centre of the scene) and angle beyond which another pose of a search is a different answer."""
 TOO_NEAR, RIGHT, TOO_FAR = (0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)
-"""Colours of a rendered depth that is less than, equal to and larger than the measured one."""
+"""Colours for rendered depth that is smaller than, equal to and larger than the measured depth."""
 
 
 @dataclass(frozen=True)
@@ -62,21 +62,21 @@ class ShownStep:
 
 @dataclass(frozen=True)
 class ShownMatches:
-    """Keypoints, the landmarks that they were matched to, and where those are seen from the pose found."""
+    """Keypoints, and the projections at the pose found of the landmarks with which they were matched."""
 
-    keypoints: Packed  # float32 (m, 2), as shares of the image's width and height
+    keypoints: Packed  # float32 (m, 2), as fractions of the image's width and height
     projections: Packed  # the same; NaN behind the camera
     accepted: Packed  # uint8 (m)
     agreeing: int
     refused: int
     by_appearance: (
-        int  # of the refused ones, matched by appearance alone; the others near where the pose has them
+        int  # of these, matched by descriptors alone; the others were matched near their projections
     )
 
 
 @dataclass(frozen=True)
 class DepthDifference:
-    """Rendered depth less measured depth, in colours."""
+    """The difference between rendered and measured depth, as a colour image."""
 
     picture: Picture
     range: float  # difference at the ends of the scale
@@ -177,7 +177,7 @@ def shown_answer(
 
 
 def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Ellipsoid | None:
-    """Return the ellipsoid of a pose's position; None where its covariance is not known or not finite."""
+    """Return the ellipsoid of a pose's position; None if its covariance is unknown or not finite."""
     if covariance is None or not bool(covariance.isfinite().all()):
         return None
     turn = T_world_camera.rotation.double().cpu()
@@ -190,7 +190,7 @@ def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> E
 
 
 def depth_difference(image: RenderedImage, frame: Frame) -> DepthDifference | None:
-    """Return how much farther the field is than what was measured, where both are known; None where nothing is."""
+    """Return rendered minus measured depth at the pixels that have both; None if there are none."""
     if frame.depth is None or not frame.has_depth:
         return None
     height, width = image.depth.shape
@@ -231,7 +231,7 @@ def _camera(frame: Frame | None, found: Localization) -> str:
 
 
 def _summary(method: str) -> str:
-    """Return what a method does, in a line; empty for one that is not installed, as in a file from elsewhere."""
+    """Return the one-line summary of a method; empty if it is not installed here."""
     with contextlib.suppress(PluginError):
         return METHODS.load(method).summary
     return ""
@@ -265,7 +265,7 @@ def _path(poses: SE3) -> tuple[tuple[float, float, float], ...]:
 
 
 def _matches(frame: Frame, record: SearchRecord) -> ShownMatches | None:
-    """Return the matches of the last pose that landmarks were asked about: those it was refined on, and those refused."""
+    """Return the matches of the last pose that was checked by landmarks: those used in its refinement, and those rejected."""
     if not record.landmarks:
         return None
     pose = record.landmarks[-1]
@@ -287,9 +287,9 @@ def _matches(frame: Frame, record: SearchRecord) -> ShownMatches | None:
 
 
 def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3"], Tensor, int]:
-    """Return keypoints (pixels), landmarks (world) and whether they agree: guided matches, and refused ones by appearance.
+    """Return keypoints (pixels), landmarks (metres, world), whether they are inliers, and the number of rejected matches.
 
-    The number of the latter, which are the last, is returned too.
+    The rejected matches, which are by descriptors alone, follow the guided ones.
     """
     last = pose.correspondences.view == pose.correspondences.view.max()
     agree = (torch.linalg.vector_norm(pose.normalized_residuals, dim=-1) <= 3)[last]
@@ -313,7 +313,7 @@ def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m
 def _runner_up(
     scene: SceneMap, T: SE3, record: SearchRecord, frame: Frame | None, quick: bool
 ) -> RunnerUp | None:
-    """Return the least unlikely other explanation that has a pose, else the best different pose of the last search."""
+    """Return the most probable alternative explanation with a pose, else the best different pose of the last search."""
     rivals = [other for other in record.explanations if other.T is not None]
     if rivals:
         best = min(rivals, key=lambda other: other.log_odds)

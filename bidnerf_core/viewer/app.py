@@ -1,4 +1,4 @@
-"""The viewer as an ASGI application: the page, and what it asks for."""
+"""The viewer as an ASGI application: the page, and the API that it calls."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from bidnerf_core.viewer.scene import thumbnail_jpeg
 
 COOKIE = "bidnerf_token"
 LARGEST_RENDERING = 1024
-"""Pixels of the longer side of what is rendered from the viewer's own camera."""
+"""Longer side (pixels) of renderings from the virtual camera of the page."""
 PAGE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Content-Security-Policy": "frame-ancestors 'none'",
@@ -99,7 +99,7 @@ def viewer_app(shown: Shown, token: str | None = None, config: ServiceConfig | N
 
 
 class TokenCookie:
-    """Lets a browser send the token: ``/?token=TOKEN`` stores it as a cookie, which then counts as the header of ``Access``."""
+    """Accepts the token from a browser: ``/?token=TOKEN`` stores it as a cookie, which replaces the header that ``Access`` checks."""
 
     def __init__(self, app: ASGIApp, token: str | None) -> None:
         self.app, self.token = app, token
@@ -126,7 +126,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 def _answering(handler: Handler) -> Handler:
-    """Turn refusals and bad input into answers."""
+    """Convert rejected requests and bad input to responses."""
 
     async def handle(request: Request) -> Response:
         try:
@@ -154,7 +154,7 @@ async def _health(request: Request) -> Response:
 
 
 async def _thumbnail(request: Request) -> Response:
-    """Answer with what a camera of the map sees, by its number: no request names a file."""
+    """Respond with a rendering from a camera of the map, which is given by number, since no request may name a file."""
     scene: Map = request.app.state.shown.map
     number = request.path_params["number"]
     if number >= len(scene.info.cameras):
@@ -167,7 +167,7 @@ async def _thumbnail(request: Request) -> Response:
 
 
 async def _photo(request: Request) -> Response:
-    """Begin to localize a photo, which lies in a temporary folder until it is read."""
+    """Queue the localization of a photo, which is kept in a temporary folder until it is read."""
     state = request.app.state
     query = await query_of(request, await body_of(request, state.config))
     upload = Upload(query.parameters, query.blocks)
@@ -191,7 +191,7 @@ def named(query: Query, name: str) -> Query:
 
 
 async def _query(request: Request) -> Response:
-    """Begin to localize one of the images that the viewer was started with, by its number."""
+    """Queue the localization of one of the images with which the viewer was started, given by its number."""
     shown: Shown = request.app.state.shown
     number = request.path_params["number"]
     source = shown.source
@@ -209,7 +209,7 @@ async def _job(request: Request) -> Response:
 
 
 async def _view(request: Request) -> Response:
-    """Answer with a rendering from the viewer's camera, unless the viewer leaves before it is done."""
+    """Respond with a rendering from the virtual camera of the page, unless the client disconnects before it is done."""
     state = request.app.state
     asked = json_of(await body_of(request, state.config))
     camera, T, quick = asked_camera(asked)
@@ -246,7 +246,7 @@ async def _left(request: Request) -> None:
 
 
 def asked_camera(asked: Any) -> tuple[Intrinsics, SE3, bool]:
-    """Return the camera and the pose that a request describes, and whether a rendering of the surface is enough.
+    """Return the camera and the pose in a request, and whether a rendering of the surface suffices.
 
     The pose has the axes of WebGL: x right, y up, z backward. Raises ``Refused``.
     """

@@ -1,4 +1,4 @@
-"""The contests of explanations of an image that a localization weighed, with their probabilities."""
+"""The competing explanations of an image that a localization compared, with their probabilities."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bidnerf_core.localization.recording import ComparedExplanation, SearchRecor
 from bidnerf_core.viewer.scene import rows_of
 
 LEAST_SHOWN = 0.001
-"""Least probability of an explanation that is listed."""
+"""Minimum probability of an explanation that is listed."""
 CAMERA_NAMES = {
     STATED: "given camera",
     INEXACT: "given camera (slightly off)",
@@ -45,7 +45,7 @@ HERE = "the pose found"
 
 @dataclass(frozen=True)
 class ShownExplanation:
-    """An answer to the question of a contest, and its probability."""
+    """One of the explanations in a comparison, and its probability."""
 
     name: str
     probability: float
@@ -54,7 +54,7 @@ class ShownExplanation:
 
 @dataclass(frozen=True)
 class Contest:
-    """A question, its answers, whose probabilities add up to 1 but for unlikely ones that are left out, and a remark."""
+    """A comparison of explanations: a question, its possible answers without the improbable ones, and a remark."""
 
     question: str
     answers: tuple[ShownExplanation, ...]
@@ -62,7 +62,7 @@ class Contest:
 
 
 def contests(found: Localization, record: SearchRecord | None) -> tuple[Contest, ...]:
-    """Return what was weighed: the pose against another or a mirror image, against its rivals, and whose camera it is."""
+    """Return all comparisons: the pose with another one or a mirror image, with its rivals, and between possible cameras."""
     shown = list[Contest]()
     if record is not None:
         shown += [_against(found, other) for other in told(found, record)]
@@ -75,7 +75,7 @@ def contests(found: Localization, record: SearchRecord | None) -> tuple[Contest,
 
 
 def told(found: Localization, record: SearchRecord) -> list[ComparedExplanation]:
-    """Return the comparisons that tell something: that a refused pose beats its mirror image is no good news."""
+    """Return the recorded comparisons, except those in which a rejected pose is more probable than a mirror image."""
     return [
         each
         for each in record.explanations
@@ -84,7 +84,7 @@ def told(found: Localization, record: SearchRecord) -> list[ComparedExplanation]
 
 
 def support_of(found: Localization) -> Support | None:
-    """Return how well measurements distinguish a pose from its rivals, where they were compared."""
+    """Return how well measurements distinguish a pose from its rivals; None if it was not compared with any."""
     said = found.diagnostics
     if isinstance(said, SurfaceDiagnostics | DescentDiagnostics):
         return said.support

@@ -1,4 +1,4 @@
-"""The figures by which a pose was accepted or rejected, each beside its threshold."""
+"""The measures by which a pose was accepted or rejected, each with its threshold."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bidnerf_core.viewer.explanations import support_of, told
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 """Digits of an exponent."""
 BEYOND = 1.1
-"""Length of a bar's scale, over the larger of the value and its threshold."""
+"""Upper end of a bar's scale, as a multiple of the larger of the value and its threshold."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Bar:
 
     @staticmethod
     def of(value: float, threshold: float, at_least: bool) -> Bar | None:
-        """Return the bar of a value and a threshold that are not negative; None where there is no scale for both."""
+        """Return the bar for a value and a threshold; None if the value is not finite or the threshold is not positive."""
         if not math.isfinite(value) or threshold <= 0:
             return None
         scale = BEYOND * max(value, threshold)
@@ -47,12 +47,12 @@ class Bar:
 
 @dataclass(frozen=True)
 class Figure:
-    """A measure of a pose and the threshold that it is held against."""
+    """A measure of a pose, and the threshold with which it is compared."""
 
     name: str
     value: str
-    threshold: str  # with "at least" or "at most"; empty for a measure that decides nothing by itself
-    passed: bool | None  # None where there is no threshold
+    threshold: str  # with "at least" or "at most"; empty for a measure without one
+    passed: bool | None  # None if there is no threshold
     bar: Bar | None
     meaning: str
 
@@ -60,9 +60,9 @@ class Figure:
 def acceptance_figures(
     found: Localization, record: SearchRecord | None, approximate: bool = False
 ) -> tuple[Figure, ...]:
-    """Return the figures of an answer; those of landmarks that were matched in vain too, where a record has them.
+    """Return the measures of an answer and, if recorded, those of a pose by landmarks that was rejected on the way to it.
 
-    ``approximate``: whether the focal length was given as approximate.
+    ``approximate`` is whether the focal length was given as approximate.
     """
     by_landmarks = None if record is None or not record.landmarks else record.landmarks[-1]
     said, figures = found.diagnostics, list[Figure]()
@@ -92,7 +92,7 @@ def acceptance_figures(
 
 
 def _by_appearance(pose: LandmarkPose) -> bool:
-    """Return whether the matches that a pose counts were made before there was a pose, by appearance alone."""
+    """Return whether the matches counted for a pose are by descriptors alone, from before there was a pose."""
     return pose.guided is not None and pose.matches == len(pose.guided.matches)
 
 
@@ -152,7 +152,7 @@ def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Itera
 
 
 def _power(log10: float) -> str:
-    """Return a small number of which the decimal logarithm is given."""
+    """Return a small number, given by its decimal logarithm, as text."""
     return f"{10**log10:.2g}" if log10 > -2 else "10" + f"{log10:.0f}".translate(RAISED)
 
 

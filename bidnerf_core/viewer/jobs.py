@@ -1,4 +1,4 @@
-"""Localizations in the background: one at a time, with what they have found so far."""
+"""A background queue of localizations, which run one at a time and report intermediate results."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from bidnerf_core.viewer.answer import ShownAnswer
 from bidnerf_core.viewer.view import localized
 
 MOST_WAITING = 8
-"""Localizations that may wait."""
+"""Maximum number of localizations in the queue."""
 KEPT = 64
-"""Localizations whose answers are kept for whoever asks."""
+"""Maximum number of finished localizations whose answers are kept."""
 
 State = Literal["waiting", "searching", "rendering", "done"]
 
 
 @dataclass
 class Job:
-    """A localization that was asked for."""
+    """A requested localization."""
 
     name: str
     id: str = field(default_factory=lambda: secrets.token_urlsafe(9))
@@ -37,7 +37,7 @@ class Job:
     answer: ShownAnswer | None = None
 
     def plain(self, known: str) -> dict[str, Any]:
-        """Return the state as JSON values, with the answer unless the one of the ``known`` state has been seen."""
+        """Return the state as JSON values, with the answer unless the client has already seen it in the ``known`` state."""
         steps = [] if self.record is None else list(self.record.steps)
         said = {
             "id": self.id,
@@ -49,11 +49,11 @@ class Job:
 
 
 class Busy(Exception):
-    """So many localizations are waiting that no other is accepted."""
+    """The queue of localizations is full."""
 
 
 class Jobs:
-    """Localizations in one thread, in the order in which they were asked for."""
+    """Runs localizations in one thread, in the order in which they were requested."""
 
     def __init__(self, localizer: Localizer) -> None:
         self._localizer, self._jobs = localizer, dict[str, Job]()
@@ -61,7 +61,7 @@ class Jobs:
         self._lock, self._closed = threading.Lock(), threading.Event()
 
     def begin(self, name: str, read: Callable[[], Query]) -> Job:
-        """Begin to localize what ``read`` returns. Raises ``Busy``."""
+        """Queue the localization of the query that ``read`` returns. Raises ``Busy`` if the queue is full."""
         with self._lock:
             if sum(job.state == "waiting" for job in self._jobs.values()) >= MOST_WAITING:
                 raise Busy
@@ -74,11 +74,11 @@ class Jobs:
         return job
 
     def find(self, id: str) -> Job | None:
-        """Return a localization that was asked for and is still kept."""
+        """Return a localization by its id; None if it is unknown or no longer kept."""
         return self._jobs.get(id)
 
     def close(self) -> None:
-        """Drop those that wait, and let the one at work end soon."""
+        """Discard the localizations in the queue, and stop the one in progress soon."""
         self._closed.set()
         self._thread.shutdown(wait=False, cancel_futures=True)
 
@@ -97,9 +97,7 @@ class Jobs:
             job.answer = ShownAnswer(job.name, "stopped", False, "the viewer was closed")
         except InputError as error:
             job.answer = ShownAnswer(job.name, "bad input", False, str(error))
-        except (
-            Exception
-        ) as error:  # whatever a method, a backend or a reader of others raises; the page has to say so
+        except Exception as error:  # third-party code may raise anything, which the page has to report
             job.answer = ShownAnswer(job.name, "fault", False, f"{type(error).__name__}: {error}")
             raise
         finally:

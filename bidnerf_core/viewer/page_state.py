@@ -1,4 +1,4 @@
-"""All that a page shows, as JSON."""
+"""The complete content of a page, as JSON."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from bidnerf_core.viewer.table import ShownRow
 from bidnerf_core.viewer.trajectories import ShownTrajectory
 
 ESCAPED = str.maketrans({c: f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"})
-"""Characters that could end a script in a page or begin markup, as JSON writes them in other words."""
+"""JSON escapes of the characters that could end a script in a page or begin markup."""
 
 
 @dataclass(frozen=True)
 class PageState:
-    """A map, and what was localized in it."""
+    """A map, and the localizations in it."""
 
     map: ShownMap
     answers: tuple[ShownAnswer, ...] = ()
@@ -29,10 +29,10 @@ class PageState:
     results: tuple[ShownRow, ...] = ()
 
     def json(self) -> str:
-        """Return the state as JSON that may stand inside of a script of a page."""
+        """Return the state as JSON that is safe to embed in a script element."""
         return escaped_json(self)
 
 
 def escaped_json(value: Any) -> str:
-    """Return JSON in which no character can end the script that it stands in."""
+    """Return JSON without characters that could end a script element in which it is embedded."""
     return json.dumps(to_plain(value), allow_nan=False, separators=(",", ":")).translate(ESCAPED)

@@ -1,4 +1,4 @@
-"""What is seen from a camera, quickly on the surface or in full by the field."""
+"""Renderings of a map from a camera: of the field, or quickly of the surface."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from bidnerf_core.localization.costs.images import SurfaceRenderer
 from bidnerf_core.localization.problem import SceneMap
 
 PIXELS_AT_A_TIME = 4096
-"""Pixels after which a rendering stops if it is no longer wanted, see ``stopped_by``."""
+"""Number of pixels between two checks whether a rendering is still wanted, see ``stopped_by``."""
 
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Return what the field shows from a camera."""
+    """Render the colours of the field, in [0, 1], from a camera."""
     return render_image(scene.field, camera, T_world_camera, scene.bounds, PIXELS_AT_A_TIME).rgb
 
 
 @torch.no_grad()
 def quick_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Return the colours of the surface as a camera sees them, in a twentieth of the time of the field.
+    """Render the colours of the surface, in [0, 1], from a camera, twenty times as fast as the field.
 
-    A map without a surface is rendered by its field.
+    For a map without a surface, the field is rendered.
     """
     if scene.surface is None:
         return field_image(scene, camera, T_world_camera)

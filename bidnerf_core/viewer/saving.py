@@ -14,12 +14,12 @@ from bidnerf_core.io.files import write_file
 from bidnerf_core.viewer.page_state import PageState
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
-"""The modules of the page, each after those that it imports. Their names share one scope in the page."""
+"""The modules of the page, each after those that it imports. They share one scope, so their names must differ."""
 IMPORT = re.compile(r'^import \{[^}]*\} from "\./\w+\.js";\n', re.MULTILINE)
 
 
 def page_html(state: PageState) -> str:
-    """Return the whole page. Its policy lets it run its own scripts only, and ask nobody but a server that it came from."""
+    """Return the whole page. Its content security policy allows only its own scripts and, if live, its own server."""
     style, library, scripts = _part("style.css"), _part("three.min.js"), _scripts()
     server = "'self'" if state.live else "'none'"
     policy = (
@@ -36,7 +36,7 @@ def page_html(state: PageState) -> str:
 
 
 def save_page(state: PageState, path: str | Path) -> Path:
-    """Write the page to a file, whole or not at all. Raises ``InputError`` for a name that is not one of a page."""
+    """Write the page to a file atomically. Raises ``InputError`` for a file extension other than .html or .htm."""
     path = Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: a page, expected a name that ends with .html")
@@ -51,12 +51,12 @@ def _part(name: str) -> str:
 
 @cache
 def _scripts() -> str:
-    """Return the modules of the page as one."""
+    """Return the modules of the page, joined into one script."""
     texts = (IMPORT.sub("", _part(f"{name}.js")).replace("\nexport ", "\n") for name in MODULES)
     return "\n".join(texts)
 
 
 @cache
 def _digest(text: str) -> str:
-    """Return what a content security policy calls a script or style by."""
+    """Return the hash by which a content security policy identifies a script or style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

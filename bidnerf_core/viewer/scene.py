@@ -30,32 +30,32 @@ from bidnerf_core.viewer.packing import (
 from bidnerf_core.viewer.rendering import quick_image
 
 MOST_SURFELS, MOST_LANDMARKS = 120_000, 20_000
-"""Points that a page holds; of more, a random part is shown."""
+"""Maximum numbers of points in a page; larger sets are subsampled at random."""
 THUMBNAIL, THUMBNAIL_QUALITY = 80, 75
-"""Pixels of the longer side of a thumbnail, and its quality as a JPEG."""
+"""Longer side of a thumbnail (pixels), and its JPEG quality."""
 MOST_THUMBNAILS = 60
-"""Thumbnails that a saved page holds, since each has to be rendered."""
+"""Maximum number of thumbnails in a saved page, since each has to be rendered."""
 LEAST_OPACITY = 0.2
-"""Opacity of a splat below which it is not shown."""
+"""Minimum opacity of a splat that is shown."""
 MOST_OF_SCENE = 0.98
-"""Share of the points that the first view of a scene is made for; a few may be far away."""
+"""Fraction of the points that the initial view of a scene encloses; a few may be far away."""
 
 
 @dataclass(frozen=True)
 class Points:
-    """Points of the surface or of the landmarks; of many, a part."""
+    """Points of the surface or of the landmarks; a subset if there are many."""
 
     points: PackedPoints
     colours: Packed | None
     count: int  # in the map
     radius: float  # in the unit of the map
     sizes: Packed | None = None  # float32 (n): radii of points that differ in size
-    normals: Packed | None = None  # int8 (n, 3), in 127ths, towards the cameras; what faces away is not drawn
+    normals: Packed | None = None  # int8 (n, 3), in 127ths, towards the cameras; back faces are culled
 
 
 @dataclass(frozen=True)
 class CameraShape:
-    """The pyramid that a camera sees, by the tangents of its sides, and the size of its image."""
+    """The viewing frustum of a camera: its sides' slopes on the plane z = 1, and the size of its image (pixels)."""
 
     left: float
     right: float
@@ -66,7 +66,7 @@ class CameraShape:
 
     @staticmethod
     def of(camera: Intrinsics) -> CameraShape:
-        """Return the shape of a camera's pyramid, without the distortion of its lens."""
+        """Return the viewing frustum of a camera, without lens distortion."""
         return CameraShape(
             -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx,
             -camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy, camera.width, camera.height,
@@ -93,7 +93,7 @@ class ShownMap:
     up: tuple[float, float, float]
     up_source: str  # what the upward direction was found from
     centre: tuple[float, float, float]
-    extent: float  # in the unit of the map: what the first view should show
+    extent: float  # in the unit of the map: size of what the initial view should show
     surface: Points | None
     landmarks: Points | None
     splats: Points | None
@@ -101,7 +101,7 @@ class ShownMap:
 
 
 def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> ShownMap:
-    """Return a map as JSON values; ``thumbnails`` is the largest number of cameras whose view is rendered."""
+    """Return a map as JSON values; ``thumbnails`` is the maximum number of cameras whose view is rendered."""
     up = scene.up
     centre, extent = _framing(scene)
     return ShownMap(
@@ -120,7 +120,7 @@ def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> ShownMap:
 
 
 def thumbnail_jpeg(scene: Map, camera: StoredCamera) -> bytes:
-    """Return what a camera of the map sees, as a small JPEG file."""
+    """Render a small image from a camera of the map, as a JPEG file."""
     return jpeg(_small_image(scene, camera), THUMBNAIL_QUALITY)
 
 
@@ -129,7 +129,7 @@ def _small_image(scene: Map, camera: StoredCamera) -> Float[Tensor, "h w 3"]:
 
 
 def rows_of(T: SE3) -> tuple[float, ...]:
-    """Return a pose as 16 numbers by rows."""
+    """Return a pose as the 16 numbers of its matrix, row by row."""
     return tuple(T.matrix().detach().cpu().double().flatten().tolist())
 
 
@@ -164,7 +164,7 @@ def _surface(scene: Map) -> Points | None:
 def towards(
     positions: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], cameras: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Return normals that point to the side of the nearest camera, so that one can look into a room from outside."""
+    """Return normals flipped to the side of the nearest camera, so that culling back faces opens a room seen from outside."""
     if not len(cameras):
         return normals
     _, nearest = cKDTree(cameras.numpy()).query(positions.numpy())
@@ -180,7 +180,7 @@ def _landmarks(scene: Map) -> Points | None:
 
 
 def _splats(scene: Map) -> Points | None:
-    """Return the pieces of the field that are not nearly transparent, as points of their own sizes."""
+    """Return the splats of the field that are not nearly transparent, as points with their own radii."""
     if not isinstance(scene.field, SplatField):
         return None
     splats = moved(scene.field.splats(), "cpu")
@@ -213,7 +213,7 @@ def _cameras(scene: Map, thumbnails: int) -> tuple[ShownCamera, ...]:
 
 
 def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
-    """Return the middle of a scene and how far most of it extends."""
+    """Return the centre of a scene, and the size that encloses most of it, in the unit of the map."""
     if scene.surface is not None and len(scene.surface.surfels):
         points = scene.surface.surfels.positions
     elif scene.landmarks is not None and len(scene.landmarks):
@@ -222,7 +222,7 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
         x, y, z = scene.bounds.centre
         return (x, y, z), max(scene.bounds.size)
     points = points[_some(len(points), 20_000)].cpu().double()
-    if scene.info.cameras:  # as many as if each had seen a hundredth of them
+    if scene.info.cameras:  # weighted so that all cameras together count as a hundredth of the points
         places = poses_of(scene.info.cameras).translation
         points = torch.cat([points, places.repeat(1 + len(points) // (100 * len(places)), 1)])
     beyond = (1 - MOST_OF_SCENE) / 2

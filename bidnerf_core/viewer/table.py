@@ -11,7 +11,7 @@ Rows = Sequence[Sequence[float]]
 
 @dataclass(frozen=True)
 class ShownRow:
-    """A trial: what was found, whether it was accepted and, where the truth is known, how wrong it is."""
+    """A trial: the answer, whether it was accepted, and its error if the true pose is known."""
 
     frame: str
     method: str
@@ -28,7 +28,7 @@ def shown_row(
     frame: str, method: str, outcome: str, accepted: bool, reason: str, confidence: float | None,
     error: tuple[float, float] | None, covariance: Rows | None, T_world_camera: Rows | None,
 ) -> ShownRow:  # fmt: skip
-    """Return a row of the table for a pose and a covariance by rows."""
+    """Return a row of the table; pose and covariance are given as rows of their matrices."""
     variance = math.nan if covariance is None else sum(covariance[i][i] for i in range(3))
     return ShownRow(
         frame, method, outcome, accepted, reason, confidence, error,

@@ -1,4 +1,4 @@
-"""Trajectories as the page shows them: poses in the order of time, with their uncertainty and outcome where a file has them."""
+"""Trajectories as the page shows them: poses in chronological order, with uncertainty and outcome if the file has them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from bidnerf_core.viewer.packing import Packed, packed
 log = logging.getLogger("bidnerf")
 
 MOST_POSES = 20_000
-"""Poses that are shown; of more, every second, third ... one."""
+"""Maximum number of poses that are shown; longer trajectories are subsampled at a regular stride."""
 
 
 @dataclass(frozen=True)
 class ShownTrajectory:
-    """The poses of a trajectory; what a file does not say is None, or an empty text."""
+    """The poses of a trajectory; values missing from its file are None, or an empty string."""
 
     name: str
     poses: Packed  # T_world_camera without the last row, float32 (n, 12)
@@ -45,13 +45,13 @@ class _Posed:
     time: float | None = None
     sigma: float | None = None
     outcome: str = ""
-    unit: str | None = None  # None if the file does not say
+    unit: str | None = None  # None if the file does not state it
 
 
 def shown_trajectory(path: Path, unit: LengthUnit | None = None) -> ShownTrajectory:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or one of TUM, EuRoC or KITTI.
 
-    A remark is logged if the file says that its lengths are not in the ``unit`` of the map. Raises ``InputError`` where it holds no pose.
+    A remark is logged if the file states another unit than the map's ``unit``. Raises ``InputError`` for a file without poses.
     """
     found = _from_json(path) if path.suffix.lower() in (".json", ".jsonl") else _from_rows(path)
     if not found:

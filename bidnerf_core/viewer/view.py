@@ -22,7 +22,7 @@ from bidnerf_core.viewer.table import ShownRow
 from bidnerf_core.viewer.trajectories import ShownTrajectory, shown_trajectory
 
 HEIGHT = 620
-"""Pixels of the page in a notebook."""
+"""Height (pixels) of the page in a notebook."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,16 +32,16 @@ class MapView:
     state: PageState
 
     def __repr__(self) -> str:
-        """A line, in place of all that the page holds."""
+        """A one-line description, without the content of the page."""
         return f"<MapView of {self.state.map.name} with {amount(len(self.state.answers), 'localization')}>"
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame of its own, as notebooks show it."""
+        """Return the page in an iframe, as notebooks show it."""
         page = html.escape(page_html(self.state), quote=True)
         return f'<iframe srcdoc="{page}" style="width:100%;height:{HEIGHT}px;border:0" sandbox="allow-scripts"></iframe>'
 
     def save(self, path: str | Path) -> Path:
-        """Write the page to a file that opens without a server or a network. Raises ``InputError`` where it cannot be written."""
+        """Write the page to a file that opens without a server or a network. Raises ``InputError`` if it cannot be written."""
         return save_page(self.state, path)
 
 
@@ -57,7 +57,7 @@ def view(
 
     With the ``frame`` that was localized, the page compares it with the map as rendered from the pose. A frame without a
     ``localization`` is localized here, and the page then shows the search too. ``scene`` is a map, or a localizer with settings
-    of its own, and ``trajectory`` a file of poses. Raises ``InputError`` for what is no map.
+    of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if it is neither.
     """
     scene_map = scene.map if isinstance(scene, Localizer) else scene
     if not isinstance(scene_map, Map):
@@ -86,7 +86,7 @@ def localized(
     begun: Callable[[SearchRecord], None] | None = None,
     found_pose: Callable[[ShownAnswer], None] | None = None,
 ) -> ShownAnswer:
-    """Localize a query and return the answer with its search, or with what is wrong with the query.
+    """Localize a query, and return the answer with a record of its search, or an answer that states why the query is unusable.
 
     ``begun`` is called with the record of the search before it begins, and ``found_pose`` with an answer whose pictures are of
     the surface, before the field is rendered.
@@ -106,7 +106,7 @@ def localized(
 
 
 def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> ShownAnswer:
-    """Localize the query at an index of a source; of one that cannot be read, the answer says so."""
+    """Localize the query at index ``place`` of a source; if it cannot be read, the answer states why."""
     try:
         query = source.read(place)
     except InputError as error:
