@@ -78,7 +78,7 @@ def open_dataset(
     depth_unit: float | None = None,
     masks: str | Path | MaskFolder | None = None,
 ) -> Dataset:
-    """Open the dataset in the folder ``path``. Descriptions are read and checked immediately, images when
+    """Open the dataset in the folder ``path``. Its metadata are read and checked immediately, images when
     views are requested.
 
     ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. It
@@ -88,7 +88,7 @@ def open_dataset(
     the format. ``depth_unit`` (metres per step of depth images) overrides the unit of the format. ``masks``
     is a folder of images whose black pixels are ignored (see ``MaskFolder``). Files that are listed but
     missing are left out, with an ``InputWarning`` that counts them. Raises ``InputError`` if there is no such
-    folder, if no reader recognizes it, if nothing is left, and if a description is invalid.
+    folder, if no reader recognizes it, if nothing is left, and if a metadata file is invalid.
     """
     folder = Path(path)
     if not folder.exists():
@@ -124,7 +124,7 @@ def open_sequence(
     videos, use one of the ``assumed`` cameras. Datasets have their own cameras, except those for which
     ``open_dataset`` accepts one. ``register_depth``, ``depth_unit`` and ``masks`` are as in ``open_dataset``;
     depth in a folder of images is registered if a sensor is given, and in millimetres unless a unit is given.
-    Raises ``InputError`` if nothing is found, if a description is invalid, and for a missing or superfluous
+    Raises ``InputError`` if nothing is found, if a metadata file is invalid, and for a missing or superfluous
     camera.
     """
     if masks is not None:

@@ -206,7 +206,7 @@ def _text_images(path: Path) -> list[ModelImage]:
     for row in rows:
         if not row.text or row.text.startswith("#"):
             continue
-        words = row.text.split(maxsplit=9)  # a name may contain blanks
+        words = row.text.split(maxsplit=9)  # a name may contain spaces
         if len(words) < 10:
             raise row.error(f" has {len(words)} entries")
         following = replace(next(rows, replace(row, text="")), columns="x, y, id of points")

@@ -55,7 +55,7 @@ class Dataset(Protocol):
 
 @runtime_checkable
 class Georeferenced(Protocol):
-    """A dataset that knows more about its world than the poses. Readers may provide it in addition to ``Dataset``."""
+    """A dataset with more information about its world than the poses. Readers may provide it in addition to ``Dataset``."""
 
     @property
     def unit(self) -> LengthUnit | None:

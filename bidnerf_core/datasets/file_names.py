@@ -1,6 +1,6 @@
 """Finding files from names that were written on another system.
 
-Descriptions may use Windows separators, different case from the files, no image extension, or an absolute
+Metadata files may use Windows separators, different case from the files, no image extension, or an absolute
 path from another machine. The file is found anyway if the name is unambiguous.
 """
 
@@ -21,7 +21,7 @@ def posix_name(name: str) -> PurePosixPath:
 
 
 class FileNames:
-    """The files below a folder, found by the names in a description; each folder is listed at most once."""
+    """The files below a folder, found by the names in a metadata file; each folder is listed at most once."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

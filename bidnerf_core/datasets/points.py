@@ -19,7 +19,7 @@ EXPECTED_POINTS = "expected n rows of x, y, z in metres"
 def read_depth_points(path: Path) -> Observations:
     """Read points (metres, OpenCV axes) as depth rays in the camera's frame.
 
-    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or blanks. Further columns are
+    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or spaces. Further columns are
     ignored, and ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from
     the camera. A .npz file holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor``
     (4x4); the points are then in the sensor's frame. Raises ``InputError`` for anything else.

@@ -179,13 +179,13 @@ def file_of_dataset(path: Path) -> str | None:
 
 
 def no_dataset(folder: Path) -> str:
-    """Return that a folder has neither photos nor a dataset, and where the formats are described."""
+    """Return an error message for a folder with neither photos nor a dataset, which refers to the list of formats."""
     found = "contains no photos and is no dataset" if any(folder.iterdir()) else "the folder is empty"
     return f"{found}; {expected_formats()}"
 
 
 def expected_formats(readers: Sequence[Reader] | None = None) -> str:
-    """Return which formats are read, for messages: all, by name, or the files of those of some readers."""
+    """Return the formats that can be read, for messages: all by name, or the files that some readers expect."""
     if readers is not None:
         return "expected " + "; or ".join(reader.expected for reader in readers)
     return f"expected photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"

@@ -23,7 +23,7 @@ HOLD_OUT_EVERY = 8
 
 @runtime_checkable
 class NamedFrame(Protocol):
-    """The description of a frame, named after its image file."""
+    """The metadata of a frame, which is named after its image file."""
 
     @property
     def stem(self) -> str: ...
@@ -43,7 +43,7 @@ F = TypeVar("F", bound=NamedFrame)
 
 
 class Splits(Generic[F]):
-    """The descriptions of the frames in the folder ``path``, by split and name."""
+    """The metadata of the frames in the folder ``path``, by split and name."""
 
     def __init__(self, path: Path, frames: dict[str, list[F]]) -> None:
         self.path = path
@@ -62,7 +62,7 @@ class Splits(Generic[F]):
         return list(self._names[split])
 
     def select(self, split: str, names: Sequence[str] | None = None) -> list[tuple[str, F]]:
-        """Return the name and description of the frames ``names``, in that order, or of the whole split.
+        """Return the name and metadata of the frames ``names``, in that order, or of the whole split.
 
         Raises ``InputError`` for an unknown split or frame.
         """
@@ -78,14 +78,14 @@ class Splits(Generic[F]):
         return [group[0] for group in self._frames.values()]
 
     def distinct(self) -> list[tuple[str, F]]:
-        """Return each description once, with the first split that contains it; splits may share frames."""
+        """Return each frame once, with the first split that contains it; splits may share frames."""
         found = {
             id(frame): (split, frame) for split in reversed(self.splits) for frame in self._frames[split]
         }
         return list(found.values())
 
     def distinct_names(self) -> list[tuple[str, str]]:
-        """Return each description's first split and its name there; splits may share frames."""
+        """Return each frame's first split and its name there; splits may share frames."""
         seen, found = set[int](), list[tuple[str, str]]()
         for split, group in self._frames.items():
             for name, frame in zip(self._names[split], group, strict=True):

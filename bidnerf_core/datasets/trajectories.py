@@ -1,6 +1,6 @@
 """Rows with time stamps, as in the TUM RGB-D benchmark; trajectories, and their poses interpolated in time.
 
-A row is ``timestamp value value ...``, separated by blanks or commas; ``#`` begins a comment, empty lines are
+A row is ``timestamp value value ...``, separated by spaces or commas; ``#`` begins a comment, empty lines are
 skipped, and Windows line endings are allowed. Rows may be in any order. A truncated last row, as left by an
 interrupted copy, is left out with a remark.
 
@@ -53,7 +53,7 @@ class TimedRow:
     row: Row
     time: float  # seconds
     words: tuple[str, ...]  # what follows the time stamp
-    rest: str  # the same as one text, such as a file name with blanks in it
+    rest: str  # the same as one string, such as a file name with spaces
 
     @property
     def where(self) -> str:

@@ -78,7 +78,7 @@ class FrameRecord:
 
 
 def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
-    """Read the frames of each split of the folder ``path``. Raises ``InputError`` for an invalid description."""
+    """Read the frame records of each split of the folder ``path``. Raises ``InputError`` for an invalid ``transforms*.json``."""
     files = {split: path / file_of(split) for split in SPLITS if (path / file_of(split)).is_file()}
     if files:
         return _cut({split: read_frames(read_record(file)) for split, file in files.items()})

@@ -8,7 +8,7 @@ between the samples before and after it. A frame outside the time span of the gr
 more than 0.1 s, has no pose: it is in the sequence but not in the dataset, and a remark counts it. The ground
 truth may also be in the format of EuRoC, or of KITTI with one pose for each image. Every eighth posed frame
 (the first, the ninth ...) is held out as "test" and the others are "train". Listed images that are missing
-are left out with a remark; names may contain blanks.
+are left out with a remark; names may contain spaces.
 
 Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image.
 The published images already include the depth scale correction. Depth of other recordings in this layout is
@@ -232,7 +232,7 @@ def _depths(folder: Path, names: FileNames) -> list[tuple[float, ListedDepth]]:
 
 
 def _file(row: TimedRow, names: FileNames, folder: Path) -> tuple[Path, bool]:
-    """Return the file that a row lists, whose name may contain blanks, and whether it exists."""
+    """Return the file that a row lists, whose name may contain spaces, and whether it exists."""
     for name in (row.rest.strip("\"'"), row.words[0]):
         if (found := names.find(posix_name(name))) is not None:
             return found, True

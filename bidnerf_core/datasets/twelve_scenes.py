@@ -50,7 +50,7 @@ class TwelveScenesReader(Reader):
         return _info(path) is not None and _data(path) is not None
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the poses. Raises ``InputError`` if a description is invalid, and if no frame has a pose."""
+        """Read the poses. Raises ``InputError`` if a metadata file is invalid, and if no frame has a pose."""
         frames = images_posed(path, _frames(path, options))
         dataset = MetricImageDataset(Splits(path, _splits(path, frames)), options.background)
         dataset.depth_unit = _metres_per_step(options)

@@ -18,7 +18,7 @@ from bidnerf_core.io.files import open_binary
 LARGEST_HEADER = 64 * 1024
 """Bytes."""
 SHORTEST_NUMBER = 2
-"""Bytes per number in a text file, including the separating blank."""
+"""Bytes per number in a text file, including the separator."""
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",

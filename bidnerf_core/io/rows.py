@@ -1,4 +1,4 @@
-"""Text files of rows: words and numbers separated by blanks; ``#`` begins a comment if the format has comments."""
+"""Text files of rows: words and numbers separated by white space; ``#`` begins a comment if the format has comments."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHOWN = 60
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a file, without surrounding blanks."""
+    """A line of a file, without leading and trailing white space."""
 
     path: Path
     line: int  # counted from 1
@@ -27,7 +27,7 @@ class Row:
 
     @property
     def where(self) -> str:
-        """The file and line, as messages begin."""
+        """The file and the line number, with which error messages begin."""
         return f"{self.path}: line {self.line}"
 
     @property
@@ -35,7 +35,7 @@ class Row:
         return self.text.split()
 
     def error(self, finding: str) -> InputError:
-        """Return the error for this row; ``finding`` begins with a blank or a colon."""
+        """Return the error for this row; ``finding`` begins with a space or a colon."""
         return InputError(f"{self.where}{finding}, expected {self.columns}")
 
     def numbers(self, words: Sequence[str] | None = None, count: int | None = None) -> list[float]:

@@ -47,9 +47,9 @@ def read_saved(path: Path, expected: str) -> Any:
 
 
 def outline_of(path: Path, expected: str) -> Any:
-    """Return what ``read_saved`` does, for recognising a file of any size: the numbers of its tensors stay in the file until they are used.
+    """Read a file as ``read_saved`` does, but memory-map its tensors, so that a file of any size is recognised quickly.
 
-    Only those of files in the format that torch had before version 1.6, which is no zip archive, are read.
+    Files in the format of torch before version 1.6, which are not zip archives, cannot be mapped and are read.
     """
     return _read(path, expected, mapped=zipfile.is_zipfile(path))
 
@@ -74,8 +74,9 @@ def _read(path: Path, expected: str, mapped: bool) -> Any:
 
 
 def check_sizes(path: Path, found: Any, expected: str) -> None:
-    """Raise ``InputError`` for a tensor in which one stored number stands for many. Call this before copying
-    the tensor.
+    """Raise ``InputError`` for a tensor that needs more memory than the file holds, such as an expanded one (stride 0).
+
+    Call this before copying the tensor.
     """
     size = path.stat().st_size
     for tensor in _tensors(found):

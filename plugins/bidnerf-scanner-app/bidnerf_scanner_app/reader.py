@@ -104,11 +104,11 @@ class ScannerAppReader(Reader):
             return False
 
     def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read all descriptions. Raises ``InputError`` if one is missing or invalid."""
+        """Read the metadata of all frames. Raises ``InputError`` if a file is missing or invalid."""
         return self._dataset(path, options)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        """Read all descriptions, including those of frames that have only depth."""
+        """Read the metadata of all frames, including those that have only depth."""
         return self._dataset(path, options).sequence(depth_frames(path))
 
     def _dataset(self, path: Path, options: ReadOptions) -> ScannerAppDataset:
@@ -147,7 +147,7 @@ class ScannerAppDataset(SplitDataset[ScannerFrame]):
 
 
 def _between(frame: ScannerFrame, name: str) -> Frame:
-    """Read a frame that has only depth. Its description holds the camera of a photo that was not saved."""
+    """Read a frame that has only depth. Its metadata file holds the camera of a photo that was not saved."""
     depth = read_measured(frame.beside("depth"), frame.beside("conf")).metres
     height, width = depth.shape
     photo_width, photo_height = projected_size(frame.record)
@@ -161,7 +161,7 @@ def _between(frame: ScannerFrame, name: str) -> Frame:
 
 
 def scanner_frames(folder: Path) -> list[ScannerFrame]:
-    """Read the descriptions of all photos, ordered by number. Raises ``InputError`` if one is missing or
+    """Read the metadata of all photos, ordered by number. Raises ``InputError`` if a file is missing or
     invalid.
 
     Depth is expected for all frames or, from phones without a LiDAR, for none.
@@ -182,7 +182,7 @@ def scanner_frames(folder: Path) -> list[ScannerFrame]:
 
 
 def depth_frames(folder: Path) -> list[ScannerFrame]:
-    """Read the descriptions of the frames that have depth and no photo. Raises ``InputError`` as ``scanner_frames`` does."""
+    """Read the metadata of the frames that have depth and no photo. Raises ``InputError`` as ``scanner_frames`` does."""
     photos = {path.stem for path in folder.iterdir() if PHOTO.fullmatch(path.name)}
     numbered = {path: DEPTH.fullmatch(path.name) for path in sorted(folder.glob("depth_*.png"))}
     descriptions = [folder / f"frame_{found[1]}.json" for found in numbered.values() if found]

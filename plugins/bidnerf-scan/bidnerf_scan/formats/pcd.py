@@ -18,7 +18,7 @@ LARGEST = 4 * 2**30
 """Largest file, in bytes, that is read."""
 LARGEST_HEADER = 64 * 1024
 SMALLEST_NUMBER = 2
-"""Bytes per number in a text file, including the separating blank."""
+"""Bytes per number in a text file, including the separator."""
 LARGEST_RATIO = 300
 """Upper bound on the bytes that one byte of LZF can represent."""
 
