@@ -1,4 +1,4 @@
-"""How well a model agrees with the pairs of photos that it was made of.
+"""Agreement of a model with the matched pairs of photos from which it was reconstructed.
 
 Places that look alike, such as the doors of a corridor, can be taken for one place. The model is then folded, although its
 points project where they should. It contradicts other pairs of photos, whose many matches cannot be due to chance.
@@ -21,7 +21,7 @@ TOLERANCE = 4.0
 
 @dataclass(frozen=True)
 class Agreement:
-    """How many pairs of placed photos have many verified matches, and how many of these contradict the poses of the model."""
+    """The number of pairs of registered photos with many verified matches, and of those that contradict the model's poses."""
 
     pairs: int
     contradicting: int

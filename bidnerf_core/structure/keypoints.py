@@ -98,7 +98,10 @@ def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> t
 
 
 def key(number: int) -> str:
-    """Return the name of a photo in the database; its own may contain blanks, which COLMAP's pair lists do not allow."""
+    """Return the name in the database of the photo with this number.
+
+    Its file name may contain spaces, which COLMAP's pair lists do not allow.
+    """
     return f"{number:06d}"
 
 

@@ -1,4 +1,4 @@
-"""Placing photos: COLMAP's incremental mapper, and the choice of the model that is kept."""
+"""Registration of photos by COLMAP's incremental mapper, and the choice of the model that is kept."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from bidnerf_core.structure.matching import Overlaps
 LEAST_PHOTOS = 3
 """Photos in the smallest model: two have a single baseline, which allows no check."""
 LEAST_POINTS = 15
-"""Triangulated points that a placed photo must show. COLMAP also places photos by matches without depth,
-which occur between photos from one place.
+"""Minimum number of triangulated points that a registered photo observes. COLMAP also registers photos by matches without
+depth, which occur between photos from one place.
 """
 FEW_KEYPOINTS = 100
-"""Number of keypoints below which an unplaced photo is reported as showing too little."""
+"""Number of keypoints below which an unregistered photo is reported as showing too little."""
 MOST_MODELS = 20
 
 
@@ -50,7 +50,7 @@ def reconstructed(
     """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to
     ``folder``.
 
-    ``count`` receives the number of photos placed, and may raise to stop. There may be no model at all.
+    ``count`` receives the number of registered photos, and may raise to stop. There may be no model at all.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,

@@ -85,7 +85,7 @@ def find_poses(
     returned immediately, unless ``overwrite`` is set and ``reuse`` is not.
 
     ``progress`` receives each step; once ``cancel`` returns True, ``Cancelled`` is raised. Raises
-    ``InputError`` if fewer than three photos can be read or placed, if poses are already known, if the folder
+    ``InputError`` if fewer than three photos can be read or registered, if poses are already known, if the folder
     holds something else and ``overwrite`` is not set, and if pycolmap is missing.
     """
     source, folder = Path(photos), Path(out)
@@ -292,7 +292,7 @@ class _Search:
 
 
 def _unplaced(found: Described, overlaps: Overlaps) -> str:
-    """Return why no three photos could be placed."""
+    """Return why no three photos could be registered."""
     of = f"no three of {amount(len(found.photos), 'photo')} could be placed"
     if not overlaps.pairs:
         return f"{of}: no two of them overlap enough"

@@ -68,13 +68,17 @@ class FoundPoses:
     inputs: str  # digest of the names, sizes and times of the files, and of the camera
     pycolmap: str  # its version
     video: bool = False  # whether the photos are frames of a video, which were written next to this record
-    sure_pairs: int = 0  # of placed photos, with so many matches that they show the same place for certain
+    sure_pairs: int = (
+        0  # pairs of registered photos with so many matches that they certainly show the same place
+    )
     contradicting: int = 0  # of these, pairs whose matches contradict the poses
-    turned: int = 0  # of placed photos, with an EXIF orientation; their cameras are of the images as stored
+    turned: int = (
+        0  # registered photos with an EXIF orientation; their cameras are those of the images as stored
+    )
 
     @property
     def doubt(self) -> str | None:
-        """Why the poses may be wrong as a whole, with the remedy; None where nothing speaks against them."""
+        """Why the poses may be wrong as a whole, with a remedy; None if there is no sign of that."""
         if self.contradicting <= CONTRADICTING * self.sure_pairs:
             return None
         return (
@@ -106,7 +110,7 @@ class FoundPoses:
 
 
 def digest(files: Sequence[Path], camera: Intrinsics | str | Path | None) -> str:
-    """Return a digest of the photos and of how their poses are sought."""
+    """Return a digest of the photos and of the settings with which their poses are estimated."""
     facts = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
     given = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]
     return hashlib.blake2b(json.dumps([facts, given]).encode(), digest_size=16).hexdigest()

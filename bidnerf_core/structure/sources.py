@@ -1,4 +1,4 @@
-"""The photos whose poses are sought: those of a folder or its subfolders, and videos."""
+"""The input of structure from motion: photos of a folder and its subfolders, and videos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frames of a video that are worth placing: as many as the image motion requires, each the sharpest among
+"""Selection of video frames for structure from motion: as many as the image motion requires, each the sharpest among
 its neighbours.
 
 The image motion is the displacement of tracked corners, accumulated along the video. A shaking camera does
