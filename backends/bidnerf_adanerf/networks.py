@@ -65,7 +65,7 @@ class Oracle(nn.Module):
         nn.init.constant_(self.scores.bias, FULL)
 
     def forward(self, points: Float[Tensor, "r k 3"]) -> Float[Tensor, "r n"]:
-        """Return the logits of the scores of rays, given their points (in the cube [-1, 1]) at ``places`` of their segment."""
+        """Return the logits of the bins' scores, from points (in the cube [-1, 1]) at the fractions ``places`` of each ray's segment."""
         return self.scores(self.trunk(encode(points, self.frequencies).flatten(1)))
 
 

@@ -1,4 +1,4 @@
-"""Levels of a hash encoding: their sizes, and where their tables hold the vertices around a point."""
+"""Levels of a hash encoding: their sizes, and the table indices of the vertices around a point."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Level:
 
     resolution: int  # cells along a side
     entries: int
-    strides: tuple[int, int, int]  # factor of each coordinate in a vertex's place
+    strides: tuple[int, int, int]  # factor of each coordinate in a vertex's table index
     hashed: bool
 
 
@@ -55,7 +55,7 @@ class LevelGroup:
 
     @property
     def span(self) -> slice:
-        """The places of these levels among all."""
+        """The indices of these levels among all levels."""
         return slice(self.first, self.first + len(self))
 
     @property
@@ -85,7 +85,7 @@ class LevelGroup:
         return terms, scaled.sub_(lower)
 
     def corner_indices(self, terms: Int[Tensor, "3 2 k m"]) -> Int[Tensor, " 8*k*m"]:
-        """Return the places of the eight corners (eq. 4, or the dense index), ordered (z, y, x, level, point)."""
+        """Return the table indices of the eight corners (eq. 4 if hashed, else dense), ordered (z, y, x, level, point)."""
         combine = torch.bitwise_xor if self.levels[0].hashed else torch.add
         x, y, z = terms.unbind()
         return combine(combine(z[:, None], y)[:, :, None], x).view(-1)

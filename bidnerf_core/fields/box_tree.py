@@ -1,9 +1,8 @@
-"""A tree of boxes around the pieces of a scene (Gaussians, triangles, discs) that finds the few pieces a ray
-or point meets.
+"""A bounding volume hierarchy of the pieces of a scene (Gaussians, triangles, discs), which finds the few pieces that
+a ray or point meets.
 
 Pieces are sorted along a Morton curve, eight neighbours share a box, eight of these boxes share the next, and
-so on (an implicit bounding volume hierarchy, Lauterbach et al. 2009, with eight children). The tree has no
-pointers: child ``c`` of node ``n`` is ``8 n + c`` on the level below. The boxes of a node's children are
+so on (Lauterbach et al. 2009, with eight children). The tree has no pointers: child ``c`` of node ``n`` is ``8 n + c`` on the level below. The boxes of a node's children are
 stored side by side, as (6 nodes 8): lower corner, upper corner.
 """
 

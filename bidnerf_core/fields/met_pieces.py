@@ -28,7 +28,7 @@ KEPT_HITS = 64
 
 @dataclass(frozen=True, eq=False)
 class Meeting:
-    """Where lines meet pieces, one pair each."""
+    """The intersections of pairs of a line and a piece."""
 
     distance: Float[Tensor, "*p"]  # metres along the line from its origin; may be negative
     alpha: Float[Tensor, "*p"]  # fraction of the light stopped there; 0 where the line misses
@@ -42,7 +42,7 @@ Meet: TypeAlias = Callable[[Int[Tensor, "p"], Float[Tensor, "p 3"], Float[Tensor
 def met_pieces(
     rays: Rays, boxes: Boxes, order: Int[Tensor, "n"], meet: Meet
 ) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-    """Return the indices of the pieces that rays (r) hit, in key order until hardly any light is left, and
+    """Return the indices of the pieces that rays (r) hit, in key order until the transmittance is negligible, and
     which slots are in use.
     """
     if not len(rays.near):

@@ -49,8 +49,8 @@ class RenderedImage:
 def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
     """Return the field's values at the samples (*r s), with density 0 at invalid samples.
 
-    The field is not queried at these or, if the host must not wait for the device (see ``may_wait``), queried
-    at the origin.
+    Invalid samples are skipped. If the host must not wait for the device to count them (see ``may_wait``), the
+    field is queried at the origin instead, and the result is discarded.
     """
     valid = samples.valid
     if not may_wait(valid.device) or bool(valid.all()):

@@ -160,13 +160,13 @@ class Importance:
     """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its
     weight.
 
-    The field's own valid intervals are split at ``count`` more places; what its sampler skips, as an
-    occupancy grid does, remains skipped. No gradient flows through the choice of places.
+    The field's own valid intervals are split at ``count`` further distances; space that its sampler skips,
+    such as one with an occupancy grid, remains skipped. No gradient flows through the choice of distances.
     """
 
     field: RadianceField
     count: int
-    padding: float = 1e-5  # added to the weight of each interval, so that every interval gets some places
+    padding: float = 1e-5  # added to the weight of each interval, so that every interval gets some samples
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         with torch.no_grad():
@@ -181,8 +181,8 @@ class Importance:
 def inverse_transform(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> tuple[Float[Tensor, "*r n"], Int[Tensor, "*r n"]]:
-    """Return ``count`` distances distributed as ``weights`` (piecewise constant over the intervals), by
-    inverting their CDF.
+    """Return ``count`` distances along each ray, by inverse transform sampling of the piecewise-constant PDF
+    ``weights`` over the intervals.
 
     They are in ascending order, each with the index of its interval. On a ray without weight, all are in its
     first interval.
@@ -336,7 +336,7 @@ def _first(samples: RaySamples, count: int) -> RaySamples:
 def concentrated(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> RaySamples:
-    """Replace ``samples`` by ``count`` intervals that are short where ``weights`` are large, see ``Concentrated``."""
+    """Resample rays to ``count`` intervals that are short where the ``weights`` of ``samples`` are large, see ``Concentrated``."""
     length = torch.where(samples.valid, samples.ends - samples.starts, 0)
     laid = pad(length.cumsum(-1), (1, 0))  # borders of the intervals, laid end to end
     border = _borders(weights, length, laid, count, jitter)

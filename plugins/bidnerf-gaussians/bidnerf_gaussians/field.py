@@ -143,8 +143,8 @@ class GaussiansField(nn.Module):
 
     @torch.no_grad()
     def met(self, rays: Rays, by_means: bool) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        """Return the indices of the Gaussians that rays (r) hit, nearest first, until hardly any light is
-        left.
+        """Return the indices of the Gaussians that rays (r) hit, nearest first, until the transmittance is
+        negligible.
 
         With ``by_means``, they are ordered by the distance of the mean, otherwise by that of the peak.
         """

@@ -36,7 +36,7 @@ class NgpConfig(RadianceConfig, SupervisionConfig):
 
     grid_levels: Annotated[int, Range(1, 16)] = 1  # boxes of cells, each twice as wide as the previous one
     grid_resolution: Annotated[int, Range(2, 1024)] = 128  # cells along each side of a box
-    step: Positive = 2 * math.sqrt(3) / 1000  # length of the shortest interval (trained units)
+    step: Positive = 2 * math.sqrt(3) / 1000  # length of the shortest interval (training units)
     cone_angle: NotNegative = 0.0  # length of an interval at distance 1, if that is larger
     steps: Count = 5000  # steps of the optimizer
     rays_per_step: Count = 1024  # rays of a step
@@ -69,7 +69,7 @@ class OccupancyLevels(nn.Module):
         return tuple(c - wide * h for c, h in pairs), tuple(c + wide * h for c, h in pairs)
 
     def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        """Return whether positions (trained coordinates) are in an occupied cell."""
+        """Return whether positions (training coordinates) are in an occupied cell."""
         count, resolution = self.cells.shape[:2]
         points = (positions - constant(self.centre, positions)) / constant(self.half, positions)
         size = points.abs().amax(-1)

@@ -21,7 +21,7 @@ class Placement:
 
     scale: float  # training units per unit of the world
     rotation: tuple[float, ...]  # 3x3, row by row; the world's axes in training coordinates
-    translation: tuple[float, ...]  # trained units
+    translation: tuple[float, ...]  # training units
 
     @staticmethod
     def of(numbers: tuple[float, ...], bounds: SceneBounds) -> Placement:
@@ -42,7 +42,7 @@ class Placement:
 
     @staticmethod
     def from_similarity(world_to_trained: Similarity) -> Placement:
-        """Return the placement of a similarity transform from the world to the trained coordinates."""
+        """Return the placement of a similarity transform from the world to training coordinates."""
         T = world_to_trained.T_target_source.to(dtype=torch.float64)
         return Placement(
             world_to_trained.scale, tuple(T.rotation.reshape(-1).tolist()), tuple(T.translation.tolist())
@@ -55,20 +55,20 @@ class Placement:
 
     @property
     def similarity(self) -> Similarity:
-        """The transform from the world to the trained coordinates."""
+        """The transform from the world to training coordinates."""
         rotation = torch.tensor(self.rotation, dtype=torch.float64).reshape(3, 3)
         return Similarity(self.scale, SE3(rotation, torch.tensor(self.translation, dtype=torch.float64)))
 
     def points(self, positions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-        """Return positions (world) in the trained coordinates."""
+        """Return positions (world) in training coordinates."""
         return self.scale * self.directions(positions) + constant(self.translation, positions)
 
     def directions(self, directions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-        """Return unit directions (world) in the trained coordinates."""
+        """Return unit directions (world) in training coordinates."""
         return directions @ constant(self.rotation, directions).reshape(3, 3).mT
 
     def rays(self, rays: Rays) -> Rays:
-        """Return rays of the world in the trained coordinates."""
+        """Return rays of the world in training coordinates."""
         return Rays(
             self.points(rays.origins), self.directions(rays.directions), self.scale * rays.near,
             self.scale * rays.far,

@@ -33,8 +33,8 @@ class Proposed:
 class ProposalSampler:
     """Samples of rays in training coordinates: nerfstudio's ProposalNetworkSampler, at inference.
 
-    The first network is evaluated at uniform steps of ``spacing``; each further one, and then the field, at
-    places distributed as the previous one's weights.
+    The first network is evaluated at uniform steps of ``spacing``. The samples of each further network, and of the
+    field, are drawn from the rendering weights of the previous one, as a piecewise-constant PDF.
     """
 
     densities: Sequence[Density]
@@ -88,7 +88,7 @@ def place(distances: Tensor, spacing: Spacing) -> Tensor:
 
 
 def distance(places: Tensor, spacing: Spacing) -> Tensor:
-    """Return the distance (trained units) at coordinates, the inverse of ``place``."""
+    """Return the distance (training units) at coordinates, the inverse of ``place``."""
     if spacing == "uniform":
         return places
     return torch.where(places < 0.5, 2 * places, 1 / (2 - 2 * places.clamp(0.5, 1 - 1e-7)))

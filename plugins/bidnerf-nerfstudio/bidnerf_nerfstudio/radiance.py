@@ -59,14 +59,14 @@ class Radiance(nn.Module):
         self.appearance = nn.Parameter(torch.zeros(config.appearance))
 
     def density(self, positions: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
-        """Return densities per trained unit."""
+        """Return densities per training unit."""
         points, inside = unit_cube(positions, self.box)
         return density_of(self.base(points)[:, 0], self.factor) * inside
 
     def forward(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
-        """Return densities per trained unit, and colours."""
+        """Return densities per training unit, and colours."""
         points, inside = unit_cube(positions, self.box)
         raw, features = self.base(points).split(
             [1, self.head.layers[0].in_features - HARMONICS - len(self.appearance)], -1

@@ -160,7 +160,7 @@ class ScanField(nn.Module):
 
     @torch.no_grad()
     def met(self, rays: Rays) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        """Return the indices of the pieces that rays (r) cross, nearest first, until hardly any light is left."""
+        """Return the indices of the pieces that rays (r) cross, nearest first, until the transmittance is negligible."""
 
         def meet(index: Tensor, origins: Tensor, directions: Tensor) -> Meeting:
             found = self._crossings(index, origins, directions)
@@ -222,7 +222,7 @@ class ScanField(nn.Module):
     def colours_at(
         self, piece: Int[Tensor, "p"], u: Float[Tensor, "p"], v: Float[Tensor, "p"]
     ) -> Float[Tensor, "p 3"]:
-        """Return the colours at places on pieces, see ``Pieces``."""
+        """Return the colours of pieces at the coordinates u and v, see ``Pieces``."""
         return self._colours(piece, u, v)
 
     def _colours(

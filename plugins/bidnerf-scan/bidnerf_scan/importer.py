@@ -198,9 +198,7 @@ def surface_points(pieces: Pieces) -> Float[Tensor, "n 3"]:
 def surface_places(
     pieces: Pieces,
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return places distributed uniformly over the area of triangles, always the same: indices of triangles,
-    and u and v in them.
-    """
+    """Return points distributed uniformly over the area of triangles, as triangle indices, u and v. Deterministic."""
     area = torch.linalg.vector_norm(torch.linalg.cross(pieces.first, pieces.second), dim=-1).double()
     ends = area.cumsum(0) / area.sum().clamp(min=1e-300)
     generator = torch.Generator().manual_seed(0)
