@@ -13,7 +13,7 @@ from bidnerf_core.errors import Cancelled, InputError
 
 @dataclass(frozen=True)
 class Progress:
-    """How much of one stage of some work is done. ``str()`` gives a human-readable line."""
+    """The progress of one stage of long-running work. ``str()`` gives a human-readable line."""
 
     stage: str  # such as "training"
     done: int
@@ -59,7 +59,7 @@ def stopped_by(cancel: Cancel) -> Iterator[None]:
 
 
 def check_stopped() -> None:
-    """Raise ``Cancelled`` if what this thread does is to stop, see ``stopped_by``. Called once in each round of a long loop."""
+    """Raise ``Cancelled`` if this thread's work should stop, see ``stopped_by``. Called once per iteration of a long loop."""
     check_cancelled(_STOP.get(), "localization")
 
 

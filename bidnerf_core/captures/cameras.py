@@ -207,8 +207,9 @@ def _typical_motion(moved: Sequence[MovedCamera]) -> str:
 
 
 def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
-    """Return the views at their refined poses; a view keeps its pose unless ``cameras`` records a refinement
-    of it.
+    """Return the views with the refined poses and motions in ``cameras``, matched by name and given pose.
+
+    Views whose pose was not refined are returned unchanged.
     """
     known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
     found = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]

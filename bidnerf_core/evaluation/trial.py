@@ -38,7 +38,7 @@ class Trial:
 
     map: str  # folder, or demo:NAME
     data: str  # folder, or demo:NAME
-    frames: tuple[str, ...]  # views of a rig, or one image; the pose sought is the last one's
+    frames: tuple[str, ...]  # views of a rig, or one image; the pose of the last one is to be found
     protocol: str = "bid"  # how the start is chosen
     size: tuple[float, ...] = ()  # how far the start is from the truth, in the protocol's units
     method: str = "auto"
@@ -62,7 +62,7 @@ class Trial:
 
     @property
     def frame(self) -> str:
-        """The name of the frame whose pose is sought."""
+        """The name of the frame whose pose is to be found."""
         return self.frames[-1]
 
     @property

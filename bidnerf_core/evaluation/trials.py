@@ -240,7 +240,10 @@ def _finite(values: Tensor) -> list[float | None]:
 
 
 def forget_peak_memory() -> None:
-    """Reset the peak if the system supports it; elsewhere it remains the peak since the process began."""
+    """Reset the peaks that ``peak_memory_bytes`` reports.
+
+    Where the operating system cannot do that, the peak resident memory remains that since the process began.
+    """
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
     with contextlib.suppress(OSError):

@@ -144,7 +144,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class FusedPose:
-    """A pose estimated from several kinds of measurements, its covariance, and the errors of depth estimated with it."""
+    """A pose estimated from several kinds of measurements, with the depth scale and offset, and its covariance."""
 
     state: PoseAndDepth
     covariance: Float[Tensor, "6 6"]  # metres, radians; of a right update

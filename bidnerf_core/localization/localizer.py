@@ -134,7 +134,7 @@ class Localizer:
 
     @property
     def assumed_cameras(self) -> tuple[Intrinsics, ...]:
-        """The cameras that photos without a focal length may have, which takes landmarks: those of the map's images."""
+        """The cameras of the map's images, assumed for photos without a focal length; empty if landmarks are not matched."""
         return landmark_cameras(self.map) if self.matches_landmarks else ()
 
     @property

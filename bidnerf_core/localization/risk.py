@@ -38,7 +38,7 @@ def least_confidence(risk: float) -> float:
 
 
 def within_risk(found: Localization, risk: float) -> Localization:
-    """Return an answer, as ``uncertain`` if its confidence is unknown or lower than the risk requires."""
+    """Return the answer, rejected as ``uncertain`` if its confidence is unknown or lower than the risk requires."""
     least = least_confidence(risk)
     if not found.converged or (found.confidence is not None and found.confidence >= least):
         return found

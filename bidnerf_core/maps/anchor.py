@@ -119,15 +119,15 @@ def save_anchor(folder: Path, anchor: Anchor) -> None:
 
 
 def anchor_bytes(anchor: Anchor | None) -> bytes:
-    """Return the content of a file with an anchor; None says that there is none."""
+    """Return the content of a file with an anchor; None means that there is none."""
     plain = None if anchor is None else anchor.plain()
     return (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode()
 
 
 def put_in_place(folder: Path, newer: str) -> None:
-    """Let the anchor in file ``newer``, which ``map.json`` names, take the place of ``anchor.json``.
+    """Replace ``anchor.json`` by the file ``newer``, which ``map.json`` names.
 
-    Where this stops in between, ``newer`` still exists and counts.
+    If this is interrupted, ``newer`` still exists and is the one that counts.
     """
     with contextlib.suppress(OSError, InputError):
         if read_json(folder / newer, "the anchor of a map") is not None:

@@ -55,7 +55,7 @@ class Placement:
     found: Localization
     runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
     ranking: tuple[MapSimilarity, ...]  # all maps, most similar first
-    asked: tuple[str, ...]  # maps in which a pose was sought, in order
+    asked: tuple[str, ...]  # maps in which the image was localized, in order
 
     @property
     def converged(self) -> bool:

@@ -16,7 +16,7 @@ UNEXPLAINED = 0.1
 
 
 def world_of_truth(found: SE3, true: SE3) -> Similarity | None:
-    """Return the similarity that takes the world of the ``true`` poses to that of the ``found`` ones (n each).
+    """Return the similarity that maps the world of the ``true`` poses to that of the ``found`` ones (n each).
 
     None unless it explains all errors. Its rotation is the mean of those between the orientations, so that the
     positions confirm it.

@@ -88,7 +88,7 @@ def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
 
 
 def relative_errors(found: SE3, true: SE3, apart: int = 1) -> PoseError:
-    """Return the relative pose errors (n - apart) of the motion from each pose to the one ``apart`` places
+    """Return the relative pose errors (n - apart) of the motion from each pose to the one ``apart`` poses
     later.
 
     Sturm et al. 2012, eq. 2. Raises ``InputError`` if the trajectory is too short.

@@ -124,7 +124,9 @@ SAME_OPACITY = 0.05
 
 
 def check_hits(field: RadianceField) -> None:
-    """Check the hits of a field that provides them: in range, in [near, far], and as opaque as its density."""
+    """Check the hits of a field that provides them: values in range, distances in [near, far], and the opacity of its
+    density.
+    """
     if not isinstance(field, HitField):
         return
     for of, rays in awkward_rays().items():

@@ -1,4 +1,4 @@
-"""Supervision of a field by training views: batches of their rays, and the loss of rendering them."""
+"""Supervision of a field by training views: batches of their rays, and the rendering loss."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ class SupervisionConfig(Settings):
 
     # weight of depth, from sensors or landmarks, relative to colour; 0 leaves it out
     depth_weight: NotNegative = 0.1
-    distortion_weight: NotNegative = 0.0  # weight of the term that concentrates a ray's weight in one place
+    distortion_weight: NotNegative = (
+        0.0  # weight of the distortion loss, which concentrates a ray's weight at one depth
+    )
     exposure: bool = True  # learn a colour transform of each image, unless images have alpha
     sharpness: bool = True  # down-weight blurred images
 
@@ -74,7 +76,7 @@ class Supervision:
         fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
 
     def step(self, field: RadianceField, count: int, generator: Generator) -> StepOutcome:
-        """Return the loss of rendering ``count`` rays drawn from the views."""
+        """Render ``count`` rays drawn from the views, and return their loss."""
         batch = self.draw(count, generator)
         rendering = render(field, batch.rays, batch.background, generator)
         loss, mse = self.loss(rendering, batch)

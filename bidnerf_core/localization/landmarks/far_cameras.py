@@ -89,7 +89,7 @@ def camera_fit(
     """Return the fit of a camera with far more inliers than the one that was found; None if there is none.
 
     ``data`` are matches by descriptors alone; inliers have residuals within ``limit`` (pixels). The camera that was found is the
-    stated one corrected by ``calibration``; if its inlier fraction is at least ``unsuspected``, no other is sought.
+    stated one corrected by ``calibration``; if its inlier fraction is at least ``unsuspected``, there is no search for another.
     """
     here = _Fit.of(data, State.of(T_world_rig, calibration), limit)
     enough = SUPPORT_RATIO * here.support + MIN_EXTRA_INLIERS

@@ -96,7 +96,7 @@ class LandmarkPose:
     depth_scale: float | None  # factor that corrects measured depth; None if too few depths were measured
     # A camera with far more inliers, but with which no pose could be refined.
     better_camera: Calibration | None = None
-    rivals: tuple[Rival, ...] = ()  # if sought: other poses that explain the keypoints about as well
+    rivals: tuple[Rival, ...] = ()  # if searched for: other poses that explain the keypoints about as well
     guided: GuidedPose | None = (
         None  # state to which evidence about the camera can be added; None for tracked landmarks
     )

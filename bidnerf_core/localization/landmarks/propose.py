@@ -132,7 +132,7 @@ def confirm(
 
 
 def _with_rivals(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> LandmarkPose:
-    """Return a pose with its rivals, which are sought with the intrinsics used for the pose."""
+    """Search for rivals of a pose, with the intrinsics used for it, and return the pose with them."""
     cameras = [found.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
     seen = replace(query.seen_by(cameras), prior=FIXED)
     rivals = (twin_of(seen, matcher, found), second_of_plane(seen, found))

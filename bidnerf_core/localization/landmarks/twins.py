@@ -27,7 +27,7 @@ from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 COMPARED = 100
-"""Maximum number of correspondences for which similar landmarks are sought elsewhere."""
+"""Maximum number of correspondences for which similar landmarks at other places are searched for."""
 ALIKE = 0.9
 """Minimum ratio of a correspondence's descriptor distance to that of a similar landmark elsewhere."""
 LEAST_ALIKE = 0.3

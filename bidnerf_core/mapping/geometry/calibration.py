@@ -36,7 +36,7 @@ class Calibration:
 
     @property
     def across_and_down(self) -> Float[Tensor, "2"]:
-        """Ratios of the true to the given focal lengths, across and down the image."""
+        """The ratios of the true to the given fx and fy."""
         logarithms = (self.log_focal + 0.5 * self.log_stretch, self.log_focal - 0.5 * self.log_stretch)
         return torch.tensor(logarithms, dtype=torch.float64).exp()
 
