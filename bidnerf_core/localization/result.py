@@ -80,7 +80,7 @@ class Localization:
     # Covariance of a right update at the camera: translation (``unit``) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
     focal_factor: float = 1.0  # ratio of the estimated to the given focal length; 1 if it was not corrected
-    # Probability that the pose is right, from the diagnostics; None if no model of it was learned.
+    # Probability that the pose is right: by a learned model of the diagnostics, else by comparison with rivals. None if unknown.
     confidence: float | None = None
     diagnostics: Diagnostics | None = None  # the measures by which the pose was accepted or rejected
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
