@@ -420,7 +420,7 @@ def interface_defects(
     their parameters.
 
     If ``summary`` is one of the attributes, it must be text; ``config_type`` must be a frozen dataclass with
-    defaults. The method ``__call__`` stands for a plain function.
+    defaults. A plain function counts as an object with the method ``__call__``.
     """
     missing = [name for name in (*attributes, *methods) if not hasattr(plugin, name)]
     if missing:

@@ -9,7 +9,7 @@ from bidnerf_core.camera.lenses import LENS_MODEL_IDS, LENS_MODELS, PANORAMA, Ca
 from bidnerf_core.errors import InputError
 
 COLMAP_MODELS: dict[str, tuple[int, ...]] = {
-    # Indices of fx, fy, cx, cy and the distortion (in OpenCV's order) among the parameters; -1 stands for a
+    # Indices of fx, fy, cx, cy and the distortion (in OpenCV's order) among the parameters; -1 means a
     # coefficient of 0.
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),

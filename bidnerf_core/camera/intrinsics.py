@@ -23,7 +23,7 @@ from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
 LARGEST_SIZE = 1_000_000
-"""Most columns or rows of an image."""
+"""Maximum number of columns or rows of an image."""
 SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
 """Limits of focal lengths and of the principal point's distance, in pixels. Beyond them, float32 overflows."""
 LARGEST_FOCAL = 1000
@@ -33,7 +33,7 @@ SHORTEST_FOCAL, PHOTO, MILLIMETRE = 0.1, 240, 1.0
 pixels along a side. A shorter one above ``MILLIMETRE`` is probably given in millimetres: a phone's lens has
 about 4.2 mm."""
 SKEW = 1e-6
-"""Largest skew of a camera matrix, as a share of its focal length."""
+"""Maximum skew of a camera matrix, as a fraction of its focal length."""
 LARGEST_COEFFICIENT = 1e6
 """Largest distortion coefficient; those of rational models reach some hundreds."""
 ASPECT_TOLERANCE = 0.005

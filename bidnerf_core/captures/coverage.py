@@ -25,7 +25,7 @@ BEYOND = 1.5
 """Distance of the point where the optical axes meet, relative to what the photos show, beyond which it does not
 count: they look along a corridor."""
 BEHIND = 0.05
-"""Share of the landmarks behind a camera, on average, above which the scene surrounds the cameras (up to 0.02 in
+"""Fraction of the landmarks behind a camera, on average, above which the scene surrounds the cameras (up to 0.02 in
 captures of things seen from outside, 0.08 to 0.5 in those of rooms and corridors)."""
 OPEN_SIDE = 120.0
 """Smallest range of directions (degrees) without a camera in a one-sided capture."""
@@ -115,7 +115,7 @@ def _range_deg(sines: Float[Tensor, "v"]) -> tuple[float, float]:
 def _share_behind(
     centres: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3"], positions: Float[Tensor, "n 3"]
 ) -> float:
-    """Return the mean share of the points that lie behind a camera."""
+    """Return the mean fraction of the points that lie behind a camera."""
     shares = [
         ((positions - centre) @ axis < 0).double().mean() for centre, axis in zip(centres, axes, strict=True)
     ]

@@ -52,7 +52,7 @@ class PhotoMeasures:
 
     sharpness: Float[Tensor, "v"]  # log2 of fine over coarse energy, in the direction where it is smallest
     brightness: Float[Tensor, "v"]  # log2 of the median linear brightness
-    overexposed: Float[Tensor, "v"]  # share of the pixels
+    overexposed: Float[Tensor, "v"]  # fraction of the pixels
     underexposed: Float[Tensor, "v"]
 
 

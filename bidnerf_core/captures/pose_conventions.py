@@ -99,7 +99,7 @@ class PoseContradiction:
 
 
 def pose_contradiction(images: Sequence[PosedKeypoints]) -> PoseContradiction | None:
-    """Return how the poses of ``images`` contradict them; None if they agree, or if the images do not tell."""
+    """Return how the poses of ``images`` contradict them; None if they agree, or if the images do not determine it."""
     proposed = _pairs(images)
     pairs = [pair for i, j in proposed if (pair := _matched(images, i, j)) is not None]
     if len(pairs) < MOST_PAIRS / 2:

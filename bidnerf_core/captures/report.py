@@ -28,7 +28,7 @@ class PhotoRecord:
     direction: tuple[float, float, float]  # of the optical axis, unit, world
     sharpness: float  # log2 of the ratio of fine to coarse energy, relative to nearby photos
     exposure: float  # stops: brightness of the same landmarks, relative to the other photos
-    overexposed: float  # share of the pixels
+    overexposed: float  # fraction of the pixels
     underexposed: float
     keypoints: int
     landmarks: int  # number of triangulated ones that it shows
@@ -64,7 +64,7 @@ class CoverageRecord:
     parallax_deg: float = 0.0  # median angle between the rays to a point
     landmarks: int = 0  # triangulated
     seen_by: float = 0.0  # median number of photos that show a landmark
-    seen_by_two: float = 0.0  # share of the landmarks that only two photos show
+    seen_by_two: float = 0.0  # fraction of the landmarks that only two photos show
     seen_within_deg: float = 0.0  # median angle between the directions from which a landmark is seen
     # Widest range of directions without a camera if the cameras do not go all the way around; ``gaps`` are
     # the others.

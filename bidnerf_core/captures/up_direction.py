@@ -103,8 +103,8 @@ def _level(
     """Return the direction most nearly perpendicular to all horizontal image axes, nearest to the mean upward
     axis.
 
-    If all cameras face the same way, only the plane of such directions is known, and the mean decides within
-    it.
+    If all cameras face the same way, only the plane of such directions is known, and the one nearest to the mean is
+    chosen.
     """
     mean = normalize(up_axis.mean(0), dim=0)
     spread = level_axis.mT @ level_axis / len(level_axis)

@@ -1,4 +1,4 @@
-"""Messages for arguments that the parser refuses: one line, as for every other mistake.
+"""Error messages for arguments that the parser rejects: one line, as for every other mistake.
 
 The parser (tyro) reports them through a hook that is not part of its stable interface. If a version lacks the
 hook, or reports something unknown here, the parser prints its own message.
@@ -19,7 +19,7 @@ NUMBERS = {int: "a whole number", float: "a number"}
 
 @contextlib.contextmanager
 def refusals_in_a_line(arguments: Sequence[str], options: Callable[[], Collection[str]]) -> Iterator[None]:
-    """Raise ``UsageError`` where the parser refuses ``arguments``; ``options`` returns the names of all options."""
+    """Raise ``UsageError`` if the parser rejects ``arguments``; ``options`` returns the names of all options."""
     try:
         from tyro import _errors
     except ImportError:

@@ -77,7 +77,7 @@ def positions(
 ) -> list[int]:
     """Return the indices of the requested frames in ``names``.
 
-    ``splits`` has the names in each split, so that the message about a frame of another split says so. Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
+    ``splits`` has the names in each split, so that the message about a frame of another split can name that split. Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
     """
     refuse_text(f"{where}: names", asked)
     index = {name: place for place, name in enumerate(names)}

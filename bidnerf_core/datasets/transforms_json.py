@@ -46,7 +46,7 @@ class FrameRecord:
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of its position if the file says ``"unit": "metres"`` or ``"units"``, as bidnerf's files do."""
+        """The unit of its position if the file states ``"unit": "metres"`` or ``"units"``, as bidnerf's files do."""
         said = self.record.value("unit")
         return said if said in get_args(LengthUnit) else None
 

@@ -143,7 +143,7 @@ def frame_count(path: Path) -> int:
 
 
 def require_av(path: Path) -> None:
-    """Raise ``InputError``, which says what to install, if the extra ``video`` is missing."""
+    """Raise ``InputError``, which states what to install, if the extra ``video`` is missing."""
     try:
         import av  # noqa: F401
     except ImportError as error:

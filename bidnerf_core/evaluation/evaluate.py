@@ -72,7 +72,7 @@ def evaluate(
     """Localize many frames of ``data`` in a map, from the starts of a protocol or from none, and return all results.
 
     ``protocol`` chooses frames, seeds and starts; ``sizes`` are the errors of the start in its units, ``trials`` is the number
-    of trials per size, and None stands for the protocol's own values. ``config`` holds the method's settings: an instance of their
+    of trials per size, and None selects the protocol's own values. ``config`` holds the method's settings: an instance of their
     type, or a dictionary of those that differ from the defaults. ``faults`` are applied to the images, such as
     ``"depth-scale:1.02"``. ``masks`` is a folder of image masks, in which ``mask_hides`` is the colour that is ignored.
     ``device`` is used for a map read from a folder.

@@ -92,7 +92,7 @@ class Trace:
     Raises ``ValueError`` if the two sequences differ in length or are empty.
     """
 
-    translation: tuple[float | None, ...]  # metres; None where a pose was not finite
+    translation: tuple[float | None, ...]  # metres; None if a pose was not finite
     rotation_deg: tuple[float | None, ...]
 
     def __post_init__(self) -> None:
@@ -133,10 +133,10 @@ class TrialResult:
     loss: float | None
     backend: str
     method: str
-    error: ScalarPoseError | None  # None where the pose was not finite
+    error: ScalarPoseError | None  # None if the pose was not finite
     frame: str
     seed: int
-    start_error: ScalarPoseError | None  # None where no start was given
+    start_error: ScalarPoseError | None  # None if no start was given
     errors: Trace
     reason: str  # why the method stopped
     peak_memory_bytes: int  # of the process during the trial: resident memory, or memory of the GPU

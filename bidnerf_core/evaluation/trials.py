@@ -109,7 +109,7 @@ def trial_views(trial: Trial, dataset: Dataset) -> list[View]:
 
 
 def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:
-    """Return digests of everything that the trial reads besides the map's weights."""
+    """Return digests of everything that the trial reads apart from the map's weights."""
     points = None if trial.depth_points is None else folder_digest(trial.depth_points)
     return InputDigests(views_digest(views), points, stored.info.surface)
 

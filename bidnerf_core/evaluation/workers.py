@@ -81,7 +81,7 @@ def workers_for(
 ) -> Iterator[tuple[Executor, int, str]]:
     """Yield an executor for a number of trials, how many of them to run on it at once, and its description.
 
-    ``workers`` is the number of processes; None stands for one per core, and one on a GPU. ``dask`` is the
+    ``workers`` is the number of processes; None means one per core, and one on a GPU. ``dask`` is the
     address of a scheduler whose workers run the trials instead. If the work fails, the processes are ended
     with their trials. Raises ``InputError`` for a number below 1, and as ``dask_executor`` does.
     """

@@ -117,7 +117,7 @@ class OccupancyMask(nn.Module):
         self.register_buffer("cells", torch.ones(grid.shape, dtype=torch.bool))
 
     def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        """Return whether there may be matter at ``positions`` (metres, world); outside the grid, the nearest
-        border cell decides.
+        """Return whether there may be matter at ``positions`` (metres, world); positions outside
+        the grid take the value of the nearest border cell.
         """
         return self.grid.at(self.cells, positions)

@@ -46,7 +46,7 @@ def read_mask(
 
     ``raster`` is that of the image file. A mask with its own EXIF orientation is turned upright accordingly;
     one whose size fits the stored image is turned upright with it. If its size fits the upright image as
-    well, as for square photos and those taken upside down, an ``InputWarning`` says so. A mask of another
+    well, as for square photos and those taken upside down, an ``InputWarning`` is issued. A mask of another
     resolution is resampled to the nearest of its pixels. Masks whose values are all small, such as 0 and 1,
     hide what is 0; otherwise the bright half of the values is white. If the colours are uniform, the alpha
     channel is the mask. Raises ``InputError`` if the file is not an image, or has another aspect ratio, and

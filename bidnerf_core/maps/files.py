@@ -214,7 +214,7 @@ def _json(value: Any) -> bytes:
 
 
 def _finish_anchor(folder: Path) -> set[str] | None:
-    """Put the anchor in place that ``map.json`` names, and return all files that it names; None where it is damaged."""
+    """Put the anchor that ``map.json`` names in place, and return all files that it names; None if it is damaged."""
     exists = os.path.lexists(folder / DESCRIPTION)
     try:
         found = read_json(folder / DESCRIPTION, "the description of a map") if exists else {}

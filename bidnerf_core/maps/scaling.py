@@ -42,7 +42,7 @@ Place = str | Position
 """A point of a map: its three coordinates, the name of one of its cameras, or ``NAME@U,V``, what that camera
 shows at a pixel."""
 DIGITS = re.compile(r"\d+|\.\w+$")
-"""What names of photos of one capture differ in, and their endings."""
+"""The parts in which the names of photos of one capture differ: numbers and file extensions."""
 LEAST_CAMERAS = 3
 """Smallest number of cameras with known positions that gives a scale that can be checked."""
 WORST_FIT = 0.2

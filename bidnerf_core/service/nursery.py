@@ -65,7 +65,7 @@ def _fork_on_demand(control: socket.socket, worker: Worker) -> None:
         asked, descriptors, _, _ = socket.recv_fds(control, len(wire.ANOTHER), 1)
         if not asked:
             with contextlib.suppress(OSError):
-                os.killpg(0, signal.SIGKILL)  # including those at work
+                os.killpg(0, signal.SIGKILL)  # including those that are busy
             return
         if os.fork() == 0:
             control.close()

@@ -110,7 +110,7 @@ def run_app(
 ) -> None:
     """Run an application on a port until the process is interrupted, or ``stop`` is set; ``ready`` is called with its address.
 
-    Requests at work then have ``grace`` seconds. Raises ``InputError`` for a port that is taken.
+    Requests in progress then have ``grace`` seconds to end. Raises ``InputError`` for a port that is taken.
     """
     import uvicorn
 

@@ -14,7 +14,7 @@ import numpy as np
 LEAST_MATCHES = 100
 """Verified matches of a pair that surely shows one place; pairs of different places with repeated details have up to 80."""
 FITTING = 0.5
-"""Share of a pair's matches that must fit the model's poses for the pair to agree with the model."""
+"""Minimum fraction of a pair's matches that must fit the model's poses for the pair to agree with the model."""
 TOLERANCE = 4.0
 """Distance from the epipolar line within which a match fits the poses, in pixels of the photos in which keypoints were found."""
 

@@ -1,5 +1,5 @@
-"""Which photos are matched with each other: all pairs of few photos; of many, neighbours in order and similar
-ones.
+"""Selection of the pairs of photos to match: all pairs if there are few photos, else neighbours in order and similar
+photos.
 
 Neighbours are likely to overlap since photos and frames are taken one after another. Similar photos close
 loops, and connect photos in arbitrary order. The similarity of two photos is the product of their vectors of

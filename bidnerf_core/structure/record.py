@@ -35,7 +35,7 @@ DATABASE = "database.db"
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 FRAME_FILE = re.compile(r"\d{6,}\.jpg")
 CONTRADICTING = 0.005
-"""Share of the pairs with many matches that may contradict the poses; some are due to repeated details."""
+"""Fraction of contradicting pairs, among those with many matches, above which poses are doubtful; repeated details cause a few."""
 LARGEST_NAMED = 5
 """Number of photos named in a remark."""
 

@@ -100,7 +100,7 @@ class ShownAnswer:
     outcome: str
     accepted: bool
     reason: str
-    meaning: str = ""  # of the outcome, where it is a refusal
+    meaning: str = ""  # of the outcome, if the pose was rejected
     advice: str = ""
     method: str = ""
     method_summary: str = ""
@@ -108,7 +108,7 @@ class ShownAnswer:
     loss: float | None = None
     unit: str = "units"
     confidence: float | None = None
-    pose: tuple[float, ...] | None = None  # T_world_camera, 16 numbers by rows; None where it is not finite
+    pose: tuple[float, ...] | None = None  # T_world_camera, 16 numbers by rows; None if it is not finite
     truth: tuple[float, ...] | None = None
     error: tuple[float, float] | None = None  # of the position, and of the orientation in degrees
     shape: CameraShape | None = None

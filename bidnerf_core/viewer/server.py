@@ -19,7 +19,7 @@ from bidnerf_core.viewer.trajectories import ShownTrajectory
 
 PORT = 8010
 GRACE = 1
-"""Seconds for requests at work when the viewer is told to end."""
+"""Time (seconds) that requests in progress are given when the viewer is stopped."""
 NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); --save writes a page without it"
 
 

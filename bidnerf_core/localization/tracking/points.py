@@ -149,7 +149,7 @@ def fit_pose(
 
     ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. If the
     robust fit has too few inliers, sample consensus within ``threshold`` pixels gives another start. ``moves`` is whether a motion
-    during the readout is assumed until ``with_motion`` decides on it.
+    during the readout is assumed until ``with_motion`` tests for it.
     """
     if len(data) < LEAST_FOLLOWED:
         return None

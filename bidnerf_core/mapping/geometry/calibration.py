@@ -22,7 +22,7 @@ class Calibration:
     """A correction to given intrinsics, which may be estimated along with the pose."""
 
     log_focal: float = 0.0  # logarithm of the ratio of the true to the given focal length
-    shift_u: float = 0.0  # of the principal point, as a share of the given focal length
+    shift_u: float = 0.0  # of the principal point, as a fraction of the given focal length
     shift_v: float = 0.0
     radial: float = 0.0  # first coefficient of radial distortion, added to the given distortion
     log_stretch: float = (

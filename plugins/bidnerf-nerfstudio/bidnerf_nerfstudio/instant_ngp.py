@@ -45,8 +45,8 @@ class NgpConfig(RadianceConfig, SupervisionConfig):
 
 
 class OccupancyLevels(nn.Module):
-    """Boxes of cells with a common centre, each twice as wide as the previous one; the smallest that contains
-    a point decides.
+    """Boxes of cells with a common centre, each twice as wide as the previous one; a point is looked up in the
+    smallest that contains it.
     """
 
     cells: Bool[Tensor, "l n n n"]

@@ -23,7 +23,7 @@ class Scan:
     """A point cloud (without faces) or a mesh, in the coordinates of its file."""
 
     points: NDArray[np.float64]  # (n, 3): points of a cloud, vertices of a mesh
-    rgb: NDArray[np.float32] | None = None  # (n, 3), in [0, 1]; None where the file holds no colours
+    rgb: NDArray[np.float32] | None = None  # (n, 3), in [0, 1]; None if the file holds no colours
     faces: NDArray[np.int64] | None = None  # (m, 3): triangles; None for a cloud
     uv: NDArray[np.float32] | None = None  # (m, 3, 2): place of each corner in its texture, v upwards
     image: NDArray[np.int64] | None = None  # (m,): index of each triangle's texture; -1 if it has none
