@@ -146,7 +146,7 @@ class TrialResult:
     outcome: str = ""  # the method's outcome; empty in results of earlier versions
     focal_factor: float = 1.0  # ratio of the true to the given focal length, if it was estimated as well
     intrinsics: Intrinsics | None = None  # those used for the pose, if they differ from the given ones
-    confidence: float | None = None  # probability that the pose is right, if a model for it was learned
+    confidence: float | None = None  # probability that the pose is right; None if unknown
     unit: LengthUnit = "units"  # of all lengths: that of the map
     inputs: InputDigests | None = None  # None in results of earlier versions
 
