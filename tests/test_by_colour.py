@@ -15,7 +15,7 @@ from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Localization, Outcome, Problem, rig
-from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_intrinsics
+from bidnerf_core.localization.acceptance import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.mapping import SurfaceMap, bake, build_landmarks
 from bidnerf_core.results.errors import normalized_error_squared, pose_error

@@ -11,7 +11,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import all_pixels, observe
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.images import FieldRenderer
-from bidnerf_core.localization.search.centring import centred, rendered_middle
+from bidnerf_core.localization.refinement import centred, rendered_middle
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH, photograph
 
 SHIFT = torch.tensor([0.4, -0.3, 0.2, 0, 0, 0], dtype=torch.float64)

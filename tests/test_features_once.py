@@ -14,7 +14,7 @@ from bidnerf_core.captures.relocated_photos import relocated
 from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization import AutoConfig
-from bidnerf_core.localization.landmarks.mirrored import mirror_image
+from bidnerf_core.localization.alternatives import mirror_image
 from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.mapping.landmarks.building import DEFAULT_LANDMARKS, tracked_views
 from bidnerf_core.mapping.landmarks.features import FoundOnce, Keypoints, Sift

@@ -20,8 +20,8 @@ from bidnerf_core.localization.landmarks.map_camera import (
     correction_between,
     map_cameras,
 )
+from bidnerf_core.localization.landmarks.matching import unguided_matches
 from bidnerf_core.localization.landmarks.propose import updated
-from bidnerf_core.localization.landmarks.unguided import unguided_matches
 from bidnerf_core.mapping import Calibration, LandmarkMap, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL
 from landmark_scene import PINHOLE, Points, looking_in, ring

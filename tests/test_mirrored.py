@@ -9,8 +9,7 @@ import torch
 
 from bidnerf_core import Localizer, Outcome, View
 from bidnerf_core.localization import LandmarkMatcher, confirm, propose, rig
-from bidnerf_core.localization.alternatives import decide
-from bidnerf_core.localization.landmarks.mirrored import mirror_evidence, mirror_image
+from bidnerf_core.localization.alternatives import decide, mirror_evidence, mirror_image
 from bidnerf_core.testing.textured_field import textured_map, unseen
 
 

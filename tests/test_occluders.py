@@ -13,10 +13,10 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import drawer
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization
+from bidnerf_core.localization.alternatives import mirror_image
 from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.landmarks.correspondences import query_image
 from bidnerf_core.localization.landmarks.guided import projected_landmarks
-from bidnerf_core.localization.landmarks.mirrored import mirror_image
 from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
 from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.landmarks.features import SIFT

@@ -11,7 +11,7 @@ import torch
 import tiny
 from bidnerf_core import SE3, InputError, Localizer, Outcome, Tracker, View, load_map, train
 from bidnerf_core.captures.coverage import shows_distances
-from bidnerf_core.localization.direction_only import direction_only
+from bidnerf_core.localization.localizer import direction_only
 from bidnerf_core.mapping import LandmarkConfig, tracked_views
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.testing.textured_field import MapWithLandmarks, textured_map, unseen

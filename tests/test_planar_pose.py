@@ -12,7 +12,7 @@ from bidnerf_core import Outcome
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import LandmarkPose, Problem, propose, rig
 from bidnerf_core.localization.alternatives import decide, pose_at
-from bidnerf_core.localization.landmarks.planar_pose import second_pose, tilted_to_the_other_side
+from bidnerf_core.localization.landmarks.twins import second_pose, tilted_to_the_other_side
 from bidnerf_core.mapping import build_landmarks
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import resect

@@ -10,7 +10,7 @@ import torch
 import baked
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.point_exposure import STRONGEST, cloud_with_exposure_of_map
+from bidnerf_core.localization.by_depth import STRONGEST, cloud_with_exposure_of_map
 
 T = SE3.identity(dtype=torch.float64)
 RGB = baked.toy().surfels.rgb

@@ -27,7 +27,7 @@ from bidnerf_core.localization import (
     rig,
     settings_of,
 )
-from bidnerf_core.localization.costs.blurred_field import Blurred
+from bidnerf_core.localization.costs.sampled import Blurred
 from bidnerf_core.settings import to_flat
 from bidnerf_core.testing.scene import CAMERA
 from problems import FieldMap, localize

@@ -19,8 +19,7 @@ from bidnerf_core.localization import (
     rig,
 )
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
-from bidnerf_core.localization.alternatives import NOISIEST, decide, log_odds_by_rendering
-from bidnerf_core.localization.landmarks.mirrored import mirror_image
+from bidnerf_core.localization.alternatives import NOISIEST, decide, log_odds_by_rendering, mirror_image
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import CAMERA, TexturedGround, seen, textured_map, unseen
 

@@ -16,7 +16,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.landmarks.mirrored import mirror_image
+from bidnerf_core.localization.alternatives import mirror_image
 from bidnerf_core.mapping import LandmarkConfig, TrackedKeypoints, TrackedViews
 
 SUSPECT = 0.5

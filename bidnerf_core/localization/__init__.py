@@ -2,7 +2,6 @@
 
 from bidnerf_core.geometry.se3 import pose_from_matrix
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, answer_by_landmarks
-from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RayCounts, RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
@@ -12,7 +11,7 @@ from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm, propose
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.methods import METHODS, Method, find_method, settings_of
-from bidnerf_core.localization.normal_equations import Cost, NormalEquations, Scaled, Sum
+from bidnerf_core.localization.normal_equations import Cost, GaussianPrior, NormalEquations, Scaled, Sum
 from bidnerf_core.localization.problem import Problem, SceneMap, rig, window
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.second_order import BidLmConfig, InerfLmConfig

@@ -17,23 +17,28 @@ from functools import partial
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.frames.frame import View
+from bidnerf_core.camera.orientation import Orientation
+from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.depth_scale import corrected
 from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share, probability_of
-from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
-from bidnerf_core.localization.landmarks.mirrored import mirror_evidence, mirror_image
+from bidnerf_core.localization.landmarks.consensus import sample_consensus
+from bidnerf_core.localization.landmarks.correspondences import query_images
+from bidnerf_core.localization.landmarks.evidence import log10_agreement
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher, unguided_matches
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.propose import confirm, propose
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import ComparedExplanation, current_record
 from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import ColourSettings, RefinementSettings, RefinementStage
 from bidnerf_core.localization.solvers.pivots import pivot
+from bidnerf_core.mapping.geometry.calibration import FIXED
 
 BY_START = 6.0
 """Log odds per factor e between the distances from a start: in six dimensions, the density of a normal distribution of unknown
@@ -203,3 +208,29 @@ def _visible_pixels(problem: Problem) -> int:
     sizes = [view.frame.intrinsics.width * view.frame.intrinsics.height for view in problem.views]
     hidden = [0 if view.frame.hidden is None else int(view.frame.hidden.sum()) for view in problem.views]
     return max(1, sum(sizes) - sum(hidden))
+
+
+KEYPOINTS = 700
+"""Number of the strongest keypoints of a mirrored image that are matched."""
+
+
+def mirror_evidence(matcher: LandmarkMatcher, view: View, seed: int = 0) -> tuple[int, float]:
+    """Match a view of the mirror image with the map.
+
+    Returns the number of landmark inliers, and log10 of the number of false alarms.
+    """
+    query = LandmarkQuery(query_images([view], matcher.features), matcher.landmarks, FIXED)
+    matches = unguided_matches(query.images, matcher, KEYPOINTS)
+    found = sample_consensus(query.observed(matches), matches.view, query.threshold, seed)
+    agreeing = 0 if found is None else int(found.inliers.sum())
+    return agreeing, log10_agreement(query, matches, agreeing)
+
+
+def mirror_image(frame: Frame) -> Frame:
+    """Return the mirror image of a frame (left and right swapped), without depth."""
+    swap = Orientation(mirrors_columns=True)
+    alpha, hidden = (None if image is None else swap.upright(image) for image in (frame.alpha, frame.hidden))
+    camera = frame.intrinsics.upright(swap)
+    return replace(
+        frame, rgb=swap.upright(frame.rgb), depth=None, alpha=alpha, hidden=hidden, intrinsics=camera
+    )

@@ -18,9 +18,9 @@ from bidnerf_core.localization.acceptance import (
     LandmarkThresholds,
     SurfaceThresholds,
     landmark_verdict,
+    without_ambiguous_intrinsics,
 )
 from bidnerf_core.localization.alternatives import decide
-from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
 from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface

@@ -21,7 +21,6 @@ from bidnerf_core.localization.acceptance import (
 )
 from bidnerf_core.localization.alternatives import decide, log_odds_by_rendering, pose_at
 from bidnerf_core.localization.confidence import judged
-from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.covariance import finest_cost, position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints, corrected
@@ -36,6 +35,7 @@ from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import propose, updated
+from bidnerf_core.localization.normal_equations import GaussianPrior
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict

@@ -10,7 +10,6 @@ from torch import Generator, Tensor
 
 from bidnerf_core.geometry.robust import RobustName
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings, Residuals
 from bidnerf_core.localization.covariance import position_deviation, weight
 from bidnerf_core.localization.depth_scale import (
@@ -20,7 +19,7 @@ from bidnerf_core.localization.depth_scale import (
     of_pose,
     residual_equations,
 )
-from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.localization.normal_equations import GaussianPrior, NormalEquations
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import (
     ColourSettings,

@@ -22,11 +22,10 @@ from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.io.json import LARGEST_INTEGER
-from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
 from bidnerf_core.localization.problem import Problem, SceneMap, landmark_cameras, on_device, rig, unit_of
-from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.result import Localization, Outcome
 from bidnerf_core.localization.settings import ByColourConfig
 
 WARM_UP_RAYS = 64
@@ -235,3 +234,18 @@ def start_pose(start: Start, what: str = "start") -> SE3:
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
     return pose_from_matrix(matrix, what)
+
+
+NO_DISTANCES = "the map's photos are from one place and show no distances"
+
+
+def direction_only(found: Localization) -> Localization:
+    """Reject an answer, as its position is unknown: as imprecise, or for its own reason if it was already rejected."""
+    outcome = Outcome.IMPRECISE if found.converged else found.outcome
+    return replace(
+        found,
+        outcome=outcome,
+        reason=f"{NO_DISTANCES}, so the position is unknown and only the direction may be right; {found.reason}",
+        covariance=None,
+        confidence=None,
+    )

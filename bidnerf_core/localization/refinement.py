@@ -15,15 +15,18 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import may_wait, without_waiting
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import render
 from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.beyond_chance import NONE, Support, support
+from bidnerf_core.localization.costs.linearization import flattened
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import sandwich_covariance, weight
 from bidnerf_core.localization.normal_equations import NormalEquations, Scaled
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.search.centring import centred, rendered_middle
 from bidnerf_core.localization.settings import RefinementStage
 from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
@@ -191,3 +194,29 @@ def rendered_support(cost: RenderedCost, T: SE3, rivals: SE3 | None = None) -> S
         centre = torch.tensor(problem.bounds.centre, dtype=torch.float64)
         middle = T.to("cpu", torch.float64).inverse().apply(centre)
     return support(cost.ray_costs, T, middle, cost.plain_ray_costs(), rivals)
+
+
+@torch.no_grad()
+def centred(field: RadianceField, observed: Observations, bounds: SceneBounds, T: SE3) -> SE3:
+    """Return the poses T (h) after shifting each camera to align the medians of the rendered and the measured points.
+
+    At a wrong start, the main error is that the scene appears in another part of the image. This removes it with one rendering of a
+    few rays, even where the loss has no useful gradient. A pose is unchanged if nothing is measured or nothing is rendered.
+    """
+    points = torch.where(observed.measured[:, None], observed.points, torch.nan)
+    measured = points.nanmedian(0).values  # NaN where nothing was measured
+    shift = rendered_middle(field, observed, bounds, T) - measured
+    shift = torch.where(shift.isfinite(), shift, 0).to(T.translation)
+    return SE3(T.rotation, T.translation + (T.rotation @ shift[..., None])[..., 0])
+
+
+def rendered_middle(
+    field: RadianceField, observed: Observations, bounds: SceneBounds, T: SE3
+) -> Float[Tensor, "h 3"]:
+    """Return the median of the rendered points along each axis, in the last camera's frame; NaN if no ray hits anything."""
+    rays = observed.rays(T, bounds)
+    shape = rays.near.shape
+    seen = render(field, flattened(rays), bounds.background)
+    distance = torch.where(seen.opacity > 0.5, seen.distance / seen.opacity.clamp(min=0.5), torch.nan)
+    points = observed.origins + distance.reshape(shape)[..., None] * observed.directions
+    return points.nanmedian(1).values

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields.contract import RadianceField, Rays, SceneBounds, widened
+from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, SceneBounds, widened
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.residuals import Objective, masked_mean
@@ -18,10 +18,31 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.pixels import PixelDrawer, draw, drawer
 from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.blurred_field import Blurred
 from bidnerf_core.localization.costs.rendered import RayCounts
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import DescentSettings, ReachSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Blurred:
+    """A field queried at points with random displacements, of standard deviation ``sigma`` metres along each axis.
+
+    In expectation, it is the field convolved with a Gaussian (randomized smoothing, Duchi et al. 2012), at the cost of one
+    query. The sampler is the field's own: if it skips empty cells, matter is not blurred into them.
+    """
+
+    field: RadianceField
+    sigma: float
+    generator: Generator
+
+    @property
+    def sampler(self) -> RaySampler:
+        return self.field.sampler
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        noise = torch.randn(positions.shape, generator=self.generator, device=self.generator.device)
+        return self.field.query(positions + self.sigma * noise.to(positions), directions)
+
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""

@@ -1,9 +1,13 @@
-"""Nearest-neighbour search among the landmarks' descriptors, in time sublinear in their number."""
+"""Matching by descriptors alone, before any pose is known: the nearest landmarks of each keypoint.
+
+Their search takes a time sublinear in the number of landmarks.
+"""
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -12,6 +16,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage
 from bidnerf_core.mapping.landmarks.features import (
     Features,
     FoundOnce,
@@ -137,3 +142,49 @@ def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor
     """Return the ``count`` smallest values of each row (all, if there are fewer), ascending, and their columns."""
     found = distances.topk(min(count, distances.shape[1]), dim=1, largest=False)
     return found.values, found.indices
+
+
+LOOKED_UP = 4
+"""Number of landmarks looked up per keypoint; the best one at another place determines the ambiguity of the match."""
+SAME_PLACE = 2.0
+"""Distance between landmarks, in diameters, below which they are duplicates of one point."""
+AMBIGUITY = 0.9
+"""Maximum ratio of a match's descriptor distance to that of the best landmark at another place (Lowe 2004)."""
+LEAST_MATCHES = 60
+"""Number of matches up to which the least ambiguous others are added to the unambiguous ones."""
+
+
+def unguided_matches(
+    images: Sequence[QueryImage], matcher: LandmarkMatcher, strongest: int
+) -> LandmarkMatches:
+    """Return the matches of keypoints with their nearest landmarks that pass the ratio test, least ambiguous first.
+
+    Only the ``strongest`` keypoints of each image are matched.
+    """
+    parts = []
+    for number, image in enumerate(images):
+        distances, index = matcher.nearest(image.keypoints.descriptors[:strongest], LOOKED_UP)
+        ambiguity = _ambiguity(matcher.landmarks, distances, index)
+        keypoint = torch.arange(len(index))[distances[:, 0].isfinite()]
+        part = LandmarkMatches(
+            torch.full_like(keypoint, number), keypoint, index[keypoint, 0], ambiguity[keypoint]
+        )
+        parts.append(part)
+    found = LandmarkMatches.cat(parts)
+    found = found[found.ambiguity.argsort(stable=True)]
+    return found[torch.arange(len(found)) < max(LEAST_MATCHES, int((found.ambiguity <= AMBIGUITY).sum()))]
+
+
+def _ambiguity(
+    landmarks: LandmarkMap, distances: Float[Tensor, "q k"], index: Int[Tensor, "q k"]
+) -> Float[Tensor, "q"]:
+    """Return the ratio of the descriptor distances of the nearest landmark and the best one at another place."""
+    if not len(landmarks):
+        return torch.ones(len(distances))
+    position, size = landmarks.positions[index], landmarks.sizes[index]
+    apart = torch.linalg.vector_norm(position - position[:, :1], dim=-1)
+    near = SAME_PLACE * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
+    elsewhere = torch.where(apart > near, distances, torch.inf).amin(1)
+    # If all landmarks looked up are at one place, the last distance is a lower bound for any other.
+    other = torch.where(elsewhere.isfinite(), elsewhere, distances[:, -1])
+    return torch.where(other.isfinite(), (distances[:, 0] / other.clamp(min=1)).sqrt(), 0.0)

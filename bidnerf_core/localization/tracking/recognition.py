@@ -28,11 +28,10 @@ from bidnerf_core.localization.landmarks.evidence import (
     share_of_cells,
 )
 from bidnerf_core.localization.landmarks.guided import OBLIQUE, guided_matches, projected_landmarks
-from bidnerf_core.localization.landmarks.matching import EXHAUSTIVE, LandmarkMatcher
+from bidnerf_core.localization.landmarks.matching import EXHAUSTIVE, LandmarkMatcher, unguided_matches
 from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery, pixel_threshold
 from bidnerf_core.localization.landmarks.refinement import RADII, matches_by_chance, usual_distance
-from bidnerf_core.localization.landmarks.unguided import unguided_matches
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion

@@ -22,7 +22,6 @@ from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.rotations import retracted
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
-from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (
     FINEST,
@@ -31,7 +30,7 @@ from bidnerf_core.localization.covariance import (
     surface_covariance,
     weight,
 )
-from bidnerf_core.localization.normal_equations import Scaled, Sum
+from bidnerf_core.localization.normal_equations import GaussianPrior, Scaled, Sum
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.by_points import JUDGED
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
