@@ -20,7 +20,7 @@ from bidnerf_core.localization.acceptance import (
     rendered_verdict,
     surface_diagnostics,
 )
-from bidnerf_core.localization.beyond_chance import NONE, Support
+from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.settings import RenderedThresholds
@@ -131,7 +131,7 @@ def refined(
             Outcome.RENDERING_MISMATCH,
             "of the contrast",
         ),
-        (refined(support=NONE), Outcome.UNDETERMINED, "fits about as well"),
+        (refined(support=Support(0.0, 0.0, 0.0, 0.0)), Outcome.UNDETERMINED, "fits about as well"),
     ],
 )
 def test_fresh_rays_lead_to_an_outcome(found: RefinementResult, expected: Outcome, words: str) -> None:

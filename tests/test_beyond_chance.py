@@ -17,7 +17,7 @@ from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome
-from bidnerf_core.localization.beyond_chance import NO_RIVAL, NONE, Support, log_odds, support
+from bidnerf_core.localization.beyond_chance import NO_RIVAL, Support, log_odds, support
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 from bidnerf_core.scenes.trajectories import look_at
@@ -158,7 +158,7 @@ def test_odds_are_antisymmetric_and_grow_with_the_number_of_measurements(generat
 
 
 def test_confidence_is_that_of_the_pose_among_its_rivals() -> None:
-    assert NONE.confidence == pytest.approx(0.25)
+    assert Support(0.0, 0.0, 0.0, 0.0).confidence == pytest.approx(0.25)
     sure = Support(explained=1.0, plain=20.0, displaced=20.0, other=NO_RIVAL)
     assert sure.confidence > 0.999
     assert replace(sure, other=0.0).confidence == pytest.approx(0.5)

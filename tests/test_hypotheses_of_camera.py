@@ -9,9 +9,8 @@ from scipy.stats import multivariate_normal
 
 from bidnerf_core import Intrinsics
 from bidnerf_core.localization.landmarks.hypotheses import (
-    INEXACT,
-    STATED,
     Posterior,
+    Stated,
     camera_hypotheses,
     posterior,
 )
@@ -90,8 +89,8 @@ def probability(found: Posterior, group: str) -> float:
 @pytest.mark.parametrize(
     ("true", "name"),
     [
-        (GIVEN, STATED),
-        (Calibration(log_focal=0.025), INEXACT),
+        (GIVEN, Stated.EXACT),
+        (Calibration(log_focal=0.025), Stated.INEXACT),
         (Calibration(log_focal=0.08), "mistaken focal length"),
         (Calibration(shift_u=0.09, shift_v=-0.04), "cropped"),
         (Calibration(log_focal=0.06, radial=0.06), "mistaken"),
@@ -108,7 +107,7 @@ def test_the_camera_of_the_map_explains_an_image_that_misstates_it() -> None:
     stated = Calibration(log_focal=-0.03).applied(CAMERA)
     found = judged(Calibration(log_focal=0.03), given=stated)
     assert found.best.hypothesis.camera == CAMERA
-    assert judged(GIVEN, given=stated).best.hypothesis.name == STATED
+    assert judged(GIVEN, given=stated).best.hypothesis.name == Stated.EXACT
 
 
 def test_keypoints_that_tell_nothing_leave_the_priors() -> None:

@@ -13,7 +13,7 @@ from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, Outcome, propose
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
-from bidnerf_core.localization.landmarks.hypotheses import STATED, Whose
+from bidnerf_core.localization.landmarks.hypotheses import Stated, Whose
 from bidnerf_core.localization.landmarks.map_camera import (
     SHARE_SAME_CAMERA,
     MapCamera,
@@ -206,7 +206,7 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
 def with_log_odds(found: LandmarkPose, whose: Whose, odds: float) -> LandmarkPose:
     assert found.guided is not None
     every = [e.hypothesis for e in found.guided.posterior.explanations]
-    return updated(found, {h.group: odds for h in every if h.whose is whose and h.group != STATED})
+    return updated(found, {h.group: odds for h in every if h.whose is whose and h.group != Stated.EXACT})
 
 
 @pytest.mark.parametrize("odds", [-20.0, 20.0])
@@ -233,7 +233,7 @@ def test_evidence_against_the_intrinsics_taken_has_them_estimated(landmarks: Lan
     assert found is not None
     kept, estimated = (with_log_odds(found, Whose.ESTIMATED, odds) for odds in (-50.0, 50.0))
     assert kept.guided is not None
-    assert kept.guided.best.hypothesis.group == STATED
+    assert kept.guided.best.hypothesis.group == Stated.EXACT
     assert estimated.focal_factor == pytest.approx(1 / 1.02, rel=0.005)
 
 

@@ -30,8 +30,6 @@ SIGHT_LINES = 300
 """Maximum number of lines of sight that are traced."""
 FLAT = 0.02
 """Standard deviation of an image's colours, in [0, 1], below which a gain and a bias can fit any view to it."""
-BLANK = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
-AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class SurfaceDiagnostics:
             share = f"{self.free_space_violations:.0%} of the lines of sight"
             return Verdict(Outcome.FREE_SPACE_VIOLATED, f"{share} pass through the surface")
         if self.runner_up_margin < thresholds.runner_up_margin:
-            return AMBIGUOUS
+            return Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
         if not self.rendered_inliers >= thresholds.rendered_inliers:
             share = f"{self.rendered_inliers:.0%} of the rendered rays agree with the measurements"
             return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}")

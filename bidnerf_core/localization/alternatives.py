@@ -24,11 +24,11 @@ from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.depth_scale import corrected
-from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share, probability_of
+from bidnerf_core.localization.landmarks.chance import CONVINCING, DECISIVE, log_odds_of_share, probability_of
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
 from bidnerf_core.localization.landmarks.correspondences import query_images
 from bidnerf_core.localization.landmarks.evidence import log10_agreement
-from bidnerf_core.localization.landmarks.matching import LandmarkMatcher, unguided_matches
+from bidnerf_core.localization.landmarks.matching import STRONGEST, LandmarkMatcher, unguided_matches
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.propose import confirm, propose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
@@ -46,12 +46,6 @@ width about the start falls with the sixth power of the distance.
 """
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which an image is not compared with its mirror image."""
-SIGNIFICANT = -20.0
-"""Upper limit of an image's log10 number of false alarms in the comparison with its mirror image's: a few chance matches of the
-mirror image are no evidence against an image with even fewer.
-"""
-UNTOLD = 0.5
-"""Log odds below which two explanations are called equally likely: probabilities of 38 % to 62 %."""
 AT_COPIES = 6.0
 """Log odds by rendering that errors of the two poses alone can produce, even at exact copies of a place."""
 COMPARED_RAYS = 8192
@@ -108,8 +102,6 @@ def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed
 
 def _in_words(odds: float) -> str:
     """Return a phrase for the other explanation's probability, from the log odds of the pose against it."""
-    if abs(odds) < UNTOLD:
-        return "nothing tells the two apart"
     if odds < -DECISIVE:
         return "the other one is far likelier"
     return f"the other one is {probability_of(-odds):.0%} likely"
@@ -163,7 +155,8 @@ def _mirror(problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: 
         found = propose(matcher, [view], seed=seed)
         return None if found is None else corrected(replace(problem, views=(view,)), found)
 
-    odds = log_odds_of_share(mirror_nfa / min(log10_nfa, SIGNIFICANT))
+    # A few chance matches of the mirror image are no evidence against an image with even fewer.
+    odds = log_odds_of_share(mirror_nfa / min(log10_nfa, CONVINCING))
     return Alternative(odds, f"the mirror image has {agreeing} landmark inliers", mirrored)
 
 
@@ -210,17 +203,13 @@ def _visible_pixels(problem: Problem) -> int:
     return max(1, sum(sizes) - sum(hidden))
 
 
-KEYPOINTS = 700
-"""Number of the strongest keypoints of a mirrored image that are matched."""
-
-
 def mirror_evidence(matcher: LandmarkMatcher, view: View, seed: int = 0) -> tuple[int, float]:
     """Match a view of the mirror image with the map.
 
     Returns the number of landmark inliers, and log10 of the number of false alarms.
     """
     query = LandmarkQuery(query_images([view], matcher.features), matcher.landmarks, FIXED)
-    matches = unguided_matches(query.images, matcher, KEYPOINTS)
+    matches = unguided_matches(query.images, matcher, STRONGEST)
     found = sample_consensus(query.observed(matches), matches.view, query.threshold, seed)
     agreeing = 0 if found is None else int(found.inliers.sum())
     return agreeing, log10_agreement(query, matches, agreeing)

@@ -71,10 +71,6 @@ class Support:
         return None
 
 
-NONE = Support(0.0, 0.0, 0.0, 0.0)
-"""The support of a pose that is not finite."""
-
-
 def support(
     costs: Costs,
     T: SE3,

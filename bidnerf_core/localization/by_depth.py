@@ -21,7 +21,7 @@ from bidnerf_core.localization.exposure import clipped, robust_exposure
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
+from bidnerf_core.localization.search.by_points import COMPARED_POINTS, POINT_STAGES, PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import (
     AutoConfig,
@@ -37,8 +37,6 @@ WORSE = 0.05
 """Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict each other."""
 JUDGED_POINTS = 1000
 """Number of points on which two poses are compared."""
-LOSS_POINTS = 200
-"""Number of points on which the losses along the path are computed."""
 
 
 def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
@@ -58,7 +56,7 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
         diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers, support=apart)
         judgement = judged(diagnostics.verdict(), diagnostics)
         path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
-        losses = search.judge(LOSS_POINTS).cost(path)
+        losses = search.judge(COMPARED_POINTS).cost(path)
         covariance = surface_covariance(
             search.judge(), found.T[0], len(problem.views), problem.sensor, USUAL.points
         )

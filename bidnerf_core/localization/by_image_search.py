@@ -10,7 +10,7 @@ import torch
 from torch import Generator
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.acceptance import BLANK, is_blank
+from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.by_colour import ColourAnswer, localization_of, refine_by_colour, usual_stages
 from bidnerf_core.localization.by_landmarks import is_sharp
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
@@ -68,7 +68,7 @@ def localized_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfi
             many = hypotheses_for_images(known, problem.start, config.hypotheses, generator)
             found = this.search(many, this.stages)
         if hopeless:
-            return _unrefined(found, BLANK if blank else _unrecognised(problem), began)
+            return _unrefined(found, _unrecognised(problem, blank), began)
         answers.append(this.refined(problem, found, config.by_colour, generator))
         if answers[-1].verdict.accepted:
             return localization_of(problem, answers[-1], config.by_colour, began, "auto")
@@ -99,8 +99,10 @@ def _is_hopeless(problem: Problem) -> bool:
     return textured and not is_sharp(problem)
 
 
-def _unrecognised(problem: Problem) -> Verdict:
-    """Return the rejection of an image without recognised landmarks in a blurred field."""
+def _unrecognised(problem: Problem, blank: bool) -> Verdict:
+    """Return the rejection of an image that is blank, or without recognised landmarks in a blurred field."""
+    if blank:
+        return Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
     causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
     focal = ", or its focal length may be too far off" if problem.focal_is_approximate else ""
     why = f"too few landmarks were recognised, and the field is not sharp enough to compare images with it: {causes}{focal}"

@@ -31,7 +31,7 @@ from bidnerf_core.localization.fusion import (
     fused_pose,
     nearby_start,
 )
-from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED
+from bidnerf_core.localization.landmarks.hypotheses import Whose
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import propose, updated
@@ -130,7 +130,7 @@ def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> L
     )
     there = replace(here, views=views, start=found.T_world_camera.retract(posterior.shift(other)))
     odds = log_odds_by_rendering(there, here, seed, steps=FEW_STEPS)
-    if other.hypothesis.group == ESTIMATED:
+    if other.hypothesis.group == Whose.ESTIMATED:
         odds = max(odds, 0.0)  # an inexact estimate renders badly even if the stated intrinsics are wrong
     return updated(found, {other.hypothesis.group: odds})
 

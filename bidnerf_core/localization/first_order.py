@@ -42,8 +42,6 @@ from bidnerf_core.settings import Settings
 
 SUPPORTING_RAYS = 1024
 """Number of rays on which a pose is compared with its rivals."""
-PAPERS_REACH = ReachSettings()
-"""The paper's objective, without additions."""
 WIDE_REACH = ReachSettings(candidates=3, box_weight=1.0)
 """Favour pixels on matter, and keep measured points in the scene's box: the best variant on Lego (``benchmarks/bid_variants.py``)."""
 PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
@@ -52,7 +50,7 @@ PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_
 
 def descended(
     problem: Problem, rays: DescentSettings, adam: AdamSettings, objective: Objective, depth_rays: int, seed: int,
-    method: str, reach: ReachSettings = PAPERS_REACH,
+    method: str, reach: ReachSettings,
 ) -> Localization:  # fmt: skip
     """Descend with Adam from ``problem.start`` (Alg. 1), then accept or reject the pose."""
     began = time.perf_counter()
@@ -107,8 +105,8 @@ class BidConfig(Settings):
 
 
 BID_PRESETS = {
-    "paper": BidConfig(DescentSettings(level=0, pivot="camera"), PAPER_STEPS, reach=PAPERS_REACH),
-    "paper-scene": BidConfig(DescentSettings(level=0, pivot="scene"), PAPER_STEPS, reach=PAPERS_REACH),
+    "paper": BidConfig(DescentSettings(level=0, pivot="camera"), PAPER_STEPS, reach=ReachSettings()),
+    "paper-scene": BidConfig(DescentSettings(level=0, pivot="scene"), PAPER_STEPS, reach=ReachSettings()),
 }
 """The paper's settings, with updates in the camera's frame as in its Alg. 1, and about the middle of the scene as by default."""
 
@@ -147,7 +145,7 @@ def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
     if len(problem.views) > 1:
         raise InputError(f"method inerf takes one image, got {len(problem.views)}; method bid takes several")
     objective = objective_of(config.colour, None)
-    return descended(problem, config.descent, config.adam, objective, 0, seed, "inerf")
+    return descended(problem, config.descent, config.adam, objective, 0, seed, "inerf", ReachSettings())
 
 
 INERF = Method(

@@ -20,7 +20,7 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.beyond_chance import NONE, Support, support
+from bidnerf_core.localization.beyond_chance import Support, support
 from bidnerf_core.localization.costs.linearization import flattened
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import SurfaceCost
@@ -184,7 +184,7 @@ def rendered_support(cost: RenderedCost, T: SE3, rivals: SE3 | None = None) -> S
     """Return how well rendered rays distinguish a pose from its rivals, which include ``rivals`` (h)."""
     problem = cost.problem
     if not bool(T.matrix().isfinite().all()):
-        return NONE
+        return Support(0.0, 0.0, 0.0, 0.0)
     middle = (
         rendered_middle(cost.field, cost.rays.observed, problem.bounds, T[None].to(problem.device))[0]
         .cpu()

@@ -55,7 +55,6 @@ START = 0.03, 0.1
 """Standard deviations of a start of unknown uncertainty: fraction of the scene's extent, and radians."""
 VELOCITY_KEPT = 0.6
 """Fraction of the velocity kept with each lost frame."""
-NOTHING_SEEN = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
 
 
 class Tracker:
@@ -173,7 +172,8 @@ class Tracker:
             if found is not None and found.converged:
                 return self._found(frame, image, state, found)
         state = self._adrift(frame, image, state, points, predicted)
-        verdict = NOTHING_SEEN if measured is None else measured.verdict
+        unseen = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
+        verdict = unseen if measured is None else measured.verdict
         reason = (
             f"lost for {state.lost} frame{'s' if state.lost > 1 else ''}, bridged by {how}: {verdict.reason}"
         )

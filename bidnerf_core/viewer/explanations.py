@@ -11,15 +11,10 @@ from bidnerf_core.localization.acceptance import DescentDiagnostics, LandmarkDia
 from bidnerf_core.localization.beyond_chance import DISPLACEMENT, NO_RIVAL, Support
 from bidnerf_core.localization.landmarks.chance import DECISIVE, odds, probability_of
 from bidnerf_core.localization.landmarks.hypotheses import (
-    APPROXIMATE,
-    CROPPED_IMAGE,
-    INEXACT,
-    STATED,
-    WRONG_CAMERA,
-    WRONG_FOCAL,
     Explanation,
     Motion,
     Posterior,
+    Stated,
     Whose,
 )
 from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
@@ -28,12 +23,12 @@ from bidnerf_core.viewer.scene import rows_of
 LEAST_SHOWN = 0.001
 """Minimum probability of an explanation that is listed."""
 CAMERA_NAMES = {
-    STATED: "given camera",
-    INEXACT: "given camera (slightly off)",
-    WRONG_FOCAL: "another focal length",
-    WRONG_CAMERA: "another camera",
-    APPROXIMATE: "given camera (approximate)",
-    CROPPED_IMAGE: "a cropped image",
+    Stated.EXACT: "given camera",
+    Stated.INEXACT: "given camera (slightly off)",
+    Stated.WRONG_FOCAL: "another focal length",
+    Stated.WRONG: "another camera",
+    Stated.APPROXIMATE: "given camera (approximate)",
+    Stated.CROPPED: "a cropped image",
 }
 MOTIONS = {
     Motion.STILL: "",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+CONVINCING = -20.0
+"""Log10 of the number of false alarms below which a pose is certain to be no accident."""
 DECISIVE = 4.0
 """Log odds beyond which one of two explanations is accepted."""
 BY_SHARE = 10.0

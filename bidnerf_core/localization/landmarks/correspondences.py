@@ -18,6 +18,11 @@ from bidnerf_core.mapping.landmarks.features import Features, Keypoints, detecte
 from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
+MIN_MATCHES = 6
+"""Minimum number of correspondences from which a pose, or a scale of measured depth, is estimated."""
+MAX_AMBIGUITY = 0.9
+"""Maximum ratio of the descriptor distances of the best and the second-best candidate for a match (Lowe 2004, section 7.1)."""
+
 
 @dataclass(frozen=True, eq=False)
 class QueryImage:

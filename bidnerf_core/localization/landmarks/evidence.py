@@ -11,15 +11,13 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.chance import log10_nfa
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.hypotheses import Whose
 from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.localization.landmarks.refinement import GuidedPose
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
-LEAST_DEPTHS = 6
-"""Minimum number of measured depths for estimating a depth scale."""
 CELLS = 8
 """Number of rows and columns of cells by which the spread of correspondences over an image is measured."""
 
@@ -75,7 +73,7 @@ def median_distance(data: ObservedPoints, T_world_rig: SE3) -> float:
 def depth_scale(data: ObservedPoints, T_world_rig: SE3) -> float | None:
     """Return the factor that corrects measured depth; None if too few depths were measured."""
     known = data.depth > 0
-    if int(known.sum()) < LEAST_DEPTHS:
+    if int(known.sum()) < MIN_MATCHES:
         return None
     return float((data.in_camera(T_world_rig)[known, 2] / data.depth[known]).median())
 

@@ -16,12 +16,12 @@ from jaxtyping import Bool
 
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.consensus import Candidate, focal_consensus, sample_consensus
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.evidence import described
 from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.localization.landmarks.refinement import LEAST_GUIDED_MATCHES, refined_pose
+from bidnerf_core.localization.landmarks.refinement import refined_pose
 from bidnerf_core.mapping.geometry.calibration import ANY, FIXED, STRETCHED, Calibration
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.reprojection import SCALE, ReprojectionErrors, State
@@ -175,7 +175,7 @@ def _with_map_camera(
     if not sampled:
         return None
     camera, first = max(sampled, key=lambda pair: int(pair[1].inliers.sum()))
-    if int(first.inliers.sum()) < max(enough, LEAST_GUIDED_MATCHES):
+    if int(first.inliers.sum()) < max(enough, MIN_MATCHES):
         return None
     seen = replace(query.seen_by([camera.intrinsics] * len(query.images)), prior=FIXED)
     again = described(refined_pose(seen, matches, first))

@@ -14,15 +14,13 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, moved_points
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage
+from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches, QueryImage
 from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.landmarks.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 CANDIDATES = 6
 """Maximum number of landmarks that are compared with a keypoint: the nearest ones in the image."""
-GUIDED_RATIO = 0.9
-"""Maximum ratio of the best to the second-best candidate's descriptor distance (Lowe 2004, section 7.1)."""
 OBLIQUE = radians(40)
 """Maximum angle (radians) outside the cone of a landmark's viewing directions at which it is still matched."""
 OCTAVES = 1.0
@@ -172,9 +170,9 @@ def _best(
     following = (first + 1).clamp(max=max(0, len(order) - 1))
     alone = (first + 1 >= len(order)) | begins[following]
     nearest = distance[order[first]]
-    next_best = torch.where(alone, most / GUIDED_RATIO**2, distance[order[following]])
+    next_best = torch.where(alone, most / MAX_AMBIGUITY**2, distance[order[following]])
     ambiguity = (nearest / next_best.clamp(min=1)).sqrt()
-    good = (nearest <= most) & (ambiguity <= GUIDED_RATIO)
+    good = (nearest <= most) & (ambiguity <= MAX_AMBIGUITY)
     return _once(order[first[good]], landmark, distance, ambiguity[good])
 
 

@@ -63,17 +63,18 @@ A larger one more probably compensates for another camera. It is not used, and t
 MIN_POINTS = 20
 """Minimum number of points for estimating a motion; with fewer, the noise is as uncertain as the motion itself."""
 
-APPROXIMATE, CROPPED_IMAGE, WRONG_FOCAL, WRONG_CAMERA = (
-    "approximate",
-    "cropped",
-    "mistaken focal length",
-    "mistaken",
-)
-"""Names of the hypotheses under which intrinsics are estimated."""
-STATED, INEXACT, ESTIMATED = "stated", "inexact", "estimated"
-"""Names of the hypotheses that the stated intrinsics are right, exactly or to the accuracy usual for devices, and of the group of
-hypotheses that they are wrong or unknown.
-"""
+
+class Stated(StrEnum):
+    """What may be true of the stated intrinsics: the names of hypotheses that do not replace them by the map's."""
+
+    EXACT = "stated"
+    INEXACT = "inexact"  # right to the accuracy usual for devices
+    APPROXIMATE = (
+        "approximate"  # and stated to be; intrinsics are estimated under this hypothesis and those below
+    )
+    CROPPED = "cropped"
+    WRONG_FOCAL = "mistaken focal length"
+    WRONG = "mistaken"
 
 
 class Whose(StrEnum):
@@ -107,9 +108,9 @@ class Hypothesis:
     @property
     def group(self) -> str:
         """Name of the group of similar hypotheses: that the stated intrinsics are right, or that they are wrong."""
-        if self.name in (STATED, INEXACT):
-            return STATED
-        return self.name if self.camera is not None else ESTIMATED
+        if self.name in (Stated.EXACT, Stated.INEXACT):
+            return Stated.EXACT
+        return self.name if self.camera is not None else Whose.ESTIMATED
 
 
 def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FIXED) -> list[Hypothesis]:
@@ -134,10 +135,10 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         )
 
     if prior != FIXED:
-        own = [about(APPROXIMATE, 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
+        own = [about(Stated.APPROXIMATE, 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
         if prior.shift < ANY.shift:
             cropped = replace(prior, shift=ANY.shift)
-            own.append(about(CROPPED_IMAGE, CROPS_BESIDE_APPROXIMATE, cropped, cropped))
+            own.append(about(Stated.CROPPED, CROPS_BESIDE_APPROXIMATE, cropped, cropped))
         of_map = [(camera, SAME_LOG_ODDS) for camera in cameras]
     else:
         # If the stated intrinsics are those of the map, they are wrong only where the image is from another camera.
@@ -146,17 +147,17 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         wrong = (MISTAKES + CROPS) * share
         other_focal = replace(USUAL, log_focal=MISTAKEN.log_focal)
         own = [
-            about(STATED, 1 - USUALLY - wrong, RIGHT),
-            about(INEXACT, USUALLY, USUAL),
+            about(Stated.EXACT, 1 - USUALLY - wrong, RIGHT),
+            about(Stated.INEXACT, USUALLY, USUAL),
             # A mistaken parameter may be off by any amount, so it is estimated without its prior.
             about(
-                WRONG_FOCAL,
+                Stated.WRONG_FOCAL,
                 0.6 * MISTAKES * share,
                 other_focal,
                 replace(other_focal, log_focal=ANY.log_focal),
             ),
-            about(WRONG_CAMERA, 0.4 * MISTAKES * share, MISTAKEN, NOMINAL),
-            about(CROPPED_IMAGE, CROPS * share, CROPPED, CROPPED),
+            about(Stated.WRONG, 0.4 * MISTAKES * share, MISTAKEN, NOMINAL),
+            about(Stated.CROPPED, CROPS * share, CROPPED, CROPPED),
         ]
         of_map = [(camera, camera.log_odds) for camera in cameras if bool(camera.differs.any())]
     found = [
@@ -204,7 +205,7 @@ class Explanation:
     @property
     def taken(self) -> Calibration:
         """The correction with which an image is localized if none is estimated along with the pose."""
-        if self.hypothesis.name == STATED:
+        if self.hypothesis.name == Stated.EXACT:
             return GIVEN
         known = self.hypothesis.camera is not None
         return Calibration(*self.hypothesis.mean.tolist()) if known else self.calibration
@@ -301,7 +302,7 @@ class Posterior:
     @property
     def wrong(self) -> float:
         """The probability that neither the stated intrinsics nor the map's are even approximately right."""
-        return sum(p for e, p in self._weighted if e.hypothesis.group == ESTIMATED)
+        return sum(p for e, p in self._weighted if e.hypothesis.group == Whose.ESTIMATED)
 
     @property
     def expected_shift(self) -> float:

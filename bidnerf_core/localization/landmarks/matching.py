@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage
+from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches, QueryImage
 from bidnerf_core.mapping.landmarks.features import (
     Features,
     FoundOnce,
@@ -144,12 +144,12 @@ def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor
     return found.values, found.indices
 
 
+STRONGEST = 700
+"""Number of an image's strongest keypoints that are matched first; all are matched only if these do not suffice."""
 LOOKED_UP = 4
 """Number of landmarks looked up per keypoint; the best one at another place determines the ambiguity of the match."""
 SAME_PLACE = 2.0
 """Distance between landmarks, in diameters, below which they are duplicates of one point."""
-AMBIGUITY = 0.9
-"""Maximum ratio of a match's descriptor distance to that of the best landmark at another place (Lowe 2004)."""
 LEAST_MATCHES = 60
 """Number of matches up to which the least ambiguous others are added to the unambiguous ones."""
 
@@ -172,7 +172,7 @@ def unguided_matches(
         parts.append(part)
     found = LandmarkMatches.cat(parts)
     found = found[found.ambiguity.argsort(stable=True)]
-    return found[torch.arange(len(found)) < max(LEAST_MATCHES, int((found.ambiguity <= AMBIGUITY).sum()))]
+    return found[torch.arange(len(found)) < max(LEAST_MATCHES, int((found.ambiguity <= MAX_AMBIGUITY).sum()))]
 
 
 def _ambiguity(

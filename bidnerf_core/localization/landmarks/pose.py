@@ -12,7 +12,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
-from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED, Posterior, Whose
+from bidnerf_core.localization.landmarks.hypotheses import Posterior, Whose
 from bidnerf_core.localization.landmarks.refinement import GuidedPose
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration
 
@@ -54,7 +54,7 @@ class CameraDoubt:
         return CameraDoubt(
             0.0 if taken is Whose.ESTIMATED else found.wrong, found.expected_shift, found.doubt_of_camera,
             GIVEN if other is None else other.calibration,
-            other is None or other.hypothesis.group != ESTIMATED,
+            other is None or other.hypothesis.group != Whose.ESTIMATED,
         )  # fmt: skip
 
 

@@ -10,11 +10,12 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.chance import CONVINCING
 from bidnerf_core.localization.landmarks.consensus import Candidate, focal_consensus, sample_consensus
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, query_images
+from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches, query_images
 from bidnerf_core.localization.landmarks.evidence import described, log10_agreement
 from bidnerf_core.localization.landmarks.far_cameras import better_camera, with_far_camera
-from bidnerf_core.localization.landmarks.matching import LandmarkMatcher, unguided_matches
+from bidnerf_core.localization.landmarks.matching import STRONGEST, LandmarkMatcher, unguided_matches
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.localization.landmarks.refinement import (
@@ -28,12 +29,6 @@ from bidnerf_core.localization.recording import current_record
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.landmarks.features import Features
 
-STRONGEST = 700
-"""Number of an image's strongest keypoints that are matched first; all are matched only if these do not suffice."""
-CONVINCING = -20.0
-"""Log10 of the number of false alarms below which the matches of the strongest keypoints suffice."""
-LEAST_INLIERS = 6
-"""Minimum number of inliers for a pose to be refined."""
 MANY_VISIBLE, CONTRADICTED = 200, 1.5
 """Minimum number of visible landmarks for contradicting a pose, and multiple of the chance matches below which they contradict
 it.
@@ -92,7 +87,7 @@ class Confirmation:
     @property
     def contradicts(self) -> bool:
         """Whether hardly more landmarks match than expected by chance, although many should."""
-        return self.visible >= MANY_VISIBLE and self.matches < CONTRADICTED * self.chance + LEAST_INLIERS
+        return self.visible >= MANY_VISIBLE and self.matches < CONTRADICTED * self.chance + MIN_MATCHES
 
 
 def confirm(
@@ -167,7 +162,7 @@ def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Can
     if found is not None and (record := current_record()) is not None:
         agreeing = f"{int(found.inliers.sum())} of {len(matches)} matches agree"
         record.add(f"sample consensus: {agreeing}", found.T_world_rig)
-    if found is None or int(found.inliers.sum()) < LEAST_INLIERS:
+    if found is None or int(found.inliers.sum()) < MIN_MATCHES:
         return None
     return found
 

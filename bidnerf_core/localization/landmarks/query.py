@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage, observed_points
-from bidnerf_core.localization.landmarks.hypotheses import STATED, Hypothesis, camera_hypotheses
+from bidnerf_core.localization.landmarks.hypotheses import Hypothesis, Stated, camera_hypotheses
 from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
 from bidnerf_core.mapping.geometry.calibration import FIXED, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
@@ -56,7 +56,7 @@ class LandmarkQuery:
         every = camera_hypotheses(self.map_cameras, self.prior)
         if len({image.intrinsics for image in self.images}) == 1:
             return every
-        return [each for each in every if each.name == STATED]
+        return [each for each in every if each.name == Stated.EXACT]
 
     def seen_by(self, cameras: Sequence[Intrinsics]) -> LandmarkQuery:
         """Return the query with other intrinsics for each of its images."""

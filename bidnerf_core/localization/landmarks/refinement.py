@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.consensus import Candidate
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.guided import ProjectedLandmarks, guided_matches, projected_landmarks
 from bidnerf_core.localization.landmarks.hypotheses import (
     Explanation,
@@ -41,8 +41,6 @@ MAX_DISTANCE = 0.6
 """Maximum descriptor distance of a guided match without first inliers, in units of the distance between descriptors of different
 landmarks.
 """
-LEAST_GUIDED_MATCHES = 6
-"""Minimum number of guided matches for another round."""
 MAX_REFITS = 2
 """Maximum number of repeated refinements because other intrinsics or another motion have become more probable."""
 
@@ -102,7 +100,7 @@ def confirmed(query: LandmarkQuery, matches: LandmarkMatches, T_world_rig: SE3) 
     """Refine a pose found by other means on guided matches; None if there are too few."""
     radius, most = RADII[0] * query.threshold, _most_distance(query)
     found = guided_matches(query.images, query.landmarks, T_world_rig, radius, most)
-    if len(found) < LEAST_GUIDED_MATCHES:
+    if len(found) < MIN_MATCHES:
         return None
     correlation = query.landmarks.correlation_of(len(found))
     fit = resect(query.observed(found), T_world_rig, radius / 2, query.prior, correlation=correlation)
@@ -194,7 +192,7 @@ def _guided(
         data = query.observed(guided)
         agrees = _depth_agrees(data, fit.T_world_rig)
         guided, data = guided[agrees], data[agrees]
-        if len(guided) < LEAST_GUIDED_MATCHES:
+        if len(guided) < MIN_MATCHES:
             break
         changed, found = _changed(guided, found), guided
         correlation = _correlation(query, found)
@@ -214,7 +212,7 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
     z = data.in_camera(T_world_rig)[:, 2]
     known = data.depth > 0
     ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)
-    scale = ratio[known].median() if int(known.sum()) >= LEAST_GUIDED_MATCHES else 1.0
+    scale = ratio[known].median() if int(known.sum()) >= MIN_MATCHES else 1.0
     return (ratio / scale - 1).abs() <= DEPTH_OFF
 
 

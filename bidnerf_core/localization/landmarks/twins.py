@@ -18,22 +18,20 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.evidence import described
 from bidnerf_core.localization.landmarks.matching import LOOKED_UP, LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.localization.landmarks.refinement import LEAST_GUIDED_MATCHES, RADII, confirmed
+from bidnerf_core.localization.landmarks.refinement import RADII, confirmed
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_likelihood_ratio, resect
 
 COMPARED = 100
 """Maximum number of correspondences for which similar landmarks at other places are searched for."""
-ALIKE = 0.9
-"""Minimum ratio of a correspondence's descriptor distance to that of a similar landmark elsewhere."""
 LEAST_ALIKE = 0.3
-"""Minimum fraction of the correspondences with such a landmark, and of those that agree on one other pose."""
+"""Minimum fraction of the correspondences that are ambiguous with a landmark elsewhere, and of those that agree on one other pose."""
 
 
 def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> Rival | None:
@@ -45,7 +43,7 @@ def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose)
     here = found.correspondences
     chosen = here[torch.linspace(0, len(here) - 1, min(COMPARED, len(here))).round().long().unique()]
     others = _elsewhere(query, matcher, chosen, found)
-    least = max(LEAST_ALIKE * len(chosen), LEAST_GUIDED_MATCHES)
+    least = max(LEAST_ALIKE * len(chosen), MIN_MATCHES)
     if _keypoints(others) < least:
         return None
     first = sample_consensus(query.observed(others), others.view, query.threshold, seed=0)
@@ -99,7 +97,7 @@ def _elsewhere(
     """Return matches of the keypoints of ``chosen`` with landmarks that do not project near them, the most similar first."""
     distances, index = matcher.nearest(query.descriptors(chosen), LOOKED_UP)
     ratio = distances / query.squared_distances(chosen).clamp(min=1)[:, None]
-    row, column = (ratio <= ALIKE**-2).nonzero().unbind(-1)
+    row, column = (ratio <= MAX_AMBIGUITY**-2).nonzero().unbind(-1)
     order = ratio[row, column].argsort(stable=True)
     row, column = row[order], column[order]
     others = LandmarkMatches(chosen.view[row], chosen.keypoint[row], index[row, column], torch.ones(len(row)))
@@ -119,8 +117,6 @@ def _is_shared(there: LandmarkMatches, here: LandmarkMatches) -> bool:
     return float(torch.isin(there.keys, here.keys).float().mean()) > 0.5
 
 
-LEAST_POINTS = 4
-"""Minimum number of points that determine a pose."""
 FAR_OFF = 10.0
 """Median residual, in standard deviations, beyond which a second pose is discarded before refinement."""
 SAME = 5.0
@@ -160,7 +156,7 @@ def start_of_second_pose(data: ObservedPoints, T_world_rig: SE3, noise: float) -
 
     ``noise`` is that of the keypoints, pixels.
     """
-    if len(data) < LEAST_POINTS:
+    if len(data) < MIN_MATCHES:
         return None
     start = tilted_to_the_other_side(data.points, T_world_rig)
     off = torch.linalg.vector_norm(data.normalized_residuals(start, noise), dim=-1)

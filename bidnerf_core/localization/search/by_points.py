@@ -20,7 +20,7 @@ from bidnerf_core.mapping import SurfaceMap
 JUDGED = 0.02
 """Distance scale for comparing poses, as a fraction of the scene's extent."""
 COMPARED_POINTS = 200
-"""Minimum number of points on which poses are compared."""
+"""Minimum number of points on which poses are compared within a search."""
 APART, TURNED = 0.05, math.radians(10)
 """Distance (fraction of the extent, radians) beyond which two poses are different answers."""
 

@@ -12,7 +12,9 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.acceptance import SIGHT_LINES
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.surface.casting import cast
 
@@ -20,10 +22,6 @@ JUMP = 0.05
 """Relative depth difference above which neighbouring pixels belong to different segments."""
 CONSIDERABLE, REST = 0.15, 0.05
 """Minimum fraction of the measured pixels in an occluder, and in the rest."""
-LEAST_PIXELS = 50
-"""Minimum number of measured pixels in both."""
-PROBED_POINTS = 300
-"""Maximum number of an occluder's points that are compared with the surface."""
 CLEARLY_IN_FRONT = 0.02
 """Distance in front of the surface (fraction of the scene's extent) up to which a point still lies on it."""
 
@@ -68,7 +66,7 @@ def nearest_piece(problem: Problem) -> Occluder | None:
         view.frame, depth=torch.where(hidden, 0, depth), hidden=hidden if given is None else hidden | given
     )
     pixels = piece.nonzero()
-    some = pixels[torch.linspace(0, len(pixels) - 1, min(len(pixels), PROBED_POINTS)).long()]
+    some = pixels[torch.linspace(0, len(pixels) - 1, min(len(pixels), SIGHT_LINES)).long()]
     centres = some.flip(-1).double() + 0.5
     points = view.frame.intrinsics.unproject(centres) * depth.cpu().double()[some[:, 0], some[:, 1], None]
     share = len(pixels) / int(((depth > 0) & depth.isfinite()).sum())
@@ -79,12 +77,12 @@ def _nearest(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"] | None:
     label = _pieces(depth.numpy())
     measured = label >= 0
     counts = np.bincount(label[measured]) if measured.any() else np.zeros(0, dtype=int)
-    considerable = (counts >= max(LEAST_PIXELS, CONSIDERABLE * counts.sum())).nonzero()[0]
+    considerable = (counts >= max(LEAST_POINTS, CONSIDERABLE * counts.sum())).nonzero()[0]
     if len(considerable) == 0:
         return None
     values = depth.numpy()
     nearest = min(considerable, key=lambda number: float(np.median(values[label == number])))
-    if counts.sum() - counts[nearest] < max(LEAST_PIXELS, REST * counts.sum()):
+    if counts.sum() - counts[nearest] < max(LEAST_POINTS, REST * counts.sum()):
         return None
     return torch.from_numpy(label == nearest)
 

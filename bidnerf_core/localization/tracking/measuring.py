@@ -28,7 +28,6 @@ from bidnerf_core.localization.settings import ByColourConfig, TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.points import (
-    CAMERAS,
     FRESH,
     FollowedPoints,
     PointFit,
@@ -62,9 +61,6 @@ SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is checked after fusing them with depth and the prediction."""
 VAGUE = 0.35
 """Maximum uncertainty of a prediction that shape alone may correct, as a fraction of the distance to the scene."""
-TOO_VAGUE = Verdict(
-    Outcome.UNDETERMINED, "no colours were recorded, and the prediction is too uncertain for the shape"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +110,7 @@ class ByLandmarks:
             points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation, state.moves
         )
         if found is not None:
-            found = with_motion(found, self.detector.landmarks, CAMERAS[:1])
+            found = with_motion(found, self.detector.landmarks, trusts_camera=True)
             state = replace(state, moves=found.moves)
         judged = measured = None
         state = replace(state, age=state.age + 1)
@@ -256,7 +252,8 @@ def by_shape(
     translation, rotation = prediction.covariance.diagonal().split(3)
     off = math.sqrt(float(translation.mean() + rotation.mean() * predicted.reach**2))
     if off > VAGUE * predicted.reach:
-        return Measurement(prediction, TOO_VAGUE, 1.0, state)
+        why = "no colours were recorded, and the prediction is too uncertain for the shape"
+        return Measurement(prediction, Verdict(Outcome.UNDETERMINED, why), 1.0, state)
     found = fit_shape(surface, cloud, prediction, off)
     return Measurement(found.pose, found.verdict(), 1 - found.diagnostics.on_surface, state)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -16,8 +15,8 @@ from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_tim
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
+from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES
 from bidnerf_core.localization.landmarks.hypotheses import (
-    Hypothesis,
     Motion,
     Posterior,
     camera_hypotheses,
@@ -30,16 +29,12 @@ from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
 from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
-LEAST_FOLLOWED = 6
-"""Minimum number of points from which a pose is estimated."""
 INLIER = 3.0
 """Maximum reprojection error (norm) of an inlier, in standard deviations."""
 MAJORITY = 0.7
 """Inlier fraction below which the robust fit is not trusted, and sample consensus is tried."""
 TRACKED_STEPS = 1
 """Steps of the fits for the posterior of a motion in a tracked frame: the start is so close that linear algebra does the rest."""
-CAMERAS = camera_hypotheses([])
-"""Hypotheses about the camera of an image; ``CAMERAS[:1]`` is the one that its intrinsics are right."""
 FRESH = -1
 """Landmark number of points that are not landmarks."""
 
@@ -151,7 +146,7 @@ def fit_pose(
     robust fit has too few inliers, sample consensus within ``threshold`` pixels gives another start. ``moves`` is whether a motion
     during the readout is assumed until ``with_motion`` tests for it.
     """
-    if len(data) < LEAST_FOLLOWED:
+    if len(data) < MIN_MATCHES:
         return None
     near = _nearby(data, start, threshold)
     motion = MotionPrior.usual(float(data.in_camera(near)[:, 2].median())) if moves else STILL
@@ -160,24 +155,25 @@ def fit_pose(
     if found.share >= MAJORITY and found.fit.noise <= threshold:
         return found
     consensus = sample_consensus(data, torch.zeros(len(data), dtype=torch.long), threshold, seed=0)
-    if consensus is None or int(consensus.inliers.sum()) < LEAST_FOLLOWED:
+    if consensus is None or int(consensus.inliers.sum()) < MIN_MATCHES:
         return found
     better = resect(data[consensus.inliers], consensus.T_world_rig, threshold / 2, correlation=correlation)
     other = PointFit(better, data, _inliers(data, better))
     return other if other.within(threshold) > found.within(threshold) else found
 
 
-def with_motion(found: PointFit, landmarks: LandmarkMap, which: Sequence[Hypothesis] = CAMERAS) -> PointFit:
+def with_motion(found: PointFit, landmarks: LandmarkMap, trusts_camera: bool = False) -> PointFit:
     """Return a fit with a motion during the readout if that is more probable, and with the remaining uncertainty about it.
 
-    ``which`` are the hypotheses about the camera that are compared along with the motion.
+    Hypotheses about the camera are compared along with the motion, unless its intrinsics are trusted.
     """
+    cameras = camera_hypotheses([])
     inliers = found.data[found.inliers]
     if not len(inliers):
         return found
     correlation = landmarks.correlation_of(len(inliers))
     judged = posterior(
-        inliers, found.T_world_camera, found.fit.noise, which, correlation, GIVEN,
+        inliers, found.T_world_camera, found.fit.noise, cameras[:1] if trusts_camera else cameras, correlation, GIVEN,
         landmarks.calibration_scatter, share_moving(landmarks), TRACKED_STEPS,
     ).with_stated  # fmt: skip
     moved = judged.best.motion is Motion.MOVING

@@ -40,8 +40,6 @@ from bidnerf_core.mapping.landmarks.features import Features
 from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
-NEARBY = EXHAUSTIVE
-"""Maximum number of landmarks that are compared with an image: those seen in the most images of the map."""
 WIDE = 2.0
 """Multiple of the radius of guided matching above which keypoints are compared with all landmarks in view. Guided matching
 compares a keypoint with the few landmarks that project nearest to it, which suits accurate predictions.
@@ -140,16 +138,16 @@ class LandmarkDetector:
         return points, found, usual_distance(query, matches[found.inliers])
 
     def _near(self, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "n"]:
-        """Return up to ``NEARBY`` numbers of landmarks in view, mapped from roughly this direction, those in most images."""
+        """Return up to ``EXHAUSTIVE`` numbers of landmarks in view, mapped from roughly this direction, those in most images."""
         landmarks = self.landmarks
         local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
         half = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
         middle = torch.tensor([0.5 - camera.cx / camera.width, 0.5 - camera.cy / camera.height]) * 2 * half
         inside = ((local[:, :2] - middle * local[:, 2:]).abs() <= 1.3 * half * local[:, 2:]).all(-1)
         index = (inside & landmarks.facing(T_world_camera.translation, OBLIQUE)).nonzero()[:, 0]
-        if len(index) <= NEARBY:
+        if len(index) <= EXHAUSTIVE:
             return index
-        return index[landmarks.views[index].argsort(descending=True, stable=True)[:NEARBY].sort().values]
+        return index[landmarks.views[index].argsort(descending=True, stable=True)[:EXHAUSTIVE].sort().values]
 
 
 def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most: float) -> Evidence:

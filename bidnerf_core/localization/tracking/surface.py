@@ -41,7 +41,7 @@ SURFACE_BIAS = 0.5
 """Fraction of the variance of a pose by depth that is common to consecutive frames."""
 DRAWN = 4
 """Number of pixels drawn per requested measured point."""
-ALIGNMENT_STEPS = 8
+STEPS = 8
 """Maximum number of steps of an alignment without landmarks, at each scale."""
 ALIGNED_STEP = 1e-4
 """Length of a step (metres, radians) below which an alignment ends."""
@@ -122,11 +122,7 @@ def aligned(
     for distance in (spread, finest) if spread > 1.5 * finest else (finest,):
         cost = SurfaceCost(surface, cloud, PointScales(distance))
         term = Scaled(cost, weight(USUAL.points, float(cost.residual_variance(T[None])[0])))
-        T = (
-            descend(Sum((prior, term)), T[None], ALIGNMENT_STEPS, about.moved, stop=ALIGNED_STEP)
-            .T[0]
-            .normalized()
-        )
+        T = descend(Sum((prior, term)), T[None], STEPS, about.moved, stop=ALIGNED_STEP).T[0].normalized()
     judge = SurfaceCost(surface, cloud, PointScales(JUDGED * surface.extent))
     found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, 1, EXACT)
     return Alignment(T, found, surface_diagnostics(judge, T, torch.inf))
@@ -134,8 +130,6 @@ def aligned(
 
 WEAK = 0.1
 """Ratio to the mean information of the three best directions below which the prediction is kept along a direction."""
-SHAPE_STEPS = 8
-"""Maximum number of steps at each scale."""
 FORESEEN = 25.0
 """Maximum squared Mahalanobis distance between a prediction and an accepted pose."""
 JUDGED_CELLS = 4.0
@@ -173,7 +167,7 @@ def fit_shape(surface: SurfaceMap, cloud: PointCloud, predicted: PoseEstimate, s
     kept = information
     for distance in (spread, finest) if spread > 1.5 * finest else (finest,):
         cost = SurfaceCost(surface, cloud, PointScales(distance, colour_weight=0.0))
-        T, moved, information, kept = _descended(cost, predicted, T, moved, SHAPE_STEPS)
+        T, moved, information, kept = _descended(cost, predicted, T, moved, STEPS)
     judge = SurfaceCost(
         surface, cloud, PointScales(min(JUDGED * surface.extent, JUDGED_CELLS * surface.cell))
     )
