@@ -28,6 +28,7 @@ import tiny
 from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main
 from bidnerf_core.cli.progress import Display
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import METHODS
@@ -1070,6 +1071,17 @@ def whole(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole") / "map"
     assert main(["train", str(shared / "data"), "--out", str(out), *tiny.options(LONG)]) == 0
     return out
+
+
+@pytest.mark.slow
+def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(bidnerf: Run, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert bidnerf("demo", "--steps", 20, "--frames", 1, "--out", out).status == 0
+    data = open_dataset(out / "data")
+    assert len(data.views("train")) == len(load_map(out / "map").info.cameras)
+    [view] = data.views("test")
+    found = json.loads(bidnerf("localize", out / "map", out / "data", "--split", "test", "--json").out)
+    assert found["frame"] == view.frame.name
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.cli.options import DEFAULT_BACKEND, Flag, option, parse, require
 from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c, timed
+from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.evaluation.plots import convergence_plot
 from bidnerf_core.evaluation.protocols import perturb
@@ -68,7 +69,7 @@ def run(arguments: list[str]) -> None:
 
 def demo(
     backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
-    out: Annotated[Path, option("DIR", "folder for the map and the pictures")] = Path("demo-out"),
+    out: Annotated[Path, option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
     frames: Annotated[int, option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[int | None, option("N", "training steps", "the backend's quick choice")] = None,
     seed: Annotated[int, option("N", "seed of the views and the starts")] = 0,
@@ -109,6 +110,7 @@ def _demonstrated(
             seen, backend, out / "map", config, background=scene.bounds.background, overwrite=True,
             progress=progress, cancel=cancel,
         )  # fmt: skip
+    write_transforms(out / "data", {"train": seen, "test": unseen}, scene.bounds.background)
     auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))
     trials = []
     for number, view in enumerate(unseen):
@@ -156,6 +158,7 @@ def _draw(stored: Map, trials: Sequence[DemoTrial], out: Path) -> None:
     except InputError as error:  # matplotlib is optional
         say(str(error))
     show(f"look at {', '.join(str(out / name) for name in drawn)}")
+    show(f"see why a pose was found: bidnerf view {out / 'map'} {out / 'data'}")
 
 
 def _overlay(painter: Painter, trial: DemoTrial) -> UInt8[np.ndarray, "H W 3"]:
