@@ -22,7 +22,7 @@ from bidnerf_core.viewer.scene import rows_of
 
 LEAST_SHOWN = 0.001
 """Minimum probability of an explanation that is listed."""
-CAMERA_NAMES = {
+CAMERA_NAMES: dict[str, str] = {
     Stated.EXACT: "given camera",
     Stated.INEXACT: "given camera (slightly off)",
     Stated.WRONG_FOCAL: "another focal length",
