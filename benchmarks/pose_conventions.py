@@ -26,7 +26,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, open_dataset
 from bidnerf_core.captures.pose_conventions import pose_contradiction
-from bidnerf_core.mapping import PosedKeypoints
+from bidnerf_core.mapping import ImageKeypoints
 from bidnerf_core.mapping.landmarks.building import posed_keypoints
 from bidnerf_core.mapping.landmarks.features import SIFT
 
@@ -162,11 +162,11 @@ def remedied(found: SE3, truth: SE3) -> bool:
     return float((turned & (along > math.cos(math.radians(5))))[known].double().mean()) > 0.8
 
 
-def with_poses(images: Sequence[PosedKeypoints], T: SE3) -> list[PosedKeypoints]:
-    return [replace(image, T_world_camera=T[i]) for i, image in enumerate(images)]
+def with_poses(images: Sequence[ImageKeypoints], T: SE3) -> list[ImageKeypoints]:
+    return [replace(image, T_ref_camera=T[i]) for i, image in enumerate(images)]
 
 
-def checked(images: Sequence[PosedKeypoints], T: SE3, truth: SE3) -> dict[str, Any]:
+def checked(images: Sequence[ImageKeypoints], T: SE3, truth: SE3) -> dict[str, Any]:
     began = time.process_time()
     found = pose_contradiction(with_poses(images, T))
     answer: dict[str, Any] = {"refused": found is not None, "cpu_seconds": time.process_time() - began}
@@ -186,7 +186,7 @@ def measured(data: Path, most: int) -> dict[str, Any]:
     some = names[:: max(1, -(-len(names) // most))]
     views = dataset.views("train", some)
     images = posed_keypoints(views, SIFT)
-    truth = SE3.stack([image.T_world_camera for image in images])
+    truth = SE3.stack([image.T_ref_camera for image in images])
     right = {}
     for part, chosen in PARTS.items():
         index = list(chosen(len(images)))

@@ -15,11 +15,11 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization
 from bidnerf_core.localization.alternatives import mirror_image
 from bidnerf_core.localization.by_depth import share_on_surface
-from bidnerf_core.localization.landmarks.correspondences import query_image
 from bidnerf_core.localization.landmarks.guided import projected_landmarks
 from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
 from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.landmarks.features import SIFT
+from bidnerf_core.mapping.landmarks.image_keypoints import image_keypoints
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
 from problems import localize
@@ -238,7 +238,7 @@ def test_hidden_landmarks_are_not_missed() -> None:
     hidden[:, : camera.width // 2] = True
     counts = []
     for frame in (view.frame, replace(view.frame, hidden=hidden)):
-        image = query_image(frame, SE3.identity(), SIFT)
+        image = image_keypoints(View(frame, SE3.identity()), SIFT)
         (shown,) = projected_landmarks([image], landmarks, view.T_ref_camera, GIVEN, 3.0)
         counts.append((len(image.keypoints), len(shown)))
     (keypoints, landmarks_before), (kept, landmarks_after) = counts

@@ -14,7 +14,7 @@ from bidnerf_core import SE3, InputError, register
 from bidnerf_core.captures.pose_conventions import PoseContradiction, pose_contradiction
 from bidnerf_core.captures.pose_readings import AS_GIVEN, Y_AND_Z_REVERSED, readings, signed_permutations
 from bidnerf_core.captures.training_views import prepared
-from bidnerf_core.mapping import PosedKeypoints
+from bidnerf_core.mapping import ImageKeypoints
 from bidnerf_core.mapping.landmarks.building import posed_keypoints
 from landmark_scene import Points, looking_in, ring
 
@@ -22,11 +22,11 @@ REVERSED = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 CYCLED = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 
 
-def images(points: Points, poses: list[SE3]) -> list[PosedKeypoints]:
+def images(points: Points, poses: list[SE3]) -> list[ImageKeypoints]:
     """The keypoints of a ring of cameras, with other ``poses`` than the true ones."""
     views = ring(points, len(poses))
     found = posed_keypoints(views, points)
-    return [replace(image, T_world_camera=T) for image, T in zip(found, poses, strict=True)]
+    return [replace(image, T_ref_camera=T) for image, T in zip(found, poses, strict=True)]
 
 
 def true_poses(count: int = 14) -> list[SE3]:
@@ -120,7 +120,7 @@ def test_right_poses_before_a_wall_are_not_refused(seed: int) -> None:
     seen = posed_keypoints(views, points)
     assert pose_contradiction(seen) is None
     found = pose_contradiction(
-        [replace(image, T_world_camera=with_axes(T, REVERSED)) for image, T in zip(seen, poses, strict=True)]
+        [replace(image, T_ref_camera=with_axes(T, REVERSED)) for image, T in zip(seen, poses, strict=True)]
     )
     assert found is None or found.reading is None or found.reading.axes == Y_AND_Z_REVERSED
 
@@ -134,7 +134,7 @@ def test_inverse_matrices_of_cameras_on_one_level_are_not_called_axes(axes: Tens
     seen = posed_keypoints(views, points)
     found = pose_contradiction(
         [
-            replace(image, T_world_camera=with_axes(T, axes).inverse())
+            replace(image, T_ref_camera=with_axes(T, axes).inverse())
             for image, T in zip(seen, poses, strict=True)
         ]
     )
@@ -233,11 +233,11 @@ def irregular_poses(count: int = 14) -> list[SE3]:
     return [looking_in(0.12 * i, 0.15 * (-1) ** i) @ SE3.exp(shifts[i]) for i in range(count)]
 
 
-def seen_from(truth: SE3, given: SE3) -> list[PosedKeypoints]:
+def seen_from(truth: SE3, given: SE3) -> list[ImageKeypoints]:
     """The keypoints of images from true poses, with given ones."""
     points = Points(noise=0.4, outliers=0.1)
     found = posed_keypoints([points.view(truth[i], seed=i) for i in range(len(truth.translation))], points)
-    return [replace(image, T_world_camera=given[i]) for i, image in enumerate(found)]
+    return [replace(image, T_ref_camera=given[i]) for i, image in enumerate(found)]
 
 
 def test_images_in_no_order_are_judged_as_well() -> None:
@@ -248,9 +248,7 @@ def test_images_in_no_order_are_judged_as_well() -> None:
     views = [points.view(poses[i], seed=i) for i in order]
     found = posed_keypoints(views, points)
     assert pose_contradiction(found) is None
-    mixed = [
-        replace(image, T_world_camera=found[(7 * i) % 40].T_world_camera) for i, image in enumerate(found)
-    ]
+    mixed = [replace(image, T_ref_camera=found[(7 * i) % 40].T_ref_camera) for i, image in enumerate(found)]
     contradiction = pose_contradiction(mixed)
     assert contradiction is not None
     assert contradiction.agreeing_as_given < 0.5 * contradiction.pairs

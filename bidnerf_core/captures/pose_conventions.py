@@ -21,7 +21,7 @@ from torch import Tensor
 
 from bidnerf_core.captures.pose_readings import SWAP, Y_AND_Z_REVERSED, Reading, readings, with_axes
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import PosedKeypoints
+from bidnerf_core.mapping import ImageKeypoints
 from bidnerf_core.mapping.landmarks.features import squared_distances
 from bidnerf_core.mapping.landmarks.tracks import LEAST_BASELINE, likely_pairs_of_poses
 
@@ -98,7 +98,7 @@ class PoseContradiction:
         )
 
 
-def pose_contradiction(images: Sequence[PosedKeypoints]) -> PoseContradiction | None:
+def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
     """Return how the poses of ``images`` contradict them; None if they agree, or if the images do not determine it."""
     proposed = _pairs(images)
     pairs = [pair for i, j in proposed if (pair := _matched(images, i, j)) is not None]
@@ -107,7 +107,7 @@ def pose_contradiction(images: Sequence[PosedKeypoints]) -> PoseContradiction | 
         pairs += [pair for i, j in others if (pair := _matched(images, i, j)) is not None]
     if len(pairs) < ENOUGH_PAIRS:
         return None
-    poses = SE3.stack([image.T_world_camera for image in images])
+    poses = SE3.stack([image.T_ref_camera for image in images])
     as_given = int(_agreeing(pairs, SE3.stack([poses]))[0])
     if as_given > NOT_ALL * len(pairs):
         return None
@@ -249,20 +249,20 @@ def _near_identity(H: Float[Tensor, "9 9"]) -> Float[Tensor, "9"]:
     return torch.linalg.solve(system, right)[:9]
 
 
-def _pairs(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
+def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     """Return pairs that probably show the same things: nearby according to the poses, which may be wrong, or
     in the given order.
     """
     count = len(images)
     pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}
     if count > 1:
-        near = likely_pairs_of_poses([image.T_world_camera for image in images], 2)
+        near = likely_pairs_of_poses([image.T_ref_camera for image in images], 2)
         pairs |= {(i, j) for i, j in near.tolist()}
     ordered = sorted(pairs)
     return ordered[:: max(1, -(-len(ordered) // MOST_PAIRS))]
 
 
-def _similar(images: Sequence[PosedKeypoints]) -> list[tuple[int, int]]:
+def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     """Return pairs of images that probably show the same things, judging by their strongest keypoints, most
     similar first.
     """
@@ -290,7 +290,7 @@ def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tenso
     return rows, partner[rows]
 
 
-def _matched(images: Sequence[PosedKeypoints], i: int, j: int) -> _MatchedPair | None:
+def _matched(images: Sequence[ImageKeypoints], i: int, j: int) -> _MatchedPair | None:
     """Return two images' inlier matches to an essential matrix; None if these are too few."""
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:

@@ -35,7 +35,7 @@ def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlat
     pixel_noise, total = noise(sightings, points), 0.0
     for number in numbers[:: -(-len(numbers) // MOST_IMAGES)].tolist():
         own = (image == number).nonzero()[:, 0]
-        T = seen.images[number].T_world_camera
+        T = seen.images[number].T_ref_camera
         data = observed_at_rest(sightings[own], points, T)
         still = resect(data, T, pixel_noise, correlation=correlation)
         moving = resect(data, T, pixel_noise, correlation=correlation, motion=prior)

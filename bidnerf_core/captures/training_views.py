@@ -21,7 +21,7 @@ from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, PosedKeypoints, TrackedViews, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, ImageKeypoints, TrackedViews, tracked_views
 from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, posed_keypoints
 from bidnerf_core.mapping.landmarks.features import SIFT, USUAL_FEATURES
 from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
@@ -152,7 +152,7 @@ def _sample(views: Sequence[View]) -> list[View]:
     return [view for run in range(0, runs, every) for view in views[RUN * run : RUN * (run + 1)]]
 
 
-def _check_poses(images: Sequence[PosedKeypoints]) -> None:
+def _check_poses(images: Sequence[ImageKeypoints]) -> None:
     """Raise ``InputError`` if the poses contradict most pairs of images."""
     if (found := pose_contradiction(images)) is not None:
         raise InputError(f"{found.sentence} (--trust-poses, trust_poses in Python, trains with them anyway)")
@@ -165,7 +165,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     ``depth_unit`` is the one with which depth images were read, if another can be given.
     """
     seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
-    ratio = depth_ratio(seen.sightings, points, tracked.depth[seen.number])
+    ratio = depth_ratio(seen, points)
     if ratio is None or abs(ratio - 1) < UNUSUAL_RATIO:
         return
     remark = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"

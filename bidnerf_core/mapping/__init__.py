@@ -15,8 +15,9 @@ from bidnerf_core.mapping.landmarks.building import (
     tracked_views,
 )
 from bidnerf_core.mapping.landmarks.features import Features, Keypoints, Sift, find_features
+from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap
-from bidnerf_core.mapping.landmarks.tracks import PosedKeypoints, TrackedKeypoints
+from bidnerf_core.mapping.landmarks.tracks import TrackedKeypoints
 from bidnerf_core.mapping.surface.baking import (
     BakeConfig,
     bake,
@@ -42,12 +43,12 @@ __all__ = [
     "CalibrationPrior",
     "Features",
     "HeldOutTrial",
+    "ImageKeypoints",
     "Keypoints",
     "LandmarkConfig",
     "LandmarkMap",
     "ObservedPoints",
     "PosePrior",
-    "PosedKeypoints",
     "ReprojectionFit",
     "Sift",
     "SurfaceMap",

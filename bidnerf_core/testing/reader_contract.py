@@ -111,10 +111,10 @@ class ReaderContract:
 
     def test_depth_has_the_unit_of_the_poses(self) -> None:
         tracked = self._tracked()
-        if not bool((tracked.depth > 0).any()):
+        if not bool((tracked.observations.depth > 0).any()):
             return
         seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
-        ratio = depth_ratio(seen.sightings, points, tracked.depth[seen.number])
+        ratio = depth_ratio(seen, points)
         require_that(
             ratio is None or abs(ratio - 1) <= UNUSUAL_RATIO,
             f"reader {self.name!r}: depth is {ratio or math.nan:.3g} times the depth that the poses and"

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import exposure_times, transposed_exposure_times
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.camera.rolling_shutter import transposed_exposure_times
+from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.landmarks.features import Features, Keypoints, detected, visible_keypoints
-from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks.features import Features
+from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints, image_keypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 MIN_MATCHES = 6
@@ -24,40 +23,11 @@ MAX_AMBIGUITY = 0.9
 """Maximum ratio of the descriptor distances of the best and the second-best candidate for a match (Lowe 2004, section 7.1)."""
 
 
-@dataclass(frozen=True, eq=False)
-class QueryImage:
-    """The keypoints of a query image, as undistorted rays, and the pose of its camera in the rig's frame."""
-
-    keypoints: Keypoints
-    rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
-    depth: Float[Tensor, "n"]  # metres, 0 where none was measured
-    intrinsics: Intrinsics
-    T_rig_camera: SE3  # float64
-    hidden: Bool[Tensor, "h w"] | None = None  # pixels of objects that are not in the map, see ``Frame``
-
-    @property
-    def focal(self) -> float:
-        """The geometric mean of the two focal lengths, pixels."""
-        return (self.intrinsics.fx * self.intrinsics.fy) ** 0.5
-
-
-def query_images(views: Sequence[View], features: Features) -> list[QueryImage]:
+def query_images(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
     """Detect the keypoints of ``views``, with poses in any common frame; the rig's frame is that of the last camera."""
-    T_rig_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
-    return [
-        query_image(
-            view.frame, (T_rig_ref @ view.T_ref_camera.to("cpu", torch.float64)).normalized(), features
-        )
-        for view in views
-    ]
-
-
-def query_image(frame: Frame, T_rig_camera: SE3, features: Features) -> QueryImage:
-    hidden = None if frame.hidden is None else frame.hidden.cpu()
-    keypoints = visible_keypoints(detected(features, frame.rgb), hidden)
-    rays = frame.intrinsics.unproject(keypoints.pixels.double())
-    depth = measured_depth(frame, keypoints.pixels)
-    return QueryImage(keypoints, rays, depth, frame.intrinsics, T_rig_camera, hidden)
+    images = [image_keypoints(view, features) for view in views]
+    T_rig_ref = images[-1].T_ref_camera.inverse()
+    return [replace(image, T_ref_camera=(T_rig_ref @ image.T_ref_camera).normalized()) for image in images]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +59,12 @@ class LandmarkMatches:
 
 
 def observed_points(
-    images: Sequence[QueryImage], landmarks: LandmarkMap, found: LandmarkMatches
+    images: Sequence[ImageKeypoints], landmarks: LandmarkMap, found: LandmarkMatches
 ) -> ObservedPoints:
     """Return the landmarks and keypoints of the matches ``found``, as input for a pose solver."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
     number = first[found.view] + found.keypoint
-    T_camera_rig = SE3.stack([image.T_rig_camera.inverse() for image in images])
+    T_camera_rig = SE3.stack([image.T_ref_camera.inverse() for image in images])
     return ObservedPoints(
         landmarks.positions[found.landmark].double(),
         landmarks.deviations[found.landmark].double(),
@@ -104,8 +74,8 @@ def observed_points(
         torch.cat([image.depth for image in images])[number],
         T_camera_rig.rotation[found.view],
         T_camera_rig.translation[found.view],
-        *(
-            torch.cat([of(image.keypoints.pixels, image.intrinsics) for image in images])[number]
-            for of in (exposure_times, transposed_exposure_times)
-        ),
+        torch.cat([image.exposure_times for image in images])[number],
+        torch.cat([transposed_exposure_times(image.keypoints.pixels, image.intrinsics) for image in images])[
+            number
+        ],
     )

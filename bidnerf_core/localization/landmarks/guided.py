@@ -14,9 +14,10 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, moved_points
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches, QueryImage
+from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches
 from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.landmarks.features import paired_squared_distances
+from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 CANDIDATES = 6
@@ -28,7 +29,7 @@ OCTAVES = 1.0
 
 
 def guided_matches(
-    images: Sequence[QueryImage],
+    images: Sequence[ImageKeypoints],
     landmarks: LandmarkMap,
     T_world_rig: SE3,
     radius: float,
@@ -46,7 +47,7 @@ def guided_matches(
 
 
 def projected_landmarks(
-    images: Sequence[QueryImage],
+    images: Sequence[ImageKeypoints],
     landmarks: LandmarkMap,
     T_world_rig: SE3,
     calibration: Calibration,
@@ -66,7 +67,7 @@ class ProjectedLandmarks:
     def __init__(
         self,
         number: int,
-        image: QueryImage,
+        image: ImageKeypoints,
         landmarks: LandmarkMap,
         T_world_rig: SE3,
         calibration: Calibration,
@@ -75,7 +76,7 @@ class ProjectedLandmarks:
     ) -> None:
         self._number, self._image, self._landmarks = number, image, landmarks
         focal = image.focal * calibration.focal_factor
-        T_world_camera = T_world_rig @ image.T_rig_camera
+        T_world_camera = T_world_rig @ image.T_ref_camera
         self._index, local = _visible(image, landmarks, T_world_camera, focal, margin)
         self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         if bool(motion.any()):
@@ -116,7 +117,7 @@ class ProjectedLandmarks:
         return rows, index[rows, columns]
 
 
-def _image_pixels(pixels: Float[Tensor, "m 2"], image: QueryImage) -> Float[Tensor, "m 2"]:
+def _image_pixels(pixels: Float[Tensor, "m 2"], image: ImageKeypoints) -> Float[Tensor, "m 2"]:
     """Convert pixels relative to the principal point, at the mean focal length, to image pixels; distortion is neglected."""
     camera = image.intrinsics
     across = torch.tensor([camera.fx, camera.fy]) / image.focal
@@ -124,7 +125,7 @@ def _image_pixels(pixels: Float[Tensor, "m 2"], image: QueryImage) -> Float[Tens
 
 
 def _visible(
-    image: QueryImage, landmarks: LandmarkMap, T_world_camera: SE3, focal: float, margin: float
+    image: ImageKeypoints, landmarks: LandmarkMap, T_world_camera: SE3, focal: float, margin: float
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
     """Return the landmarks in front of the camera, inside its image, and seen roughly from a mapped direction.
 

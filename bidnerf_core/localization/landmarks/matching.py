@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches, QueryImage
+from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches
 from bidnerf_core.mapping.landmarks.features import (
     Features,
     FoundOnce,
@@ -24,6 +24,7 @@ from bidnerf_core.mapping.landmarks.features import (
     find_features,
     squared_distances,
 )
+from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 from bidnerf_core.mapping.landmarks.vocabulary import BLOCK, k_means, nearest_centre
 
@@ -155,7 +156,7 @@ LEAST_MATCHES = 60
 
 
 def unguided_matches(
-    images: Sequence[QueryImage], matcher: LandmarkMatcher, strongest: int
+    images: Sequence[ImageKeypoints], matcher: LandmarkMatcher, strongest: int
 ) -> LandmarkMatches:
     """Return the matches of keypoints with their nearest landmarks that pass the ratio test, least ambiguous first.
 

@@ -11,12 +11,13 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, QueryImage, observed_points
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, observed_points
 from bidnerf_core.localization.landmarks.hypotheses import Hypothesis, Stated, camera_hypotheses
 from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
 from bidnerf_core.mapping.geometry.calibration import FIXED, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.landmarks.features import paired_squared_distances
+from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 THRESHOLD = 0.005
@@ -27,7 +28,7 @@ THRESHOLD = 0.005
 class LandmarkQuery:
     """The images of a query, the landmarks to find in them, and the prior on the camera."""
 
-    images: list[QueryImage]
+    images: list[ImageKeypoints]
     landmarks: LandmarkMap
     prior: CalibrationPrior
     moving: bool = True  # whether the camera of a single image may have moved during the readout

@@ -26,7 +26,7 @@ from bidnerf_core.localization.landmarks.hypotheses import (
 from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
-from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks.image_keypoints import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 INLIER = 3.0

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import UNKNOWN, DepthNoise
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import visible_at
 from bidnerf_core.geometry.independent import CORNERS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.chance import log10_nfa
-from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, query_image
+from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.evidence import (
     cell_numbers,
     depth_scale,
@@ -37,7 +37,7 @@ from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN
 from bidnerf_core.mapping.landmarks.features import Features
-from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks.image_keypoints import image_keypoints, measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 WIDE = 2.0
@@ -93,7 +93,7 @@ class LandmarkDetector:
         (pixels), ``moves`` a guess as for ``fit_pose``. Returns None if too few keypoints match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
-        image = query_image(frame, SE3.identity(), self.features)
+        image = image_keypoints(View(frame, SE3.identity()), self.features)
         query = LandmarkQuery([image], self.landmarks[number], FIXED)
         tight = RADII[-1] * query.threshold
         seen = self._seen(frame, query, T_world_camera, radius, most_distance, noise, moves)

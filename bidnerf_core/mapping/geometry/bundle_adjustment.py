@@ -19,7 +19,7 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry.robust import cauchy_loss, inlier_weight
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.geometry.projection import by_update, projected
 
 ADJUSTMENT_STEPS = 30
@@ -163,10 +163,10 @@ def linearized(
     column = off[..., None]
     return AdjustmentSystem(
         cost + term.cost,
-        _summed((view_weighted @ column)[..., 0], view, views) + term.gradient,
-        _summed((point_weighted @ column)[..., 0], point, count),
-        _summed(view_weighted @ by_view, view, views) + torch.diag_embed(term.precision),
-        _summed(point_weighted @ by_point, point, count),
+        summed((view_weighted @ column)[..., 0], view, views) + term.gradient,
+        summed((point_weighted @ column)[..., 0], point, count),
+        summed(view_weighted @ by_view, view, views) + torch.diag_embed(term.precision),
+        summed(point_weighted @ by_point, point, count),
         view_weighted @ by_point, view, point,
     )  # fmt: skip
 
@@ -201,7 +201,3 @@ def _damped(blocks: Float[Tensor, "b k k"], damping: float) -> Float[Tensor, "b 
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     least = ALMOST_SINGULAR * diagonal.mean(-1, keepdim=True).clamp(min=1e-30)
     return blocks + torch.diag_embed(damping * diagonal + least)
-
-
-def _summed(values: Tensor, index: Tensor, count: int) -> Tensor:
-    return torch.zeros((count, *values.shape[1:]), dtype=values.dtype).index_add_(0, index, values)

@@ -112,3 +112,8 @@ class Sightings:
     def residuals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 2"]:
         """Return projection minus observation, pixels; infinite for points behind the camera."""
         return reprojection_errors(self.in_camera(points), self.image, self.focal)
+
+
+def summed(values: Tensor, index: Tensor, count: int) -> Tensor:
+    """Return the sums of those ``values`` that belong to each of ``count`` points or views, by number."""
+    return torch.zeros((count, *values.shape[1:]), dtype=values.dtype).index_add_(0, index, values)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.geometry.robust import inlier_weight, mad_deviation
-from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.geometry.projection import projected
 
 TRIANGULATION_STEPS = 8
@@ -20,8 +20,8 @@ def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     """Return the point nearest to all rays of each of ``count`` points (metres, world), by linear least squares."""
     d = sightings.directions()
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
-    matrix = _summed(across, sightings.point, count)
-    right = _summed((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
+    matrix = summed(across, sightings.point, count)
+    right = summed((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
     return torch.linalg.solve(_damped(matrix), right)
 
 
@@ -48,15 +48,15 @@ def _normal_equations(
     weight = front * inlier_weight(off.square().sum(-1), scale)
     jacobian = torch.from_numpy(seen.by_point(sightings.focal.numpy())) @ sightings.rotation
     weighted = jacobian.mT * weight[:, None, None]
-    matrix = _summed(weighted @ jacobian, sightings.point, len(points))
-    return matrix, _summed((weighted @ off[..., None])[..., 0], sightings.point, len(points))
+    matrix = summed(weighted @ jacobian, sightings.point, len(points))
+    return matrix, summed((weighted @ off[..., None])[..., 0], sightings.point, len(points))
 
 
 def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """Return twice the largest angle (radians) between a point's rays and their mean; 0 for points without observations."""
     away = points[sightings.point] - sightings.centre
     d = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
-    mean = _summed(d, sightings.point, len(points))
+    mean = summed(d, sightings.point, len(points))
     mean = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
     off = torch.linalg.vector_norm(torch.linalg.cross(d, mean[sightings.point]), dim=-1)
     largest = torch.zeros(len(points), dtype=d.dtype)
@@ -85,7 +85,3 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
 def _damped(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
     return matrix + DAMPING * size[:, None, None] * torch.eye(3, dtype=matrix.dtype)
-
-
-def _summed(values: Tensor, index: Tensor, count: int) -> Tensor:
-    return torch.zeros((count, *values.shape[1:]), dtype=values.dtype).index_add_(0, index, values)

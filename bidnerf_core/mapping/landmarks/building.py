@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames.frame import SeenLandmarks, View
 from bidnerf_core.geometry.robust import chi_squared_quantile, inlier_weight
@@ -32,14 +31,12 @@ from bidnerf_core.mapping.landmarks.features import (
     Features,
     FoundOnce,
     Sift,
-    detected,
     find_features,
-    visible_keypoints,
 )
-from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, measured_depth, placed
+from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints, image_keypoints
+from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, placed
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
 from bidnerf_core.mapping.landmarks.tracks import (
-    PosedKeypoints,
     TrackedKeypoints,
     epipolar_matches,
     fused_landmarks,
@@ -96,7 +93,7 @@ def pose_updates(
     updates = {}
     for number in (torch.bincount(image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0].tolist():
         own = (image == number).nonzero()[:, 0]
-        T = tracked.images[number].T_world_camera
+        T = tracked.images[number].T_ref_camera
         views = float(seen[own].mean())
         found = resect(observed_at_rest(sightings[own], positions, T), T, noise)
         update = (T.inverse() @ found.T_world_rig).log()
@@ -165,10 +162,9 @@ def build_landmarks(
 
 @dataclass(frozen=True, eq=False)
 class TrackedViews:
-    """The keypoints of posed images, joined into tracks, with the depth measured at each keypoint."""
+    """The keypoints of posed images, joined into tracks."""
 
     observations: TrackedKeypoints
-    depth: Float[Tensor, "k"]  # metres, of all keypoints by number; 0 where none was measured
     features: str | Features = USUAL_FEATURES  # the detector of the keypoints: its name, if it is registered
 
     @property
@@ -184,7 +180,7 @@ class TrackedViews:
         self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None
     ) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
-        found = _located(self.observations, self.depth, config)
+        found = _located(self.observations, config)
         if not len(found):
             images = len(self.observations.images)
             raise InputError(
@@ -208,7 +204,7 @@ class TrackedViews:
     @property
     def T_world_camera(self) -> SE3:
         """The poses of the images (v)."""
-        return SE3.stack([image.T_world_camera for image in self.observations.images])
+        return SE3.stack([image.T_ref_camera for image in self.observations.images])
 
     @property
     def matched(self) -> TrackedKeypoints:
@@ -224,15 +220,18 @@ class TrackedViews:
         """Return the tracks with other poses of the images (v), and with other motions if given."""
         motion = self.motion if motion is None else motion
         images = [
-            replace(p, T_world_camera=T_world_camera[i], motion=motion[i])
+            replace(p, T_ref_camera=T_world_camera[i], motion=motion[i])
             for i, p in enumerate(self.observations.images)
         ]
         return replace(self, observations=replace(self.observations, images=images))
 
     def at_distance(self, distance: float) -> TrackedViews:
         """Return the tracks with a measured ``distance`` (metres) from the camera for every keypoint."""
-        rays = torch.cat([image.rays for image in self.observations.images])
-        return replace(self, depth=distance / torch.linalg.vector_norm(rays, dim=-1))
+        images = [
+            replace(p, depth=distance / torch.linalg.vector_norm(p.rays, dim=-1))
+            for p in self.observations.images
+        ]
+        return replace(self, observations=replace(self.observations, images=images))
 
     def matched_anew(
         self, config: LandmarkConfig, progress: Callable[[int, int], None] = lambda done, total: None
@@ -242,7 +241,7 @@ class TrackedViews:
         ``progress`` is called with the number of image pairs done, starting at 0, and the total.
         """
         images = self.observations.images
-        pairs = _pairs([image.T_world_camera for image in images], config)
+        pairs = _pairs([image.T_ref_camera for image in images], config)
         progress(0, len(pairs))
         return replace(self, observations=_joined(images, pairs, _Counter(progress, len(pairs))))
 
@@ -268,14 +267,13 @@ def tracked_views(
         raise InputError("nothing to build landmarks from: expected at least one view")
     pairs = _pairs([view.T_ref_camera for view in views], config)
     counter = _Counter(progress, len(views) + len(pairs))
-    images = counter.over(_mapped(lambda view: _detected(view, detector), views))
+    images = counter.over(_mapped(lambda view: image_keypoints(view, detector), views))
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
         raise PluginError(
             f"descriptors have {enumeration([*map(str, lengths)])} channels in different images, expected the same number"
         )
-    depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
-    return TrackedViews(_joined(images, pairs, counter), torch.cat(depth), features)
+    return TrackedViews(_joined(images, pairs, counter), features)
 
 
 def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
@@ -286,7 +284,7 @@ def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
     return pairs
 
 
-def _joined(images: Sequence[PosedKeypoints], pairs: list[list[int]], counter: _Counter) -> TrackedKeypoints:
+def _joined(images: Sequence[ImageKeypoints], pairs: list[list[int]], counter: _Counter) -> TrackedKeypoints:
     """Match the keypoints of the pairs of images, and join the matches into tracks."""
     matches = counter.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
     found = [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)]
@@ -294,25 +292,12 @@ def _joined(images: Sequence[PosedKeypoints], pairs: list[list[int]], counter: _
     return TrackedKeypoints(images, label, torch.arange(len(label)))
 
 
-def posed_keypoints(views: Sequence[View], features: Features) -> list[PosedKeypoints]:
+def posed_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
     """Detect the keypoints of ``views`` without matching them."""
-    return list(_mapped(lambda view: _detected(view, features), views))
+    return list(_mapped(lambda view: image_keypoints(view, features), views))
 
 
-def _detected(view: View, features: Features) -> PosedKeypoints:
-    intrinsics = view.frame.intrinsics
-    keypoints = visible_keypoints(detected(features, view.frame.rgb), view.frame.hidden)
-    rays = intrinsics.unproject(keypoints.pixels.double())
-    focal = (intrinsics.fx * intrinsics.fy) ** 0.5
-    return PosedKeypoints(
-        keypoints, rays, focal, view.T_ref_camera.to("cpu", torch.float64),
-        exposure_times(keypoints.pixels.double(), intrinsics), AT_REST if view.motion is None else view.motion,
-    )  # fmt: skip
-
-
-def _located(
-    observations: TrackedKeypoints, depth: Float[Tensor, "k"], config: LandmarkConfig
-) -> LandmarkMap:
+def _located(observations: TrackedKeypoints, config: LandmarkConfig) -> LandmarkMap:
     """Return the triangulated landmarks, followed by the remaining keypoints' landmarks from measured depth."""
     kept, positions, covariance = _triangulated(observations, radians(config.parallax))
     sightings = kept.sightings
@@ -321,10 +306,10 @@ def _located(
         fused_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
         pose_covariance=pose_scatter(kept, positions, pixel_noise),
     )
-    relative = keypoint_depth_noise(sightings, positions, depth[kept.number])
+    relative = keypoint_depth_noise(kept, positions)
     left = ~torch.isin(observations.number, kept.number)
     rest = observations[left & (_tracked(observations) | config.singles)]
-    rest, positions, covariance = placed(rest, depth[rest.number], relative, pixel_noise)
+    rest, positions, covariance = placed(rest, relative, pixel_noise)
     return concatenated([triangulated, fused_landmarks(rest, positions, covariance, pixel_noise)])
 
 

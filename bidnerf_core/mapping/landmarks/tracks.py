@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import AT_REST, poses_of_rows
+from bidnerf_core.camera.rolling_shutter import poses_of_rows
 from bidnerf_core.frames.frame import SeenLandmarks, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.observations import Sightings
-from bidnerf_core.mapping.landmarks.features import MANY, Keypoints, byte_of_zero, squared_distances
+from bidnerf_core.mapping.landmarks.features import MANY, byte_of_zero, squared_distances
+from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 EPIPOLAR_BAND = 2.0
@@ -78,18 +79,6 @@ def _by_similarity(poses: Sequence[SE3]) -> Iterator[Int[Tensor, "r v"]]:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedKeypoints:
-    """The keypoints of an image, as undistorted rays, and the pose of its camera."""
-
-    keypoints: Keypoints
-    rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
-    focal: float  # pixels
-    T_world_camera: SE3  # float64; of the middle row
-    exposure_times: Float[Tensor, "n"]  # of the keypoints, float64; see ``rolling_shutter``
-    motion: Float[Tensor, "6"] = AT_REST  # during the readout; epipolar lines ignore it
-
-
-@dataclass(frozen=True, eq=False)
 class Matches:
     """Pairs of keypoints of two images that are similar and lie on each other's epipolar lines."""
 
@@ -97,7 +86,7 @@ class Matches:
     ambiguity: Float[Tensor, "p"]  # ratio of the best to the second-best descriptor distance
 
 
-def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
+def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
     """Return the pairs of keypoints of ``a`` and ``b`` that are mutual nearest neighbours near the epipolar lines.
 
     A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them matches
@@ -120,13 +109,13 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
     return Matches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
 
 
-def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
+def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
     """Return whether each keypoint of ``b`` lies near the epipolar half-line of each keypoint of ``a``.
 
     The half-line starts at the image of the ray's point at infinity. If the camera centres coincide, it reduces to that
     point.
     """
-    T_b_a = b.T_world_camera.inverse() @ a.T_world_camera
+    T_b_a = b.T_ref_camera.inverse() @ a.T_ref_camera
     rays, base = T_b_a.rotate(a.rays), T_b_a.translation
     front = rays[:, 2:].sign()
     start = rays[:, :2] / rays[:, 2:].abs().clamp(min=1e-9) * front
@@ -188,7 +177,7 @@ def _root(parent: list[int], number: int) -> int:
 class TrackedKeypoints:
     """Keypoints and the points that they observe. Keypoints are numbered consecutively over all images."""
 
-    images: Sequence[PosedKeypoints]
+    images: Sequence[ImageKeypoints]  # with poses T_world_camera
     point: Int[Tensor, "m"]
     number: Int[Tensor, "m"]  # of the keypoint
 
@@ -220,7 +209,7 @@ class TrackedKeypoints:
         """The keypoints as observations by cameras at the poses at which their rows were exposed."""
         image, motion = self.image, self.motion
         times = torch.cat([p.exposure_times for p in self.images])[self.number]
-        T = SE3.stack([p.T_world_camera for p in self.images])[image]
+        T = SE3.stack([p.T_ref_camera for p in self.images])[image]
         if bool(motion.any()):
             T = T @ poses_of_rows(times, motion[image])
         focal = torch.tensor([p.focal for p in self.images], dtype=torch.float64)
@@ -231,6 +220,11 @@ class TrackedKeypoints:
     def sizes(self) -> Float[Tensor, "m"]:
         """The diameters of the keypoints, pixels."""
         return torch.cat([p.keypoints.sizes for p in self.images])[self.number]
+
+    @property
+    def depth(self) -> Float[Tensor, "m"]:
+        """The depth measured at each keypoint, metres; 0 where none was measured."""
+        return torch.cat([p.depth for p in self.images])[self.number]
 
     @property
     def descriptors(self) -> UInt8[Tensor, "m d"]:
