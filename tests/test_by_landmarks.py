@@ -20,19 +20,20 @@ from bidnerf_core.localization import (
     LandmarkAnswer,
     LandmarkMatcher,
     LandmarkPose,
+    PointCloud,
     Problem,
     answer_by_landmarks,
     propose,
     rig,
 )
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_verdict
-from bidnerf_core.localization.by_depth import share_on_surface
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_verdict, surface_diagnostics
 from bidnerf_core.localization.by_landmarks import (
     SHARPEST,
     corrected,
     fused_answer,
     localization_by_landmarks,
 )
+from bidnerf_core.localization.covariance import finest_cost
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.fusion import FusedPose, Measurements
 from bidnerf_core.localization.landmarks.propose import Confirmation
@@ -279,41 +280,6 @@ def partly_hidden(depth: float = 1.0) -> View:
     return replace(unseen(), frame=replace(unseen().frame, depth=depth * measured, hidden=hidden))
 
 
-def test_measured_points_judge_doubtful_landmarks_where_something_hides_the_scene() -> None:
-    scene = textured_map(surface=True)
-    right = answer(partly_hidden(), map=scene)
-    off = right.T.retract(torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64))
-    wrong = replace(right, T=off, confidence=0.6)
-    there = replace(localized(unseen(), scene), T_world_camera=right.T)
-    hidden, clean = (rig(scene, [view], None) for view in (partly_hidden(), unseen()))
-    assert auto_module._is_doubtful(hidden, wrong)
-    assert not auto_module._is_doubtful(hidden, replace(wrong, confidence=0.97))
-    assert not auto_module._is_doubtful(clean, wrong)
-    assert auto_module._leaves_surface(hidden, there, wrong)
-    assert not auto_module._leaves_surface(hidden, there, right)
-    assert not auto_module._leaves_surface(clean, there, wrong)
-
-
-def test_landmarks_that_correct_the_intrinsics_are_not_compared_with_points_placed_by_the_wrong_ones() -> (
-    None
-):
-    scene = textured_map(surface=True)
-    right = replace(answer(unseen(), map=scene), confidence=0.6)
-    off = replace(right, T=right.T.retract(torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64)))
-    other = replace(CAMERA, fx=1.03 * CAMERA.fx, fy=1.03 * CAMERA.fy)
-    problem = rig(scene, [partly_hidden()], None)
-    assert auto_module._is_doubtful(problem, off)
-    assert not auto_module._is_doubtful(problem, replace(off, found=replace(off.found, intrinsics=other)))
-
-
-def test_the_more_certain_pose_is_kept() -> None:
-    landmarks, found = answer(unseen()), localized(unseen(), textured_map(surface=True))
-    for factor, surer in ((0.5, True), (2.0, False)):
-        judged = replace(found, covariance=factor * landmarks.full_covariance)
-        assert auto_module._is_surer(judged, landmarks) is surer
-    assert not auto_module._is_surer(replace(found, covariance=None), landmarks)
-
-
 def test_an_accepted_pose_is_settled_unless_landmarks_are_doubtful_beside_measured_points() -> None:
     found = localized(unseen(), textured_map(surface=True))
     assert found.converged
@@ -336,8 +302,11 @@ def test_landmarks_keep_the_scale_that_they_give_a_depth_sensor() -> None:
     found = replace(answer(view, map=scene), confidence=0.6)
     problem = rig(scene, [view], None)
     assert scene.surface is not None
-    share = share_on_surface(corrected(problem, found.found), scene.surface, found.T)
-    assert share > share_on_surface(problem, scene.surface, found.T) + 0.05
+    on_surface = []
+    for scaled in (problem, corrected(problem, found.found)):
+        cloud = PointCloud.measured(scaled.views, None, 1000, torch.Generator().manual_seed(0))
+        on_surface.append(surface_diagnostics(finest_cost(scene.surface, cloud), found.T, 1.0).on_surface)
+    assert on_surface[1] > on_surface[0] + 0.05
     assert_within(found.T, 0.02, 0.5)
 
 

@@ -14,7 +14,6 @@ from bidnerf_core.frames.pixels import drawer
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization
 from bidnerf_core.localization.alternatives import mirror_image
-from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.landmarks.guided import projected_landmarks
 from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
 from bidnerf_core.mapping.geometry.calibration import GIVEN
@@ -173,13 +172,6 @@ def test_a_pose_is_found_behind_something_of_which_more_was_measured(
 def test_a_clean_image_is_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bidnerf_core.localization.auto.nearest_piece", None)  # not called
     assert found_for(baked.unseen()[0]).converged
-
-
-def test_poses_are_compared_by_the_points_on_the_surface() -> None:
-    view = baked.unseen()[0]
-    problem, true = baked.problem(view), view.T_ref_camera
-    off = true.retract(torch.tensor([0.0, 0.0, 0.2, 0.0, 0.0, 0.0], dtype=torch.float64))
-    assert share_on_surface(problem, baked.toy(), true) > share_on_surface(problem, baked.toy(), off) + 0.2
 
 
 @pytest.mark.parametrize("name", ["uniform", "interest-points", "interest-regions"])

@@ -16,14 +16,13 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,
-    SurfaceThresholds,
     landmark_verdict,
     without_ambiguous_intrinsics,
 )
 from bidnerf_core.localization.alternatives import decide
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
 from bidnerf_core.localization.by_colour import without_the_imprecise
-from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
+from bidnerf_core.localization.by_depth import localized_by_depth
 from bidnerf_core.localization.by_image_search import localized_by_images
 from bidnerf_core.localization.by_landmarks import (
     MOSTLY_ON_SURFACE,
@@ -33,8 +32,6 @@ from bidnerf_core.localization.by_landmarks import (
     localization_by_landmarks,
 )
 from bidnerf_core.localization.confidence import TRUSTED
-from bidnerf_core.localization.covariance import position_deviation
-from bidnerf_core.localization.depth_scale import corrected
 from bidnerf_core.localization.first_order import BidConfig, bid
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
@@ -53,14 +50,12 @@ fails too.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
 """Outcomes of a pose that landmarks determine with too little accuracy or confidence."""
-MOST_POINTS_LOST = 0.05
-"""Maximum fraction of the measured points that landmarks may move off the surface."""
 IN_FRONT = 0.9
 """Minimum fraction of an occluder's points that must lie in front of the surface."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=math.inf)
 """Thresholds for landmarks that match near a pose found by other means."""
-LEAST_SUPPORT, LEAST_TO_MOVE = 0.5, 0.8
-"""Minimum confidences for landmarks to support a pose accepted on the surface, and to move a pose by depth."""
+LEAST_SUPPORT = 0.5
+"""Minimum confidence of landmarks that support a pose accepted on the surface."""
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
@@ -119,11 +114,10 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
     if matcher is not None:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
     has_points = _measured_points(problem) >= LEAST_POINTS
-    doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
     by_landmarks = None
     if answer is not None:
         by_landmarks = _Proposal(localization_by_landmarks(problem, answer, began), decided=True)
-        if not doubtful and _is_final(answer, has_points):
+        if _is_final(answer, has_points):
             return by_landmarks
         if problem.start is None:
             problem = replace(problem, start=answer.T)  # one more place to look
@@ -134,13 +128,6 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
         return _Proposal(found, confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True).pose)
     if has_points:
         found = localized_by_depth(problem, problem.surface, config, seed)
-        if (
-            answer is not None
-            and by_landmarks is not None
-            and answer.verdict.accepted
-            and not (found.converged and _leaves_surface(problem, found, answer))
-        ):
-            return by_landmarks
     else:
         found = localized_by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
@@ -167,16 +154,6 @@ def _is_settled(found: Localization) -> bool:
     if not found.converged or not isinstance(said, LandmarkDiagnostics) or said.on_surface is None:
         return found.converged
     return (found.confidence or 0.0) >= TRUSTED and said.on_surface >= MOSTLY_ON_SURFACE
-
-
-def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
-    """Return whether landmarks of a partly hidden scene gave a pose at which the measured points are off the surface."""
-    if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
-        return False
-    if not _partly_hidden(problem) or not _keeps_points(problem, answer.found):
-        return False
-    there = share_on_surface(corrected(problem, answer.found, answer.depth_factor), problem.surface, answer.T)
-    return there < SurfaceThresholds().on_surface
 
 
 def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
@@ -206,26 +183,18 @@ def _compared_with_landmarks(
     seed: int,
     began: float,
 ) -> _Proposal:
-    """Refine a pose found on the surface by the landmarks that match there, or reject it if too few of the visible ones match.
-
-    Landmarks with a confidence below ``LEAST_TO_MOVE`` confirm an accepted pose by depth, but do not move it if the measured
-    points determine it better.
-    """
+    """Refine a pose found on the surface by the landmarks that match there, or reject it if too few of the visible ones match."""
     near = confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True)
     if near.pose is not None and (record := current_record()) is not None:
         record.landmarks.append(near.pose)
     verdict = None if near.pose is None else landmark_verdict(near.pose, WITHOUT_SEARCH)
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
-        confidence = answer.confidence or 0.0
-        supported = found.converged and confidence >= LEAST_SUPPORT
-        answer = replace(answer, verdict=verdict) if supported else answer
-        refined = localization_by_landmarks(problem, answer, began)
-        stays = found.converged and _leaves_surface(problem, found, answer)
-        if supported and confidence < LEAST_TO_MOVE and _is_surer(found, answer):
-            stays = stays or _keeps_points(problem, near.pose)
-        refined = replace(refined, reason=f"found on the surface; {refined.reason}")
-        return _Proposal(found if stays else refined, near.pose)
+        supported = found.converged and (answer.confidence or 0.0) >= LEAST_SUPPORT
+        refined = localization_by_landmarks(
+            problem, replace(answer, verdict=verdict) if supported else answer, began
+        )
+        return _Proposal(replace(refined, reason=f"found on the surface; {refined.reason}"), near.pose)
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         found = replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
@@ -237,36 +206,6 @@ def _compared_with_landmarks(
 def _is_misled(near: Verdict, problem: Problem) -> bool:
     """Return whether landmarks contradict the intrinsics of a pose by colour, as wrong intrinsics fit at a wrong pose."""
     return near.outcome is Outcome.MISCALIBRATED and _measured_points(problem) < LEAST_POINTS
-
-
-def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:
-    """Return whether landmarks would move a pose found on the surface so that fewer measured points lie on it."""
-    if problem.surface is None or not _partly_hidden(problem) or _measured_points(problem) < LEAST_POINTS:
-        return False
-    before = share_on_surface(problem, problem.surface, found.T_world_camera)
-    after = share_on_surface(corrected(problem, answer.found, answer.depth_factor), problem.surface, answer.T)
-    return after < before - MOST_POINTS_LOST
-
-
-def _is_surer(found: Localization, answer: LandmarkAnswer) -> bool:
-    """Return whether the position is more certain by depth than by landmarks."""
-    if found.covariance is None:
-        return False
-    return position_deviation(found.covariance) < position_deviation(answer.full_covariance)
-
-
-def _keeps_points(problem: Problem, found: LandmarkPose) -> bool:
-    """Return whether there are measured points, and landmarks do not correct the intrinsics used to back-project them."""
-    kept = found.intrinsics_of(problem.views[-1].frame.intrinsics) is None
-    return kept and _measured_points(problem) >= LEAST_POINTS
-
-
-def _partly_hidden(problem: Problem) -> bool:
-    """Return whether part of the scene is hidden, so that few landmarks are left and measured points matter more.
-
-    Otherwise, landmarks are trusted more than the scale of a depth sensor.
-    """
-    return any(view.frame.hidden is not None for view in problem.views)
 
 
 def _measured_points(problem: Problem) -> int:

@@ -126,14 +126,6 @@ def _refined(
     return replace(found, T=steps.poses[-1:], scores=scores[-1:], path=path), steps.inliers
 
 
-@torch.no_grad()
-def share_on_surface(problem: Problem, surface: SurfaceMap, T_world_camera: SE3) -> float:
-    """Return the fraction of the measured points that lie on the surface at a pose."""
-    cloud = PointCloud.measured(problem.views, problem.depth_rays, JUDGED_POINTS, Generator().manual_seed(0))
-    judge = finest_cost(surface, cloud)
-    return float(judge.inliers(judge.correspondences(T_world_camera[None]))[0].mean())
-
-
 STRONGEST, MOST_BIAS = 4.0, 0.25
 """Maximum gain (its inverse is the minimum) and maximum bias of an exposure: two stops, and a quarter of the range."""
 LEAST_COLOURED = 0.2
