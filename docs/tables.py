@@ -767,6 +767,41 @@ def service(records: Records) -> str:
 
 
 @table
+def viewer(records: Records) -> str:
+    """How soon the viewer draws maps, and how quickly it answers while photos are localized."""
+    maps = {
+        "viewer_demo": "demo",
+        "viewer_lego": "Lego",
+        "viewer": "room",
+        "viewer_tum": "TUM",
+        "viewer_corridor": "corridor",
+    }
+    rows = []
+    for name, title in maps.items():
+        result = records[name]
+        usual, longest = result["median"], max(each["largest_ms"] for each in result["rounds"])
+        rows.append(
+            (
+                title,
+                f"{result['surfels']:,}",
+                f"{usual['first_picture_seconds']:.1f} s",
+                f"{usual['frames_a_second']:.0f}",
+                f"{usual['median_ms']:.1f} / {longest:.0f} ms",
+                f"{result['server_mebibytes_added']:.0f} / {usual['page_mebibytes']:.0f} MiB",
+            )
+        )
+    head = (
+        "map",
+        "surfels",
+        "first picture",
+        "frames a second",
+        "answers, median / longest",
+        "memory, server / page",
+    )
+    return _table(head, rows, records)
+
+
+@table
 def masks(records: Records) -> str:
     """A person in half of the images, with and without masks."""
     result = records["masks"]
