@@ -61,7 +61,7 @@ def made_steps(
     """Return the steps of ``bid`` that start 0.1 units from the first test frame's pose."""
     stored, dataset = opened(folder, data)
     there = None if device.type == "cpu" else device
-    scene = Localizer(stored, "bid", device=there, warm_up=False).map
+    scene = Localizer(stored, "bid", device=there, warm_up=False).scene
     view = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0]
     problem = rig(scene, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
     usual = METHODS["bid"].settings("paper-scene")

@@ -208,8 +208,8 @@ class GicpFromLast:
     def __init__(self, localizer: Localizer) -> None:
         import small_gicp
 
-        assert localizer.map.surface is not None
-        self._gicp, self._localizer, self._surface = small_gicp, localizer, localizer.map.surface
+        assert localizer.scene.surface is not None
+        self._gicp, self._localizer, self._surface = small_gicp, localizer, localizer.scene.surface
         self._voxel = 2 * self._surface.cell
         self._target, self._tree = small_gicp.preprocess_points(
             self._surface.surfels.positions.double().numpy(), self._voxel, num_threads=1

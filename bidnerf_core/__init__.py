@@ -99,7 +99,7 @@ if TYPE_CHECKING:
     from bidnerf_core.service.client import ServiceError as ServiceError
     from bidnerf_core.service.server import serve as serve
     from bidnerf_core.service.server import service_app as service_app
-    from bidnerf_core.service.settings import ServiceConfig as ServiceConfig
+    from bidnerf_core.service.settings import ServiceLimits as ServiceLimits
     from bidnerf_core.structure.poses import find_poses as find_poses
     from bidnerf_core.structure.record import FoundPoses as FoundPoses
     from bidnerf_core.training import Supervision as Supervision
@@ -149,8 +149,8 @@ HOMES = {
     "ScaleFit": "maps.scaling",
     "SceneBounds": "fields.contract",
     "ServiceClient": "service.client",
-    "ServiceConfig": "service.settings",
     "ServiceError": "service.client",
+    "ServiceLimits": "service.settings",
     "Stratified": "fields.sampling",
     "Supervision": "training",
     "SupervisionConfig": "training",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -111,10 +113,45 @@ def test_wrong_arguments_are_told_in_a_line(bidnerf: Run, words: list[str], mess
     assert err.endswith(f"; 'bidnerf {words[0]} --help' describes all arguments\n")
 
 
-def test_a_parser_without_the_hook_tells_it_in_its_own_way(
-    bidnerf: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def _without_the_hook(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("tyro._errors.on_parse_error")
-    status, _, err = bidnerf("info", "m", "--nonsense")
-    assert status == 2
-    assert "Unrecognized options" in err
+
+
+def _without_the_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("tyro._errors")
+    monkeypatch.setitem(sys.modules, "tyro._errors", None)
+
+
+def _with_other_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextlib.contextmanager
+    def registered(hook: Any) -> Iterator[None]:
+        yield hook(type("MissingArgs", (), {})())
+
+    monkeypatch.setattr("tyro._errors.on_parse_error", registered)
+
+
+@pytest.mark.parametrize("changed", [_without_the_hook, _without_the_module, _with_other_events])
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["info", "m", "--jsn"], "no option '--jsn', did you mean '--json'?"),
+        (["info", "m", "extra"], "Unrecognized options: extra"),
+        (["train", "d"], "Missing from bidnerf train: --out MAP folder for the map"),
+        (["localize", "m", "p", "--focal=abc"], "Error parsing --focal: "),
+    ],
+)
+def test_refusals_are_a_line_with_another_version_of_the_parser_too(
+    bidnerf: Run, monkeypatch: pytest.MonkeyPatch, changed: Any, words: list[str], message: str
+) -> None:
+    changed(monkeypatch)
+    status, out, err = bidnerf(*words)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"bidnerf {words[0]}: {message}")
+    assert err.endswith(f"; 'bidnerf {words[0]} --help' describes all arguments\n")
+    assert err.isascii()
+
+
+def test_settings_that_contradict_are_told_in_a_line(bidnerf: Run) -> None:
+    status, out, err = bidnerf("serve", "m", "--timeout", "0")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "timeout is 0.0, expected a positive number" in err

@@ -77,7 +77,7 @@ def test_every_tensor_of_a_map_moves(backend: str) -> None:
     with Elsewhere():
         there = stored.to(DEVICE)
         assert elsewhere_of(there, DEVICE) == []
-        assert elsewhere_of(Localizer(there, "bid").map, DEVICE) == []  # what is cached lies there too
+        assert elsewhere_of(Localizer(there, "bid").scene, DEVICE) == []  # what is cached lies there too
         assert sum(1 for _ in tensors_in(there)) >= sum(1 for _ in tensors_in(stored))
     assert elsewhere_of(stored, CPU) == []
 
@@ -98,13 +98,13 @@ def test_what_lies_there_already_is_not_copied() -> None:
     assert stored.surface is not None
     assert stored.surface.to(CPU) is stored.surface
     assert landmarks().to("cpu") is landmarks()
-    assert Localizer(stored, "bid", device="cpu", warm_up=False).map is stored
+    assert Localizer(stored, "bid", device="cpu", warm_up=False).scene is stored
 
 
 def test_parts_may_be_missing_and_a_field_that_cannot_move_is_refused() -> None:
     bare = FieldMap(module_fields.field(), baked.BOUNDS)
     with Elsewhere():
-        assert elsewhere_of(Localizer(bare, "bid", device=DEVICE, warm_up=False).map, DEVICE) == []
+        assert elsewhere_of(Localizer(bare, "bid", device=DEVICE, warm_up=False).scene, DEVICE) == []
     ball = FieldMap(HomogeneousBall(0.5, 10.0), baked.BOUNDS)
     with pytest.raises(InputError, match=r"HomogeneousBall, expected an nn\.Module"):
         Localizer(ball, "bid", device="cpu")

@@ -31,6 +31,7 @@ QUICK: dict[str, Any] = {
     "protocol": "bid",
     "sizes": [0.3],
 }
+COMPARED = {name: value for name, value in QUICK.items() if name != "sizes"}
 WORDS = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--size", "0.3", "--workers", "1"]
 BLOBS = "demo:blobs"
 
@@ -181,6 +182,42 @@ def test_masks_hide_parts_of_the_images_in_every_trial(folder: Path, tmp_path: P
     compared = bn.compare([scene], data, method="bid", config=QUICK["config"], protocol="bid", size=0.3, trials=2,
                           seed=5, masks=masks)  # fmt: skip
     assert timeless(compared.results[0]) == timeless(black)
+
+
+def test_frames_that_masks_hide_wholly_are_named_and_left_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, data, masks = folder / "map", folder / "data", tmp_path / "masks"
+    masks.mkdir()
+    names = open_dataset(data).frame_names("test")
+    for name in names:
+        shade = 0 if name == names[0] else 255
+        iio.imwrite(masks / f"{name}.png", np.full((tiny.SIZE, tiny.SIZE), shade, np.uint8))
+    words = [str(scene), str(data), *WORDS, "--masks", str(masks)]
+    assert main(["evaluate", *words, "--trials", "6", "--out", str(tmp_path / "r.jsonl")]) == 0
+    told = f"masks hide 1 whole frame of {len(names)}, not tried: {names[0]}\n"
+    assert capsys.readouterr().err.count(told) == 1
+    assert {row.frame for row in read_results([tmp_path / "r.jsonl"])} == set(names[1:])
+    with pytest.warns(bn.InputWarning, match="1 whole frame"):
+        found = bn.compare([bn.load_map(scene)], data, **COMPARED, trials=6, masks=masks)
+    assert {row.frame for row in found.results[0]} == set(names[1:])
+    with pytest.raises(bn.InputError, match=f"not tried: {names[0]}; .*inverted"):
+        bn.evaluate(scene, data, **QUICK, frames=names[:1], masks=masks)
+
+
+def test_all_splits_are_evaluated_together(folder: Path, tmp_path: Path) -> None:
+    data = open_dataset(folder / "data")
+    count = sum(len(data.frame_names(split)) for split in data.splits)
+    words = ["evaluate", str(folder / "map"), str(folder / "data"), *WORDS, "--split", "all"]
+    assert main([*words, "--trials", str(count), "--out", str(tmp_path / "r.jsonl")]) == 0
+    rows = read_results([tmp_path / "r.jsonl"])
+    assert {row.trial.split for row in rows} == {"all"}
+    assert len({row.frame for row in rows}) == count
+    for given in (folder / "data", data):
+        found = bn.evaluate(folder / "map", given, **QUICK, split="all", trials=count)
+        assert timeless(found.rows) == timeless(rows)
+    compared = bn.compare([bn.load_map(folder / "map")], data, **COMPARED, split="all", trials=2)
+    assert compared.split == "all"
 
 
 def test_folders_without_masks_are_refused(

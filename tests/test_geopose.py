@@ -176,12 +176,15 @@ def test_a_rejected_pose_is_never_a_geopose() -> None:
 
 def test_the_last_prior_pose_is_the_start() -> None:
     prior = asked(BUDAPEST, localization())[0]["body"]
-    _, upload = asked(BUDAPEST, localization(), priorPoses=[{"geopose": {}}, prior])
+    elsewhere = {"geopose": {**prior["geopose"], "position": {"lat": 1.0, "lon": 2.0, "h": 3.0}}}
+    _, upload = asked(BUDAPEST, localization(), priorPoses=[elsewhere, prior])
     start = torch.tensor(json.loads(upload.blocks["start"])["T_world_camera"], dtype=torch.float64)
     assert torch.allclose(start, POSE.matrix(), atol=1e-6)
     assert "start" not in asked(None, localization(), priorPoses=[prior])[1].blocks
-    with pytest.raises(InputError, match="no 'lat'"):
-        asked(BUDAPEST, localization(), priorPoses=[{"geopose": {}}])
+    for anchor in (BUDAPEST, None):  # with which it would be of no use either
+        for wrong in ([{"geopose": {}}], [{"geopose": {}}, prior]):
+            with pytest.raises(InputError, match="no 'lat'"):
+                asked(anchor, localization(), priorPoses=wrong)
 
 
 def test_raw_pixels_are_an_image() -> None:

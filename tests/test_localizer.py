@@ -145,23 +145,24 @@ def test_a_bad_query_is_refused_in_one_line(query: Any, start: Any, message: str
 
 
 @pytest.mark.parametrize(
-    ("map", "method", "config", "message"),
+    ("scene", "method", "config", "message"),
     [
         ("maps/room", "auto", None, r"Localizer: got a str, expected a Map; load_map\(folder\) gives one"),
         (Path("maps/room"), "auto", None, r"Localizer: got a PosixPath, expected a Map; load_map\(folder\)"),
         (FIELD, "auto", None, "Localizer: got a GaussianBlobs, expected a Map$"),
         (None, "auto", None, "Localizer: got a NoneType, expected a Map$"),
         (MAP, "icp", None, "no method 'icp'; installed: auto, bid, bid-lm, inerf, inerf-lm"),
-        (MAP, "bid", AutoConfig(), "method 'bid' takes a BidConfig, got a AutoConfig"),
-        (MAP, "bid", {"rays": 5}, r"takes a BidConfig, got a dict; settings_of\('bid', ...\) makes"),
+        (MAP, "bid", AutoConfig(), "method 'bid' takes a BidConfig or a dictionary, got a AutoConfig"),
+        (MAP, "bid", 5, "method 'bid' takes a BidConfig or a dictionary, got a int"),
+        (MAP, "bid", {"ray": 5}, "config: BidConfig has no setting 'ray'"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
 def test_a_bad_map_or_method_is_refused_when_the_localizer_is_made(
-    map: Any, method: str, config: Any, message: str
+    scene: Any, method: str, config: Any, message: str
 ) -> None:
     with pytest.raises(InputError, match=message) as raised:
-        Localizer(map, method, config)
+        Localizer(scene, method, config)
     assert "\n" not in str(raised.value)
 
 
@@ -170,6 +171,14 @@ def test_settings_are_the_methods_own_by_default(method: str) -> None:
     made = Localizer(MAP, method)
     assert made.config == METHODS[method].config_type()
     assert made.method == method
+
+
+def test_a_dictionary_changes_the_settings_that_it_names() -> None:
+    assert Localizer(MAP, "bid", {"rays": 64, "max_steps": 3, "level": None}, warm_up=False).config == FEW
+    given = Localizer(MAP, "bid", {"rays": 64}, preset="paper", warm_up=False).config
+    assert given == settings_of("bid", {"rays": 64}, preset="paper")
+    with pytest.raises(InputError, match="got both preset 'paper' and a BidConfig"):
+        Localizer(MAP, "bid", FEW, preset="paper")
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:
@@ -221,12 +230,12 @@ def test_a_device_that_is_another_one_gets_a_copy_of_the_field() -> None:
     before = {name: value.clone() for name, value in field.state_dict().items()}
     with Elsewhere():
         moved = Localizer(own, "bid", device=DEVICE, warm_up=False)
-        assert {p.device for p in moved.map.field.parameters()} == {DEVICE}  # type: ignore[attr-defined]
+        assert {p.device for p in moved.scene.field.parameters()} == {DEVICE}  # type: ignore[attr-defined]
     assert own.field is field
-    assert moved.map is not own
+    assert moved.scene is not own
     assert {p.device.type for p in field.parameters()} == {"cpu"}
     assert all(torch.equal(value, before[name]) for name, value in field.state_dict().items())
-    assert Localizer(own, "bid", device="cpu", warm_up=False).map is own
+    assert Localizer(own, "bid", device="cpu", warm_up=False).scene is own
 
 
 def test_a_field_that_cannot_be_moved_is_named() -> None:

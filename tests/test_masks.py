@@ -20,6 +20,8 @@ from bidnerf_core.camera.source import Raster
 from bidnerf_core.captures.photos import photo_measures
 from bidnerf_core.carving.free_space import FreeSpace
 from bidnerf_core.datasets import MaskFolder
+from bidnerf_core.datasets.masked import wholly_hidden
+from bidnerf_core.datasets.whole import with_all
 from bidnerf_core.fields.rendering import RenderedImage
 from bidnerf_core.frames.masks import WhollyHidden, masks_sentence, read_mask
 from bidnerf_core.frames.pixels import DrawerName, drawer
@@ -171,6 +173,12 @@ def test_mask_path_and_dynamic_masks_are_read(tmp_path: Path) -> None:
     with pytest.raises(WhollyHidden):  # the one hides the left, the other the rest
         opened.views("train", names[:1])
     assert [view.frame.name for view in opened.views("train")] == names[1:]
+    assert wholly_hidden(opened, "train") == []  # neither mask hides everything by itself
+    saved(data / "masks" / f"{names[1]}.png", np.zeros((48, 48), np.uint8))
+    assert wholly_hidden(opened, "train") == names[1:2]
+    whole = with_all(opened, "all")
+    assert wholly_hidden(whole, "all") == names[1:2]
+    assert names[1] not in [view.frame.name for view in whole.views("all")]
 
 
 def test_a_folder_of_masks_serves_datasets_and_sequences(tmp_path: Path) -> None:

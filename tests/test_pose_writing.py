@@ -154,6 +154,16 @@ def test_heads_state_the_direction_of_the_poses_and_no_unit_where_there_is_no_po
     assert "camera to world" not in head
 
 
+@pytest.mark.parametrize(("unit", "written"), [("metres", "[m]"), ("units", "[units]")])
+def test_the_head_of_euroc_poses_names_the_unit_of_the_map(unit: Any, written: str, tmp_path: Path) -> None:
+    metric, asked = (
+        PosedImage(name, 0, CAMERA, SE3.identity(), unit=of) for name, of in (("a", "metres"), ("b", unit))
+    )
+    write_poses(tmp_path / "path.euroc.csv", [metric, asked])
+    head = (tmp_path / "path.euroc.csv").read_text().splitlines()[0]
+    assert head.split(",")[1:4] == [f"p_RS_R_{axis} {written}" for axis in "xyz"]
+
+
 def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         InputError,

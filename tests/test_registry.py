@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 
 from bidnerf_core.backend import Backend, load_backend
+from bidnerf_core.cli import _warnings_as_lines
 from bidnerf_core.datasets import Dataset, Reader, ReadOptions, open_dataset, open_sequence
 from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.errors import InputError, InputWarning
@@ -559,6 +561,26 @@ def test_a_reader_that_fails_is_named_and_passed_over(site: Site, tmp_path: Path
     register("readers", "sound", Claiming())
     with pytest.warns(InputWarning):
         assert find_reader(tmp_path) is load_plugin("readers", "sound")
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_a_command_reports_a_broken_plugin_once(
+    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site.module("stranger_broken.py", "raise RuntimeError('no driver')")
+    site.metadata("stranger", "1.0", "[bidnerf.readers]\nbroken = stranger_broken:reader\n")
+    with _warnings_as_lines("bidnerf localize"):
+        for name in ("first", "second", "third"):
+            (tmp_path / name).mkdir()
+            assert find_reader(tmp_path / name) is None
+        warnings.warn("another remark", InputWarning, stacklevel=1)
+    told = capsys.readouterr().err.splitlines()
+    assert (
+        sum("reader 'broken' (stranger_broken:reader, from stranger 1.0): cannot be" in line for line in told)
+        == 1
+    )
+    assert len(set(told)) == len(told)
+    assert told[-1] == "bidnerf localize: another remark"
 
 
 @pytest.mark.usefixtures("nothing_registered", "unchecked")

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import socket
@@ -29,11 +31,12 @@ import tiny
 from bidnerf_core import (
     InputError,
     ServiceClient,
-    ServiceConfig,
     ServiceError,
+    ServiceLimits,
     open_dataset,
     serve,
     service_app,
+    settings_of,
 )
 from bidnerf_core.cli import main
 from bidnerf_core.service.access import Access
@@ -44,7 +47,7 @@ from bidnerf_core.service.server import named
 from commands import Run
 
 QUICK = {"max_steps": 3, "rays": 64}
-CONFIG = ServiceConfig(
+LIMITS = ServiceLimits(
     workers=1, queue=3, timeout=120.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0
 )
 FORM = "multipart/form-data; boundary=xyz"
@@ -71,6 +74,7 @@ class Service:
         self._life = app.router.lifespan_context(app)
         self.run(self._life.__aenter__())
         self.pool: Pool = app.state.pool
+        self.said = description(list(self.pool.described), self.pool.limits)
 
     def close(self) -> None:
         self.run(self._life.__aexit__(None, None, None))
@@ -118,7 +122,22 @@ class Service:
                 reply.body += message.get("body", b"")
 
         await self.app(scope, receive, send)
+        self._require_described(method, path, reply)
         return reply
+
+    said: dict[str, Any] | None = None  # of an application that describes itself
+
+    def _require_described(self, method: str, path: str, reply: Reply) -> None:
+        """Every answer of every test has a status, a type and headers that the description promises."""
+        template = re.sub("^/maps/[^/]+", "/maps/{map}", path)
+        operation = (self.said or {"paths": {}})["paths"].get(template, {}).get(method.lower())
+        if operation is None or reply.status == 499:  # for which there is nobody to receive it
+            return
+        said = operation["responses"][str(reply.status)]
+        kinds = {kind.partition(";")[0] for kind in said["content"]}
+        assert reply.headers["content-type"].partition(";")[0] in kinds
+        framing = {"content-type", "content-length", "connection"}
+        assert set(reply.headers) - framing == {name.lower() for name in said["headers"]}
 
 
 @dataclass(frozen=True)
@@ -146,7 +165,7 @@ def service(place: Place) -> Iterator[Service]:
     anchor = {"latitude": 47.4, "longitude": 19.0, "height": 120.0, "position_sigma": 0.5}
     (place.folder / "hall/anchor.json").write_text(json.dumps(anchor))
     maps = [place.folder / "map", place.folder / "hall"]
-    running = Service(service_app(maps, config=CONFIG, method="bid", settings=QUICK))
+    running = Service(service_app(maps, limits=LIMITS, method="bid", config=QUICK))
     yield running
     running.close()
 
@@ -328,13 +347,20 @@ def test_what_is_missing_is_named(service: Service, place: Place) -> None:
         "expected map as one of map, hall"
         in service.post("/geopose", body, "application/json").json["detail"]
     )
-    assert service.get("/localize").status == 405
-    assert service.get("/nothing").json["status"] == 404
+    refused = service.get("/localize")
+    assert (refused.status, refused.headers["allow"]) == (405, "POST")
+    for path in ("/nothing", "/maps/", "/maps/nothing", "/maps/nothing/geopose"):
+        assert service.get(path).json["status"] == 404, path
+    for number in ("1_0", "\u0663", " 5", "infinity", "0x10"):
+        assert (
+            "expected a number"
+            in service.post(f"/localize?map=map&focal={number}", place.photo).json["detail"]
+        )
 
 
 def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
     with contextlib.ExitStack() as taken:
-        for _ in range(CONFIG.places):
+        for _ in range(LIMITS.places):
             taken.enter_context(service.pool.place())
         reply = service.post("/localize?map=map", place.photo)
         assert reply.status == 429
@@ -401,13 +427,13 @@ def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -
 
 
 def test_work_that_takes_too_long_is_stopped(service: Service, place: Place) -> None:
-    service.pool.config = replace(CONFIG, timeout=0.2)
+    service.pool.limits = replace(LIMITS, timeout=0.2)
     try:
         with stopped(service):
             first, second = request(service, place), request(service, place)
             assert (first.result(20).status, second.result(20).status) == (504, 504)
     finally:
-        service.pool.config = CONFIG
+        service.pool.limits = LIMITS
     assert service.pool.metrics.restarts["timeout"] == 1
     assert request(service, place).result(60).status == 200
 
@@ -477,12 +503,27 @@ def test_geopose_answers_with_an_honest_accuracy(service: Service, place: Place)
     ):
         assert part in service.post("/maps/hall/geopose", body(**more), "application/json").json["detail"]
     assert service.post("/maps/hall/geopose", b"[]", "application/json").status == 400
+    for wrong in (
+        {"timestamp": "now"}, {"type": 1}, {"sensors": [1]}, {"sensors": [{"id": 1}]}, {"priorPoses": {}},
+        {"priorPoses": [{"geopose": {"position": {"lat": 1, "lon": "2", "h": 3}}}]},
+    ):  # fmt: skip
+        for name in ("map", "hall"):
+            content = json.dumps({**json.loads(body()), **wrong}).encode()
+            detail = service.post(f"/maps/{name}/geopose", content, "application/json").json["detail"]
+            assert any(word in detail for word in (*wrong, "position")), detail
 
 
 def test_every_path_is_described(service: Service) -> None:
     said = service.get("/openapi.json").json
-    assert said == json.loads(json.dumps(description(["map", "hall"], CONFIG)))
-    assert set(said["paths"]) == {route.path for route in service.app.routes} - {"/", "/openapi.json"}
+    assert said == json.loads(json.dumps(description(["map", "hall"], LIMITS)))
+    assert set(said["paths"]) == {route.path for route in service.app.routes}
+    protected = description(["map"], LIMITS, protected=True)
+    assert (protected["security"], said["security"]) == ([{"token": []}], [])
+    for path, operations in protected["paths"].items():
+        for method in operations.keys() - {"parameters"}:
+            statuses = operations[method]["responses"]
+            assert ("401" in statuses, "403" in statuses) == (path != "/health", False)
+            assert "403" in said["paths"][path][method]["responses"]
     queried = {p["name"] for p in said["paths"]["/localize"]["post"]["parameters"]}
     assert queried == set(PARAMETERS)
     text = service.get("/metrics").body.decode()
@@ -503,9 +544,9 @@ def address(place: Place) -> Iterator[tuple[str, int]]:
 
     options: Any = {
         "port": 0,
-        "config": CONFIG,
+        "limits": LIMITS,
         "method": "bid",
-        "settings": QUICK,
+        "config": QUICK,
         "ready": tell,
         "stop": stop,
     }
@@ -557,6 +598,15 @@ def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, i
         answer = spoken(address, bytes(content))
         statuses.add(answer[9:10] if answer.startswith(b"HTTP/1.1 ") else b"closed")
     assert statuses <= {b"2", b"4", b"closed"}
+    for content in (
+        b"\x00\x01\r\n\r\n",
+        b"GET / HTTP/9\r\n\r\n",
+        b"GET " + b"x" * 100_000 + b" HTTP/1.1\r\n\r\n",
+    ):
+        head, _, body = spoken(address, content).partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 400")
+        assert b"application/problem+json" in head
+        assert json.loads(body)["status"] == 400
     for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
         answer = spoken(
             address, f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode()
@@ -616,6 +666,19 @@ def test_a_connection_that_only_dribbles_after_an_answer_is_closed(
         assert time.monotonic() - began < 5
 
 
+@pytest.mark.slow
+def test_strangers_who_read_the_description_find_it_true(
+    place: Place, address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("schemathesis", reason="Schemathesis is not installed")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    openapi = importlib.import_module("_openapi")
+    found = openapi.tried(f"http://{address[0]}:{address[1]}", "map", [place.photo], 1)
+    assert (found["failures"], found["errors"]) == ({}, {}), found["output"]
+    assert found["operations"] == 11
+    assert found["requests"] > 100
+
+
 def test_a_token_that_is_given_is_not_shown(
     tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -642,8 +705,11 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
             named(maps)
     with pytest.raises(InputError, match="expected at least 16"):
         service_app("MAP", token="short")
+    assert service_app("MAP", method="bid", config=settings_of("bid", QUICK)) is not None
+    with pytest.raises(InputError, match="config is a int, expected settings of bid"):
+        service_app("MAP", method="bid", config=5)
     with pytest.raises(InputError, match="timeout is 0"):
-        ServiceConfig(timeout=0)
+        ServiceLimits(timeout=0)
     assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
     status, _, err = bidnerf("serve", place.folder / "data")
     assert status == 1

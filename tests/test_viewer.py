@@ -178,7 +178,7 @@ def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator
 
 
 def test_depth_difference_is_the_offset_of_a_shifted_measurement(localizer: Localizer) -> None:
-    image = localizer.map.render(viewed.query().views[0])
+    image = localizer.scene.render(viewed.query().views[0])
     frame = viewed.query().frame
     shifted = depth_difference(
         image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0))

@@ -21,6 +21,7 @@ from playwright.sync_api import sync_playwright
 
 import viewed
 from bidnerf_core import Localizer
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.viewer.saving import save_page
 from bidnerf_core.viewer.table import shown_row
 from bidnerf_core.viewer.trajectories import shown_trajectory
@@ -127,8 +128,14 @@ def value(page: Any, field: str) -> str:
 
 def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> None:
     photo = viewed.photo_file(tmp_path, "a <b>photo.png")
-    with serving() as client, opened(browser, f"http://127.0.0.1:{client.port}/", LAPTOP) as page:
+    with (
+        serving(camera=CameraSource(hfov=61.5)) as client,
+        opened(browser, f"http://127.0.0.1:{client.port}/", LAPTOP) as page,
+    ):
         assert page.title().startswith("room")
+        assert value(page, "#hfov") == "61.5"
+        page.fill("#hfov", "")
+        page.evaluate("document.activeElement.blur()")
         assert page.locator("#query option").count() == 2  # one asks to choose
         page.set_input_files("#photo", photo)
         page.wait_for_selector(".outcome.good")

@@ -23,7 +23,9 @@ from PIL import Image
 
 import viewed
 from bidnerf_core import Localizer, settings_of
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.viewer.jobs import Jobs
+from photo_room import CAMERA
 from viewer_client import Client, serving
 
 LONG = {"bid": {"max_steps": 100_000}, "bid-lm": {"fine_steps": 100_000, "stop_step": 0.0}}
@@ -62,6 +64,18 @@ def test_a_photo_that_is_uploaded_is_localized_in_the_background(client: Client,
     assert answer["name"] == viewed.HOSTILE
     assert answer["rendered"]["url"].startswith("data:image/jpeg")
     assert set(Path(tempfile.gettempdir()).glob("bidnerf-view-*")) == before
+
+
+def test_the_camera_that_the_viewer_was_started_with_is_that_of_photos_without_another(
+    tmp_path: Path,
+) -> None:
+    content = viewed.photo_file(tmp_path).read_bytes()
+    with serving(camera=CameraSource(focal=CAMERA.fx)) as client:
+        assert b'"hfov":null,"camera_given":true' in client.get("/").content
+        said = answer_of(client, client.post("/api/photo", content))
+        assert said["camera"].startswith(f"focal length {CAMERA.fx:g} px, as given")
+        said = answer_of(client, client.post("/api/photo?hfov=58.19", content))
+        assert said["camera"].startswith("horizontal field of view 58.19 deg")
 
 
 def bomb(side: int) -> bytes:

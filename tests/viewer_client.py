@@ -15,13 +15,13 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import viewed
-from bidnerf_core import Localizer, ServiceConfig
+from bidnerf_core import Localizer, ServiceLimits
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.queries import Photos
 from bidnerf_core.viewer.server import serve_view
 from photo_room import CAMERA
 
-CONFIG = ServiceConfig(max_megabytes=1.0, max_megapixels=1.0)
+LIMITS = ServiceLimits(max_megabytes=1.0, max_megapixels=1.0)
 
 
 @dataclass
@@ -61,12 +61,14 @@ class Client:
 
 
 @contextlib.contextmanager
-def serving(token: str | None = None) -> Iterator[Client]:
-    """Run a viewer of the room, with one photo to choose."""
+def serving(token: str | None = None, camera: CameraSource | None = None) -> Iterator[Client]:
+    """Run a viewer of the room, with one photo to choose; ``camera`` is that of other photos."""
     stop, ready = threading.Event(), SimpleQueue[str]()
     with tempfile.TemporaryDirectory() as folder:
         source = Photos([viewed.photo_file(Path(folder))], CameraSource(assumed=(CAMERA,)))
-        options = {"port": 0, "token": token, "config": CONFIG, "ready": ready.put, "stop": stop}
+        options = {
+            "port": 0, "token": token, "limits": LIMITS, "ready": ready.put, "stop": stop, "camera": camera,
+        }  # fmt: skip
         thread = threading.Thread(target=serve_view, args=(Localizer(viewed.room()), source), kwargs=options)
         thread.start()
         try:

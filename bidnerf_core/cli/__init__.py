@@ -107,13 +107,16 @@ def _dispatch(given: list[str]) -> int:
 
 @contextlib.contextmanager
 def _warnings_as_lines(name: str) -> Iterator[None]:
-    """Print each ``InputWarning`` as one line on stderr, without the source line that Python would print."""
+    """Print each ``InputWarning`` as one line on stderr, once, without the source line that Python would print."""
+    told = set[str]()
     with warnings.catch_warnings():
         others = warnings.showwarning
 
         def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
             if issubclass(category, InputWarning):
-                _failed(name, str(message), DONE)
+                if str(message) not in told:  # a broken plugin is found again with every folder
+                    _failed(name, str(message), DONE)
+                told.add(str(message))
                 return
             from bidnerf_core.cli.output import PrintableStream  # imported here, since few commands warn
 

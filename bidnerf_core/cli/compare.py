@@ -49,7 +49,7 @@ def run(arguments: list[str]) -> None:
         out: Annotated[
             Path | None, option("DIR", "write compare.json, compare.png and compare.svg there", "")
         ] = None,
-        split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+        split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
         frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
         protocol: Annotated[str, option("NAME", "how starts are chosen: " + ", ".join(PROTOCOLS))] = "bid",
         size: Annotated[

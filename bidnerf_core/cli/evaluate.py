@@ -63,7 +63,7 @@ def run(arguments: list[str]) -> None:
             ),
         ] = None,
         seed: Annotated[int | None, option("S", "seed of every random choice", "the protocol's, 0")] = None,
-        split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+        split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
         frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
         images: Annotated[int, option("K", "localize a sequence of K images around the object at once")] = 1,
         angle: Annotated[float, option("DEGREES", "angle between neighbours of a sequence")] = 15.0,

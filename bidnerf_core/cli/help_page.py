@@ -19,6 +19,12 @@ from bidnerf_core.settings import is_expert, to_flat
 
 _T = TypeVar("_T")
 
+PHRASES = {
+    "At most one argument can be overridden.": "At most one of these can be given.",
+    "Exactly one argument must be passed in.": "One of these must be given.",
+}
+"""Sentences of the parser about options that exclude each other, and what pages say instead."""
+
 
 def without_expert_settings(function: Callable[..., _T]) -> tuple[Callable[..., _T], int]:
     """Return a function without the expert options, for a short help page, and the number of options left
@@ -100,7 +106,11 @@ def _headed(line: str) -> str:
 
 
 def _quoted(line: str) -> str:
-    """Return a line with plain quotes instead of the double backticks of docstrings, padded to keep the box width."""
+    """Return a line with plain quotes instead of the double backticks of docstrings, and with the words of other help pages
+    for those of the parser, padded to keep the box width.
+    """
+    for theirs, ours in PHRASES.items():
+        line = line.replace(theirs, ours.ljust(len(theirs)))
     cells = re.split(r"([│|])", line)
     return "".join(cell.replace("``", "'") + " " * cell.count("``") for cell in cells).rstrip()
 

@@ -19,9 +19,8 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 import tyro
 
 from bidnerf_core.cli.help_page import Page, retyped, without_expert_settings
-from bidnerf_core.cli.output import PrintableStream
 from bidnerf_core.cli.parser_errors import refusals_in_a_line
-from bidnerf_core.errors import InputError, UsageError, printable
+from bidnerf_core.errors import InputError, UsageError
 
 _T = TypeVar("_T")
 
@@ -74,17 +73,14 @@ def parse(command: str, function: Callable[..., _T], arguments: list[str], confi
 
 
 def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
-    odd = any(printable(word) != word for word in arguments)
-    # The parser repeats the arguments in its messages, which may be coloured but must not control the
-    # terminal.
-    with (
-        contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext(),
-        _wide_enough(),
-        refusals_in_a_line(arguments, lambda: _options_of(command, function)),
-    ):
-        return tyro.cli(
-            function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
-        )
+    @functools.wraps(function)
+    def parsed(*given: Any, **options: Any) -> Callable[[], _T]:
+        return lambda: function(*given, **options)
+
+    name = f"bidnerf {command}"
+    with _wide_enough(), refusals_in_a_line(name, arguments, lambda: _options_of(command, function)):
+        call = tyro.cli(parsed, args=arguments, prog=name, config=(tyro.conf.OmitArgPrefixes,))
+    return call()
 
 
 def _options_of(command: str, function: Callable[..., Any]) -> set[str]:

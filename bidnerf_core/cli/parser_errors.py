@@ -1,12 +1,15 @@
 """Error messages for arguments that the parser rejects: one line, as for every other mistake.
 
-The parser (tyro) reports them through a hook that is not part of its stable interface. If a version lacks the
-hook, or reports something unknown here, the parser prints its own message.
+The parser (tyro) describes rejections through a hook that is not part of its stable interface. If a version lacks the
+hook, or describes one in a way unknown here, the line is what the parser itself prints.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
+import re
+import sys
 import types
 import typing
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -15,25 +18,59 @@ from typing import Any
 from bidnerf_core.errors import UsageError, amount, enumeration, spelling_hint
 
 NUMBERS = {int: "a whole number", float: "a number"}
+COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+BORDERS = "│|"
+"""Characters between which the parser prints the rows of a message."""
+WRONG = 2
+"""The status with which the parser ends the program if it rejects the arguments."""
 
 
 @contextlib.contextmanager
-def refusals_in_a_line(arguments: Sequence[str], options: Callable[[], Collection[str]]) -> Iterator[None]:
-    """Raise ``UsageError`` if the parser rejects ``arguments``; ``options`` returns the names of all options."""
+def refusals_in_a_line(
+    name: str, arguments: Sequence[str], options: Callable[[], Collection[str]]
+) -> Iterator[None]:
+    """Raise ``UsageError`` if the parser rejects the ``arguments`` of the command ``name``.
+
+    ``options`` returns the names of all options. What else the parser prints on stderr is passed on afterwards.
+    """
+    described = list[str]()
+
+    def refused(event: Any) -> None:
+        with contextlib.suppress(AttributeError, TypeError, LookupError):  # another version's event
+            if (message := _message(event, arguments)) is not None:
+                described.append(message)
+
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed), _hooked(refused):
+            yield
+    except SystemExit as stopped:
+        if stopped.code != WRONG:
+            raise
+        message = _unknown_option(arguments, options()) or [*described, _plain(printed.getvalue())][0]
+        printed = io.StringIO()
+        raise UsageError(f"{message}; '{name} --help' describes all arguments") from stopped
+    finally:
+        sys.stderr.write(printed.getvalue())
+
+
+def _hooked(hook: Callable[[Any], None]) -> contextlib.AbstractContextManager[None]:
+    """Let the parser call ``hook`` when it rejects arguments, if this version of it can."""
     try:
         from tyro import _errors
     except ImportError:
-        hooked = None
-    else:
-        hooked = getattr(_errors, "on_parse_error", None)
+        return contextlib.nullcontext()
+    register = getattr(_errors, "on_parse_error", None)
+    return contextlib.nullcontext() if register is None else register(hook)
 
-    def refuse(event: Any) -> None:
-        message = _unknown_option(arguments, options()) or _message(event, arguments)
-        if message is not None:
-            raise UsageError(f"{message}; '{event.prog} --help' describes all arguments")
 
-    with contextlib.nullcontext() if hooked is None else hooked(refuse):
-        yield
+def _plain(text: str) -> str:
+    """Return a message that the parser printed in a box, without the box and without its hint at the help page."""
+    rows = [row.strip() for row in COLOURS.sub("", text).splitlines()]
+    inside = [row.strip(BORDERS).strip() for row in rows if row[:1] in BORDERS and row[-1:] in BORDERS]
+    body = [row for row in inside or rows if row]
+    end = next((number for number, row in enumerate(body) if not any(map(str.isalnum, row))), len(body))
+    return " ".join(body[:end]) or "wrong arguments"
 
 
 def _unknown_option(arguments: Sequence[str], options: Collection[str]) -> str | None:
@@ -63,8 +100,8 @@ def _message(event: Any, arguments: Sequence[str]) -> str | None:
         hint = spelling_hint(event.value, event.choices)
         listed = ", ".join(event.choices)
         return f"{_name(event.argument)} is {event.value!r}, expected one of {listed}{hint}"
-    if kind == "InstantiationFailure" and event.argument is not None:
-        return _wrong_value(event.argument, arguments)
+    if kind == "InstantiationFailure":
+        return str(event.message) if event.argument is None else _wrong_value(event.argument, arguments)
     return None
 
 

@@ -14,7 +14,7 @@ from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.io.files import read_file
 from bidnerf_core.io.json import read_record
 from bidnerf_core.service import server
-from bidnerf_core.service.settings import ServiceConfig
+from bidnerf_core.service.settings import LEAST_TOKEN, ServiceLimits
 
 TOKEN = "BIDNERF_TOKEN"
 """The environment variable that may hold the token; a command-line argument would be visible to all users of
@@ -30,7 +30,9 @@ def serve(
         tuple[str, ...],
         tyro.conf.Positional,
         option(
-            "MAP...", "folders of maps, or NAME=MAP to choose the name that clients ask for (required)", ""
+            "MAP...",
+            "folders of maps; NAME=MAP serves one under another name than its folder's (required)",
+            "",
         ),
     ],
     *,
@@ -45,29 +47,40 @@ def serve(
     port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = server.PORT,
     token_file: Annotated[
         Path | None,
-        option("FILE", f"file with the token; or set {TOKEN}", "with --host, one is generated and shown"),
+        option(
+            "FILE",
+            f"file with the token that clients must send, at least {LEAST_TOKEN} characters; or set {TOKEN} to the token",
+            "none, but with --host one is generated and printed",
+        ),
     ] = None,
-    method: Annotated[str, option("NAME", "how poses are found")] = "auto",
-    settings: Annotated[
-        Path | None, option("FILE", "JSON object with settings of the method by name", "the method's own")
+    method: Annotated[str, option("NAME", "how poses are found, one of 'bidnerf plugins methods'")] = "auto",
+    config: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "JSON object with settings of the method, as 'bidnerf localize --method NAME --help' lists them:"
+            ' {"refine_steps": 20}',
+            "the method's own",
+        ),
     ] = None,
     device: Device = "cpu",
-    config: ServiceConfig = ServiceConfig(),
+    limits: ServiceLimits = ServiceLimits(),
 ) -> None:
-    """Serve localization over HTTP: POST a photo to /localize to get the JSON of 'bidnerf localize'. Ctrl-C
-    stops it.
+    """Serve localization over HTTP: photos in, the JSON of 'bidnerf localize' out. Ctrl-C stops it.
 
-    Photos come as the request body or in a form, with depth, camera and start if known; /geopose implements
-    the GeoPose Protocol. All paths are described at /openapi.json. Each request is logged as a line of JSON
-    on stderr.
+    A photo is sent as a form or as the body of a request, with its camera, depth image or start if known:
+    curl -F photo=@photo.jpg -F hfov=68 http://127.0.0.1:8000/localize
+
+    /openapi.json describes all paths, /health and /metrics are for monitoring, and /geopose implements the
+    GeoPose Protocol. Each request is logged as a line of JSON on stderr.
     """
     require("--port", port, 0, 65535)
     if not maps:
         raise UsageError("no MAP, expected folders of maps")
     given = _token(token_file)
     server.serve(
-        _named(maps), host=host, port=port, token=given, config=config, method=method, device=device,
-        settings=None if settings is None else read_record(settings).values,
+        _named(maps), host=host, port=port, token=given, method=method, device=device, limits=limits,
+        config=None if config is None else read_record(config).values,
         ready=lambda address, token: _announce(address, "TOKEN, the one that was given" if given else token),
     )  # fmt: skip
 

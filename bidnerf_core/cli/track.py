@@ -220,7 +220,7 @@ def _follow(
         try:
             if isinstance(request, InputError):
                 raise request
-            frame = request.read(camera, sensor, tracker.localizer.map.bounds.background)
+            frame = request.read(camera, sensor, tracker.localizer.scene.bounds.background)
             found = tracker(frame if depth else replace(frame, depth=None), request.time)
             answer = path.add(frame, found, request.time)
             if video is not None:

@@ -47,15 +47,15 @@ def view(
     trajectory: Annotated[
         Path | None, option("FILE", "poses from 'bidnerf track', or in the format of TUM, EuRoC or KITTI", "")
     ] = None,
-    depth: Annotated[tuple[Path, ...], option("FILE...", "depth images of the photos, in the same order", "")] = (),
+    depth: Annotated[tuple[Path, ...], option("FILE...", "depth images of the photos, in the same order or matched by name", "")] = (),
     camera: CameraFile = None,
     focal: FocalLength = None,
     hfov: FieldOfView = None,
     depth_unit: Annotated[float | None, option("METRES", "metres per step of depth images", "")] = None,
-    frame: Annotated[Names, option("NAME...", "frames of a dataset, each on its own", "all of the split")] = (),
+    frame: Annotated[Names, option("NAME...", "show only these frames of a dataset, each localized on its own", "all of the split")] = (),
     split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
-    most: Annotated[int, option("N", "number of images in a saved page, spread over all")] = 24,
-    method: Annotated[str, option("NAME", "how poses are found")] = "auto",
+    most: Annotated[int, option("N", "largest number of images in a page of --save, spread over all")] = 24,
+    method: Annotated[str, option("NAME", "how poses are found, one of 'bidnerf plugins methods'")] = "auto",
     host: Annotated[
         str | None,
         option("ADDRESS", "allow other machines to view the page; they need the address with its token", "this machine only"),
@@ -66,8 +66,8 @@ def view(
     """View a map in a browser, drop photos on it, and see how and why a pose was found or rejected. Ctrl-C
     stops it.
 
-    The photos and frames of QUERY can be selected there. With --save, they are localized immediately, and the
-    saved page shows the same without a server.
+    The photos and frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of
+    view can be changed there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
     # Imported when a page is made, since help pages do not need it.
     from bidnerf_core.localization import Localizer
@@ -88,10 +88,11 @@ def view(
     scene = load_map(map, device)
     localizer = Localizer(scene, method, warm_up=save is None)
     photos = PhotoOptions(depth, CameraSource(camera, focal, hfov, localizer.assumed_cameras), depth_unit)
-    source = None
+    source, usual = None, photos.camera
     if query:
         source = open_queries(query, photos, FrameOptions(split), scene.bounds.background, None)
         splits = source.names_by_split if isinstance(source, DatasetFrames) else None
+        usual = CameraSource() if isinstance(source, DatasetFrames) else usual
         source = Chosen(source, places_of(source.names, names, most if save else len(source.names), splits))
     if save is not None:
         answers = () if source is None else _localized(localizer, source)
@@ -104,6 +105,7 @@ def view(
         source,
         path,
         rows,
+        camera=usual,
         host=host,
         port=port,
         ready=lambda address: say(f"look at {address}; Ctrl-C ends"),

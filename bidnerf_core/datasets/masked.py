@@ -62,6 +62,11 @@ class MaskedDataset:
     def frame_names(self, split: str) -> list[str]:
         return self.unmasked.frame_names(split)
 
+    def wholly_hidden(self, split: str) -> list[str]:
+        """Return the frames of a split whose masks leave nothing visible; only masks are read."""
+        own = set(wholly_hidden(self.unmasked, split))
+        return [name for name in self.frame_names(split) if name in own or self._masks.hides_all(name)]
+
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
     ) -> list[View]:
@@ -73,6 +78,12 @@ class MaskedDataset:
                 if names is not None:
                     raise
         return found
+
+
+def wholly_hidden(dataset: Dataset, split: str) -> list[str]:
+    """Return the frames of a split of which a mask leaves nothing visible, if the dataset has masks; only masks are read."""
+    told = getattr(dataset, "wholly_hidden", None)
+    return [] if told is None else list(told(split))
 
 
 def mask_folder(masks: str | Path | MaskFolder) -> MaskFolder:

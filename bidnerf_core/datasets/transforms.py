@@ -44,7 +44,7 @@ from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, 
 from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.masks import HiddenColour, read_mask
+from bidnerf_core.frames.masks import HiddenColour, hides_everything, read_mask
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import is_file
 from bidnerf_core.io.images import Background, background_colour, read_header
@@ -119,20 +119,30 @@ class TransformsDataset(SplitDataset[FrameRecord]):
             return camera if whole == (width, height) else camera.resized(width, height)
 
         def hidden_of(width: int, height: int) -> Bool[Tensor, "h w"] | None:
-            return self._hidden(frame, path, (width, height))
+            return self._hidden(frame, (width, height))
 
         return read_rgbd(name, path, camera_of, self.background, depth, hidden_of)
 
-    def _hidden(self, frame: FrameRecord, image: Path, size: tuple[int, int]) -> Bool[Tensor, "h w"] | None:
-        """Return what the frame's masks hide: black in nerfstudio's ``mask_path``, white in instant-ngp's."""
+    def _hidden(self, frame: FrameRecord, size: tuple[int, int]) -> Bool[Tensor, "h w"] | None:
+        """Return what the frame's masks hide."""
+        found = [read_mask(path, Raster(*size), size, hides) for path, hides in self._masks(frame)]
+        return torch.stack(found).any(0) if found else None
+
+    def _masks(self, frame: FrameRecord) -> list[tuple[Path, HiddenColour]]:
+        """Return the frame's masks and the colours that are hidden: black in nerfstudio's ``mask_path``, white in instant-ngp's."""
         masks: list[tuple[Path, HiddenColour]] = []
         if frame in self._files.masks:
             masks.append((self._files.masks[frame], "black"))
+        image = self._files.images[frame]
         beside = image.with_name(f"{DYNAMIC_MASK}{image.stem}.png")
         if is_file(beside):
             masks.append((beside, "white"))
-        found = [read_mask(path, Raster(*size), size, hides) for path, hides in masks]
-        return torch.stack(found).any(0) if found else None
+        return masks
+
+    def wholly_hidden(self, split: str) -> list[str]:
+        """Return the frames of a split of which a mask leaves nothing visible."""
+        frames = self._frames.select(split)
+        return [name for name, frame in frames if any(hides_everything(*mask) for mask in self._masks(frame))]
 
     def _pose(self, frame: FrameRecord) -> SE3:
         return frame.T_world_camera

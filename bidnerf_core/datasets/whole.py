@@ -8,9 +8,11 @@ from functools import cached_property
 from pathlib import Path
 
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress, positions, unique_names
+from bidnerf_core.datasets.masked import MaskedDataset, wholly_hidden
 from bidnerf_core.datasets.splits import SplitDataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.masks import WhollyHidden
 from bidnerf_core.geometry.units import LengthUnit
 
 ALL = "all"
@@ -56,8 +58,9 @@ class WholeDataset:
     @cached_property
     def _listed(self) -> list[tuple[str, str]]:
         """Each view's split and its name there."""
-        if isinstance(self.parts, SplitDataset):  # it knows what its splits share
-            return self.parts.distinct_names()
+        unmasked = self.parts.unmasked if isinstance(self.parts, MaskedDataset) else self.parts
+        if isinstance(unmasked, SplitDataset):  # it knows what its splits share
+            return unmasked.distinct_names()
         return [(split, name) for split in self.parts.splits for name in self.parts.frame_names(split)]
 
     @cached_property
@@ -73,6 +76,13 @@ class WholeDataset:
         """Return the split of a view, and its name there."""
         return self._listed[self._names.index(name)]
 
+    def wholly_hidden(self, split: str) -> list[str]:
+        """Return the frames whose masks leave nothing visible."""
+        hidden = {(of, name) for of in self.parts.splits for name in wholly_hidden(self.parts, of)}
+        return [
+            own for own, place in zip(self.frame_names(split), self._listed, strict=True) if place in hidden
+        ]
+
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
     ) -> list[View]:
@@ -82,7 +92,12 @@ class WholeDataset:
         found = list[View]()
         for done, place in enumerate(asked, start=1):
             of, name = self._listed[place]
-            views = self.parts.views(of, [name])
+            try:
+                views = self.parts.views(of, [name])
+            except WhollyHidden:
+                if names is not None:
+                    raise
+                continue
             found += [replace(view, frame=replace(view.frame, name=known[place])) for view in views]
             if progress is not None:
                 progress(done, len(asked))

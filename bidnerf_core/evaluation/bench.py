@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
@@ -12,7 +13,8 @@ from typing import Any
 
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.datasets.dataset import in_other_split
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.datasets.masked import wholly_hidden
+from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -28,7 +30,7 @@ from bidnerf_core.evaluation.trials import (
     run_trial,
     trial_views,
 )
-from bidnerf_core.frames.masks import HiddenColour
+from bidnerf_core.frames.masks import INVERTED, HiddenColour
 from bidnerf_core.geometry.arcs import arc
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import find_method
@@ -279,6 +281,7 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
             elsewhere = in_other_split(name, others) or f"no frame {name!r}"
             raise InputError(f"{plan.data}: split {plan.split!r}: {elsewhere}")
     kept = names if plan.frames is None else [name for name in names if name in plan.frames]
+    kept = _visible(plan, dataset, kept)
     if plan.images == 1:
         return [(name,) for name in kept]
     if isinstance(dataset, ClosedFormData):
@@ -290,6 +293,19 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
             f"{plan.angle:g} degrees apart around what the cameras look at"
         )
     return rigs
+
+
+def _visible(plan: Plan, dataset: Dataset, kept: list[str]) -> list[str]:
+    """Return the frames of which masks leave something visible, with a warning that names the others."""
+    every = set(wholly_hidden(dataset, plan.split))
+    hidden = [name for name in kept if name in every]
+    if hidden:
+        listed = ", ".join(hidden[:4]) + (", ..." if len(hidden) > 4 else "")
+        text = f"masks hide {amount(len(hidden), 'whole frame')} of {len(kept)}, not tried: {listed}"
+        if len(hidden) == len(kept):
+            raise InputError(f"{plan.masks or plan.data}: {text}; {INVERTED}")
+        warnings.warn(f"{plan.masks or plan.data}: {text}", InputWarning, stacklevel=2)
+    return [name for name in kept if name not in every]
 
 
 def check_points(plan: Plan, trials: Sequence[Trial], scene: Opened) -> None:

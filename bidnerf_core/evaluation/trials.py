@@ -23,6 +23,7 @@ from torch import Tensor
 from bidnerf_core.datasets import Dataset, MaskFolder, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.masked import MaskedDataset
+from bidnerf_core.datasets.whole import with_all
 from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty, parse_faults
@@ -137,18 +138,19 @@ def open_map(name: str, device: str = "cpu") -> Map:
 
 @dataclass(frozen=True)
 class Reading:
-    """The options with which a trial's dataset is opened, see ``open_dataset``."""
+    """The options with which a trial's dataset is opened, see ``open_dataset``; its ``split`` may be "all"."""
 
     masks: str | None = None
     mask_hides: HiddenColour = "black"
     camera: str | None = None
     register_depth: bool | str | None = None
     depth_unit: float | None = None
+    split: str = "test"
 
     @classmethod
     def of(cls, work: Trial | Plan) -> Reading:
         """Return the options of a trial or a plan."""
-        return cls(work.masks, work.mask_hides, work.camera, work.register_depth, work.depth_unit)
+        return cls(work.masks, work.mask_hides, work.camera, work.register_depth, work.depth_unit, work.split)
 
     def open(self, name: str, stored: Map | None = None) -> Dataset:
         """Return the dataset in a folder, or of a closed-form scene; a map gives the colour behind its images."""
@@ -170,9 +172,9 @@ class Reading:
         return self._masked(dataset)
 
     def _masked(self, dataset: Dataset) -> Dataset:
-        return (
-            dataset if self.masks is None else MaskedDataset(dataset, MaskFolder(self.masks, self.mask_hides))
-        )
+        if self.masks is not None:
+            dataset = MaskedDataset(dataset, MaskFolder(self.masks, self.mask_hides))
+        return with_all(dataset, self.split)
 
 
 def opened(map_name: str, data_name: str, device: str = "cpu", reading: Reading = Reading()) -> Opened:

@@ -61,6 +61,12 @@ def read_mask(
     return hidden
 
 
+def hides_everything(path: Path, hides: HiddenColour = "black") -> bool:
+    """Return whether a mask leaves nothing of any image visible. Raises ``InputError`` if the file is not an image."""
+    white = _white(decode(path))
+    return bool(white.all() if hides == "white" else not white.any())
+
+
 def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[Tensor, "h w"]:
     """Turn the mask upright like the image of ``raster``. Raises ``InputError`` for another aspect ratio."""
     given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
@@ -135,6 +141,13 @@ class MaskFolder:
                 f"{self.path}: no mask in it matches any of {amount(len(names), 'image')} by name; expected"
                 f" {names[0]}.png or the like, found {next(iter(self._by_name))}"
             )
+
+    def hides_all(self, name: str) -> bool:
+        """Return whether the mask of the frame named ``name`` leaves nothing visible. Raises ``InputError`` for
+        one that is not an image.
+        """
+        file = self.file_of(name)
+        return file is not None and hides_everything(file, self.hides)
 
     def hidden(self, name: str, raster: Raster, size: tuple[int, int]) -> Bool[Tensor, "h w"] | None:
         """Return what the mask of the frame named ``name`` hides, as ``read_mask`` does; None if it has no

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
 from typing import Any
@@ -23,7 +23,13 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.io.json import LARGEST_INTEGER
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
-from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
+from bidnerf_core.localization.methods import (
+    USUAL_METHOD,
+    Method,
+    find_method,
+    require_use_of_depth,
+    settings_of,
+)
 from bidnerf_core.localization.problem import Problem, SceneMap, landmark_cameras, on_device, rig, unit_of
 from bidnerf_core.localization.result import Localization, Outcome
 from bidnerf_core.localization.settings import ByColourConfig
@@ -43,26 +49,26 @@ class Localizer:
 
     def __init__(
         self,
-        map: SceneMap,
+        scene: SceneMap,
         method: str = USUAL_METHOD,
         config: Any = None,
         device: torch.device | str | None = None,
         warm_up: bool = True,
         preset: str | None = None,
     ) -> None:
-        """Prepare ``map`` for ``method``.
+        """Prepare the map ``scene`` for ``method``.
 
-        ``config`` is an instance of the method's settings (``METHODS[method].config_type``), by default with its defaults.
-        ``preset`` is the name of other settings (``METHODS[method].presets``) in place of ``config``. ``device`` is that of the
+        ``config`` holds the method's settings: an instance of their type (``METHODS[method].config_type``), or a dictionary of those
+        that differ from the defaults, or from ``preset``, the name of other settings (``METHODS[method].presets``). ``device`` is that of the
         field, the surface and the landmarks, by default where they are; parts of the map on another device are copied.
         ``warm_up``: initialize now, so that the first call is not delayed. Raises ``InputError`` for unsuitable arguments.
         """
-        map = checked_map(map, "Localizer")
+        scene = checked_map(scene, "Localizer")
         self.method = method
-        self.map: SceneMap = map if device is None else on_device(map, device)
+        self.scene: SceneMap = scene if device is None else on_device(scene, device)
         self._method = find_method(method)
         self.config = _checked_config(self._method, method, config, preset)
-        landmarks = self.map.landmarks if self._method.uses_landmarks else None
+        landmarks = self.scene.landmarks if self._method.uses_landmarks else None
         self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
         if warm_up:
             self._warm_up()
@@ -94,7 +100,7 @@ class Localizer:
     ) -> Problem:
         """Return the problem that ``__call__`` solves; solving it several times detects the images' keypoints only once."""
         T_world_camera = None if start is None else start_pose(start)
-        return rig(self.map, _views(query), T_world_camera, depth_rays, self.matcher)
+        return rig(self.scene, _views(query), T_world_camera, depth_rays, self.matcher)
 
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer."""
@@ -103,8 +109,8 @@ class Localizer:
             raise InputError(
                 f"method {self.method!r} returned a {type(found).__name__}, expected a Localization"
             )
-        found = replace(found, unit=unit_of(self.map))
-        return found if self.map.has_distances else direction_only(found)
+        found = replace(found, unit=unit_of(self.scene))
+        return found if self.scene.has_distances else direction_only(found)
 
     @property
     def depth_sensor(self) -> DepthSensorModel:
@@ -134,7 +140,7 @@ class Localizer:
     @property
     def assumed_cameras(self) -> tuple[Intrinsics, ...]:
         """The cameras of the map's images, assumed for photos without a focal length; empty if landmarks are not matched."""
-        return landmark_cameras(self.map) if self.matches_landmarks else ()
+        return landmark_cameras(self.scene) if self.matches_landmarks else ()
 
     @property
     def matches_landmarks(self) -> bool:
@@ -144,23 +150,23 @@ class Localizer:
     @torch.no_grad()
     def _warm_up(self) -> None:
         """Render some rays and fill the caches of the surface, so that lazy initialisation does not delay the first call."""
-        bounds, field = self.map.bounds, self.map.field
+        bounds, field = self.scene.bounds, self.scene.field
         directions = torch.nn.functional.normalize(
             torch.randn((WARM_UP_RAYS, 3), generator=torch.Generator().manual_seed(0)), dim=-1
         ).to(device_of(field))
         middle = constant(bounds.centre, directions)
         render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
-        if self.map.surface is not None:
-            self.map.surface.warm_up()
+        if self.scene.surface is not None:
+            self.scene.surface.warm_up()
 
 
 def map_with_distances(localizer: Localizer) -> SceneMap:
     """Return the localizer's map. Raises ``InputError`` if its photos are from one place, as it then has no positions."""
-    if not localizer.map.has_distances:
+    if not localizer.scene.has_distances:
         raise InputError(
             f"tracking needs positions, but {NO_DISTANCES}; expected a map of photos from several places"
         )
-    return localizer.map
+    return localizer.scene
 
 
 def checked_map(given: object, where: str) -> SceneMap:
@@ -175,14 +181,15 @@ def checked_map(given: object, where: str) -> SceneMap:
 def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:
     if config is None:
         return method.settings(preset)
+    if isinstance(config, Mapping):
+        return settings_of(name, dict(config), preset=preset)
+    expected, found = method.config_type.__name__, type(config).__name__
+    if not isinstance(config, method.config_type):
+        raise InputError(f"method {name!r} takes a {expected} or a dictionary, got a {found}")
     if preset is not None:
         raise InputError(
-            f"got both preset {preset!r} and a config; give one, or use settings_of({name!r}, ..., preset={preset!r})"
+            f"got both preset {preset!r} and a {found}, expected one, or a dictionary of what differs"
         )
-    if not isinstance(config, method.config_type):
-        expected, found = method.config_type.__name__, type(config).__name__
-        hint = f"; settings_of({name!r}, ...) makes one of it" if isinstance(config, dict) else ""
-        raise InputError(f"method {name!r} takes a {expected}, got a {found}{hint}")
     return config
 
 

@@ -113,7 +113,7 @@ class Tracker:
         self._state = state = state if image is None else replace(state, image=image)
         answer = replace(
             answer, seconds=clocks.perf_counter() - began, focal_factor=1.0, intrinsics=None,
-            unit=unit_of(self.localizer.map),
+            unit=unit_of(self.localizer.scene),
         )  # fmt: skip
         return answer if state.camera is None else state.camera.stated_in(answer, stated)
 
@@ -152,7 +152,7 @@ class Tracker:
         self, frame: Frame, image: Grey | None, state: TrackerState, motion: Motion, seconds: float
     ) -> tuple[Localization, TrackerState]:
         """Estimate the pose from that of the last frame. If it is rejected, search again from the next frame on."""
-        surface = self.localizer.map.surface
+        surface = self.localizer.scene.surface
         predicted = motion.predicted(seconds, state.clock.stamped)
         if image is None and surface is not None and has_points(frame):
             return self._by_shape(surface, frame, state, predicted)
@@ -215,7 +215,7 @@ class Tracker:
         if self._by_landmarks is not None and image is not None:
             known = points[points.landmark != FRESH]
             return self._by_landmarks(frame, image, state, known, predicted)
-        surface = self.localizer.map.surface
+        surface = self.localizer.scene.surface
         if image is not None:
             state = replace(state, points=points)
         if surface is not None and has_points(frame):
@@ -223,7 +223,7 @@ class Tracker:
         elif image is None:
             return None
         else:
-            found = by_colour(self.localizer.map, frame, state, predicted, self.localizer.by_colour)
+            found = by_colour(self.localizer.scene, frame, state, predicted, self.localizer.by_colour)
         covariance = predicted.corrected(found.pose).covariance
         return replace(found, verdict=determined(found.verdict, covariance, self._extent))
 
@@ -281,7 +281,7 @@ class Tracker:
     @property
     def _extent(self) -> float:
         """The size of the scene (metres)."""
-        return scene_extent(self.localizer.map)
+        return scene_extent(self.localizer.scene)
 
     def _reach(
         self, frame: Frame, points: FollowedPoints | None = None, T_world_camera: SE3 | None = None
@@ -298,7 +298,7 @@ class Tracker:
 
     @property
     def _key(self) -> str:
-        info: Any = getattr(self.localizer.map, "info", None)
+        info: Any = getattr(self.localizer.scene, "info", None)
         return "" if info is None else str(info.weights)
 
 

@@ -78,7 +78,7 @@ class MapCollection:
 
     def __init__(
         self,
-        maps: str | Path | Sequence[Map | str | Path] | Mapping[str, Map],
+        scenes: str | Path | Sequence[Map | str | Path] | Mapping[str, Map],
         method: str = USUAL_METHOD,
         config: Any = None,
         asked: int = ASKED,
@@ -96,7 +96,7 @@ class MapCollection:
         if asked < 1:
             raise InputError(f"asked is {asked}, expected 1 or more")
         self.method, self.config, self.asked = method, config, asked
-        self._maps = _named([maps] if isinstance(maps, str | Path) else maps)
+        self._maps = _named([scenes] if isinstance(scenes, str | Path) else scenes)
         self._localizers: OrderedDict[str, Localizer] = OrderedDict()
         self._given_localizers = localizers or {}
         self._infos = {name: _info(scene) for name, scene in self._maps.items()}
@@ -185,7 +185,7 @@ class MapCollection:
             return _unrecognised(str(error), self.method)
         if answer is None:
             return _unrecognised("hardly any landmark of the map is in the image", self.method)
-        return replace(localization_by_landmarks(problem, answer, began), unit=unit_of(localizer.map))
+        return replace(localization_by_landmarks(problem, answer, began), unit=unit_of(localizer.scene))
 
     def _index(self, progress: ProgressCallback | None, cancel: Cancel | None) -> None:
         count = counter("reading", "maps", progress, cancel)

@@ -233,7 +233,7 @@ def localize_each(
     ``Cancelled`` once ``cancel`` returns True.
     """
     answers = (
-        Answers(getattr(getattr(localizer.map, "info", None), "backend", ""), unit_of(localizer.map))
+        Answers(getattr(getattr(localizer.scene, "info", None), "backend", ""), unit_of(localizer.scene))
         if answers is None
         else answers
     )

@@ -86,7 +86,7 @@ def place_each(
                 f"{query.name}: is a rig or has points from a sensor, expected single images for several maps"
             )
         placement = maps(query.views[0].frame, seed)
-        backend = getattr(getattr(maps.localizer(placement.map).map, "info", None), "backend", "")
+        backend = getattr(getattr(maps.localizer(placement.map).scene, "info", None), "backend", "")
         frame = replace(query.frame, name=query.name)
         return PlacedAnswer.placed(frame, number, placement, backend, query.file)
 

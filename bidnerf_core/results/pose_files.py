@@ -50,12 +50,16 @@ class PosedImage:
     unit: LengthUnit = "units"  # of the position
 
 
+def common_unit(images: Sequence[PosedImage]) -> LengthUnit:
+    """Return the unit of the positions: metres only if all are metric."""
+    return "metres" if images and all(image.unit == "metres" for image in images) else "units"
+
+
 def frame_of(images: Sequence[PosedImage], direction: str = "camera to world") -> str:
     """Return a file header's statement on its poses: their direction, the axes, and the unit of lengths if there are any."""
-    units = {image.unit for image in images}
-    if not units:
+    if not images:
         return f"{direction}, {OPENCV_AXES}"
-    lengths = "metres" if units == {"metres"} else "units of the map (not known to be metres)"
+    lengths = "metres" if common_unit(images) == "metres" else "units of the map (not known to be metres)"
     return f"{direction}, {OPENCV_AXES}, lengths in {lengths}"
 
 
@@ -112,8 +116,7 @@ def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
     """
     require_finite(images)
     frames = [_transforms_entry(image, folder) for image in images]
-    unit = "metres" if images and all(image.unit == "metres" for image in images) else "units"
-    content = {"camera_model": "OPENCV", "unit": unit, "frames": frames}
+    content = {"camera_model": "OPENCV", "unit": common_unit(images), "frames": frames}
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 

@@ -70,8 +70,8 @@ def track(
         raise InputError(f"every is {every}, expected 1 or more")
     localizer = scene if isinstance(scene, Localizer) else Localizer(scene)
     if not isinstance(sequence, FrameSequence):
-        sequence = opened_for(localizer.map, sequence)
-    path = TrackedPath.of(localizer.map) if path is None else path
+        sequence = opened_for(localizer.scene, sequence)
+    path = TrackedPath.of(localizer.scene) if path is None else path
     tracker = Tracker(localizer, config, start)
     total = -(-len(sequence) // every)
     count = counter("tracking", "frames", progress, cancel)

@@ -10,11 +10,12 @@ import torch
 
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.files import write_file
-from bidnerf_core.results.pose_files import PosedImage
+from bidnerf_core.results.pose_files import PosedImage, common_unit
 
 EUROC_HEAD = (
-    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
+    "#timestamp [ns],p_RS_R_x [{0}],p_RS_R_y [{0}],p_RS_R_z [{0}],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
 )
 NANOSECONDS = 10**9
 
@@ -38,9 +39,10 @@ def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
     """Write EuRoC poses: rows of nanoseconds, position and quaternion (w, x, y, z), of the camera, not of a
     body.
 
-    The time of an image without one is its number, in seconds.
+    The time of an image without one is its number, in seconds. The head names the unit of the positions, which is ``[m]`` only
+    for metric maps.
     """
-    rows = [EUROC_HEAD]
+    rows = [EUROC_HEAD.format(symbol(common_unit(images)))]
     for image in images:
         pose = _matrix(image)
         time = image.number if image.time is None else image.time

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import json
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -14,6 +14,15 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 OPEN = "/health"
 """The path that needs no token: load balancers poll it, and it reveals nothing about the maps."""
+
+
+SAFE = {
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+}
+"""Headers of every response: names in it are text, whatever a browser might make of them."""
+PROBLEM = "application/problem+json"
 
 
 class Access:
@@ -55,15 +64,20 @@ class Access:
 
 
 async def _refuse(send: Send, status: int, detail: str) -> None:
-    body = json.dumps({"title": "not allowed", "status": status, "detail": detail}).encode()
-    headers = [
-        (b"content-type", b"application/problem+json"),
-        (b"content-length", str(len(body)).encode()),
-        (b"connection", b"close"),
-        *([(b"www-authenticate", b"Bearer")] if status == 401 else []),
-    ]
+    more = {"www-authenticate": "Bearer"} if status == 401 else {}
+    headers, body = closing_problem(status, "not allowed", detail, more)
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})
+
+
+def closing_problem(
+    status: int, title: str, detail: str, more: Mapping[str, str] | None = None
+) -> tuple[list[tuple[bytes, bytes]], bytes]:
+    """Return the headers and the body of an error response (RFC 9457) after which the connection is closed."""
+    body = json.dumps({"title": title, "status": status, "detail": detail}).encode()
+    length = {"content-type": PROBLEM, "content-length": str(len(body)), "connection": "close"}
+    headers = length | SAFE | dict(more or {})
+    return [(name.lower().encode(), value.encode()) for name, value in headers.items()], body
 
 
 def _host_of(address: str) -> str | None:

@@ -20,25 +20,18 @@ from starlette.responses import Response
 from starlette.routing import Route
 from starlette.types import Scope
 
-from bidnerf_core.service.access import Access, describe_client
+from bidnerf_core.service.access import PROBLEM, SAFE, Access, describe_client
 from bidnerf_core.service.description import description
 from bidnerf_core.service.metrics import TEXT
 from bidnerf_core.service.pool import Full, Job, Lost, Pool, TimedOut
 from bidnerf_core.service.requests import JSON, Query, Refused, body_of, json_of, query_of
-from bidnerf_core.service.settings import ChosenMethod, ServiceConfig
+from bidnerf_core.service.settings import ChosenMethod, ServiceLimits
 
 log = logging.getLogger("bidnerf.service")
 
-PROBLEM = "application/problem+json"
 OSCP = "application/vnd.oscp+json"
 CLIENT_GONE = 499
 """The status in the log and the metrics for a client that disconnected before the response; nobody receives it."""
-SAFE = {
-    "X-Content-Type-Options": "nosniff",
-    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
-    "Cache-Control": "no-store",
-}
-"""Headers of every response: names in it are text, whatever a browser might make of them."""
 TITLES = {
     400: "bad request", 401: "no valid token", 403: "not allowed", 404: "not found", 405: "method not allowed",
     408: "upload too slow", 413: "too large", 422: "not localized", 429: "too many requests", 500: "internal error",
@@ -49,7 +42,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 def application(
-    maps: Mapping[str, Path], config: ServiceConfig, token: str | None, method: ChosenMethod
+    maps: Mapping[str, Path], limits: ServiceLimits, token: str | None, method: ChosenMethod
 ) -> Starlette:
     """Build the service for the maps in some folders, by name; it runs between ASGI startup and shutdown.
 
@@ -58,7 +51,7 @@ def application(
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        pool = Pool(maps, config, method)
+        pool = Pool(maps, limits, method)
         await pool.start()
         app.state.pool = pool
         try:
@@ -79,12 +72,15 @@ def application(
         Route("/maps/{map}/geopose", _logged(_geopose), methods=["GET", "POST"], name="/maps/{map}/geopose"),
     ]
     handlers: Any = {HTTPException: _unknown, 405: _unknown}
-    return Starlette(
+    app = Starlette(
         routes=routes,
         lifespan=lifespan,
         exception_handlers=handlers,
         middleware=[Middleware(Access, token=token, refused=_refused)],
     )
+    app.state.protected = token is not None
+    app.router.redirect_slashes = False  # a path with a slash too many is unknown, as every other
+    return app
 
 
 def _logged(handler: Handler) -> Handler:
@@ -139,6 +135,8 @@ def _json(value: Any, kind: str = JSON) -> Response:
 
 async def _unknown(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
+    request.app.state.pool.metrics.requests["unknown", error.status_code] += 1
+    _log(request.scope, error.status_code, 0.0, {})
     return problem(error.status_code, error.detail, error.headers)
 
 
@@ -164,7 +162,7 @@ async def _metrics(request: Request) -> Response:
 
 async def _description(request: Request) -> Response:
     pool: Pool = request.app.state.pool
-    return _json(description(list(pool.described), pool.config))
+    return _json(description(list(pool.described), pool.limits, request.app.state.protected))
 
 
 async def _maps(request: Request) -> Response:
@@ -181,7 +179,7 @@ async def _localize(request: Request) -> Response:
     """Respond with the JSON of ``bidnerf localize``."""
     pool: Pool = request.app.state.pool
     with _place(pool):
-        content = await body_of(request, pool.config)
+        content = await body_of(request, pool.limits)
         query = await query_of(request, content)
         del content
         name = _chosen(request, query.parameters.pop("map", None))  # without one, the map is found
@@ -193,9 +191,10 @@ async def _geopose(request: Request) -> Response:
     """Respond to a request of the GeoPose Protocol; a GET checks that the service runs."""
     pool: Pool = request.app.state.pool
     if request.method != "POST":
+        _chosen(request, None)
         return _json({"status": "running"})
     with _place(pool):
-        body = json_of(await body_of(request, pool.config))
+        body = json_of(await body_of(request, pool.limits))
         name = _chosen(request, request.query_params.get("map"))
         if name is None:  # the answer refers to one anchor, and prior poses to one world
             names = ", ".join(pool.described)
@@ -214,7 +213,7 @@ def _place(pool: Pool) -> Any:
             yield
     except Full as error:
         headers = {"Retry-After": str(pool.retry_after), "Connection": "close"}
-        raise Refused(429, f"all {pool.config.places} places are taken, try again later", headers) from error
+        raise Refused(429, f"all {pool.limits.places} places are taken, try again later", headers) from error
 
 
 def _chosen(request: Request, asked: str | None) -> str | None:
@@ -235,7 +234,7 @@ async def _answer(
 ) -> dict[str, Any]:
     """Return a worker's answer; stop the work if the client disconnects. Raises ``Refused``."""
     loop = asyncio.get_running_loop()
-    deadline = loop.time() + pool.config.timeout
+    deadline = loop.time() + pool.limits.timeout
     job = Job(kind, name, query.parameters, query.blocks, deadline, loop.create_future(), body)
     facts = request.state.facts
     facts |= {"id": job.id, "map": name, "bytes": sum(map(len, query.blocks.values()))}
@@ -246,7 +245,7 @@ async def _answer(
             raise Refused(CLIENT_GONE, "the client has left")
         answer = answering.result()
     except TimedOut as error:
-        raise Refused(504, f"no answer within {pool.config.timeout:g} s") from error
+        raise Refused(504, f"no answer within {pool.limits.timeout:g} s") from error
     except Lost as error:
         raise Refused(422, "the request crashed every worker that took it") from error
     finally:

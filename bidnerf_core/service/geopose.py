@@ -60,6 +60,7 @@ def answer(
     request.
     """
     request = Record("request", body)
+    _check_unused(request)
     reading = _reading(request)
     blocks = {"photo": reading.image} | _camera(reading) | _prior(anchor, request)
     name = (reading.record.text("sensorId") or "camera")[:LONGEST_NAME]
@@ -81,6 +82,15 @@ def answer(
         "localization": plain,
     }  # fmt: skip
     return {"status": 200, "body": answered, "outcome": plain["outcome"]}
+
+
+def _check_unused(request: Record) -> None:
+    """Raise ``InputError`` for values of another type than the protocol says, of keys that change nothing here."""
+    request.number("timestamp")
+    request.text("type")
+    for sensor in _records(request, "sensors"):
+        sensor.text("id")
+        sensor.text("type")
 
 
 def accuracy(found: Localization, anchor: Anchor | None) -> dict[str, float] | None:
@@ -125,10 +135,9 @@ def _quaternion(R_frame_camera: Float[Tensor, "3 3"]) -> dict[str, float]:
 
 def _reading(request: Record) -> _Reading:
     """Return the single image of a request."""
-    readings = _object(request, "sensorReadings").items("cameraReadings") or []
-    records = [Record("cameraReadings", reading) for reading in readings if isinstance(reading, dict)]
-    if len(readings) != 1 or not records:
-        raise InputError(f"request: {len(readings)} cameraReadings, expected one")
+    records = _records(_object(request, "sensorReadings"), "cameraReadings")
+    if len(records) != 1:
+        raise InputError(f"request: {len(records)} cameraReadings, expected one")
     (record,) = records
     orientation = _object(record, "imageOrientation")
     if orientation.value("mirrored") or orientation.number("rotation"):
@@ -156,14 +165,22 @@ def _object(record: Record, key: str) -> Record:
     return Record(f"{record.where}: {key}", found or {})
 
 
+def _records(record: Record, key: str) -> list[Record]:
+    """Return the objects in a list; none if it is missing."""
+    items = record.items(key) or []
+    if not all(isinstance(item, dict) for item in items):
+        raise record.error(f"{key} holds something other than objects")
+    return [Record(key, item) for item in items]
+
+
 def _numbers(record: Record, key: str) -> list[float]:
     return [record.checked_number(value, key) for value in record.items(key) or []]
 
 
 def _size(record: Record) -> tuple[int, int] | None:
-    size = _numbers(record, "size")
-    if not size:
+    if record.value("size") is None:
         return None
+    size = _numbers(record, "size")
     if len(size) != 2 or not all(1 <= value <= 1e6 and value == int(value) for value in size):
         raise record.error("size: expected width and height")
     return int(size[0]), int(size[1])
@@ -205,10 +222,12 @@ def _camera(reading: _Reading) -> dict[str, bytes]:
 
 def _prior(anchor: Anchor | None, request: Record) -> dict[str, bytes]:
     """Return the last of the prior poses as a start. Without an anchor, geoposes cannot be related to the map."""
-    priors = [prior for prior in request.items("priorPoses") or [] if isinstance(prior, dict)]
-    if anchor is None or not priors:
-        return {}
-    pose = _object(Record("priorPoses", priors[-1]), "geopose")
+    priors = [_geographic_prior(prior) for prior in _records(request, "priorPoses")]
+    return {"start": _matrix(anchor.T_world_camera(priors[-1]))} if anchor is not None and priors else {}
+
+
+def _geographic_prior(prior: Record) -> GeographicPose:
+    pose = _object(prior, "geopose")
     position, quaternion = _object(pose, "position"), _object(pose, "quaternion")
     lat, lon, h = (_required(position, key) for key in ("lat", "lon", "h"))
     q = torch.tensor([_required(quaternion, key) for key in "xyzw"], dtype=torch.float64)
@@ -216,8 +235,7 @@ def _prior(anchor: Anchor | None, request: Record) -> dict[str, bytes]:
     if not 0.9 < length < 1.1:
         raise quaternion.error(f"has length {length:.3g}, expected 1")
     rotation = SE3.from_quaternion(q, q.new_zeros(3), "xyzw").rotation @ R_CAMERA_BODY.mT
-    T_world_camera = anchor.T_world_camera(GeographicPose(Geodetic(lat, lon, h), rotation))
-    return {"start": _matrix(T_world_camera)}
+    return GeographicPose(Geodetic(lat, lon, h), rotation)
 
 
 def _required(record: Record, key: str) -> float:

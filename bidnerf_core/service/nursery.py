@@ -49,7 +49,7 @@ def _prepared(control: socket.socket, order: dict[str, Any]) -> Worker | None:
     cv2.setNumThreads(1)
     try:
         maps = {name: Path(folder) for name, folder in order["maps"].items()}
-        method = ChosenMethod(order["name"], order["settings"], order["device"])
+        method = ChosenMethod(order["name"], order["config"], order["device"])
         worker = Worker.load(maps, method, order["max_pixels"], Path(order["folder"]))
     except (InputError, OSError, RuntimeError, MemoryError) as error:
         wire.send(control, {"error": str(error) or type(error).__name__})

@@ -28,7 +28,7 @@ from typing import Any
 from bidnerf_core.errors import InputError
 from bidnerf_core.service import wire
 from bidnerf_core.service.metrics import Metrics
-from bidnerf_core.service.settings import MEBIBYTE, ChosenMethod, ServiceConfig
+from bidnerf_core.service.settings import MEBIBYTE, ChosenMethod, ServiceLimits
 
 ATTEMPTS = 3
 """Number of workers that a request may crash before it is answered with an error."""
@@ -107,8 +107,8 @@ class WorkerProcess:
 class Pool:
     """The worker processes and their queue. All methods must run in the same event loop."""
 
-    def __init__(self, maps: Mapping[str, Path], config: ServiceConfig, method: ChosenMethod) -> None:
-        self.config, self.metrics = config, Metrics()
+    def __init__(self, maps: Mapping[str, Path], limits: ServiceLimits, method: ChosenMethod) -> None:
+        self.limits, self.metrics = limits, Metrics()
         self.described: dict[str, Any] = {}
         self._order = {"maps": {name: str(folder) for name, folder in maps.items()}} | asdict(method)
         self._waiting: deque[Job] = deque()
@@ -147,7 +147,7 @@ class Pool:
             if isinstance(error, OSError | EOFError):
                 raise InputError("the process that loads the maps died; was memory short?") from error
             raise
-        self._tasks = [asyncio.create_task(self._work(number)) for number in range(self.config.processes)]
+        self._tasks = [asyncio.create_task(self._work(number)) for number in range(self.limits.processes)]
 
     async def close(self) -> None:
         """End all processes and remove their leftovers."""
@@ -165,7 +165,7 @@ class Pool:
     @contextlib.contextmanager
     def place(self) -> Iterator[None]:
         """Hold one of the service's places for requests. Raises ``Full`` if none is left."""
-        if self._taken >= self.config.places:
+        if self._taken >= self.limits.places:
             raise Full
         self._taken += 1
         try:
@@ -178,7 +178,7 @@ class Pool:
         """Whole seconds after which a place is likely to be free."""
         counted = sum(self.metrics.seconds.counts)
         mean = self.metrics.seconds.total / counted if counted else 1.0
-        return max(1, min(60, round(mean * self.config.queue / self.config.processes)))
+        return max(1, min(60, round(mean * self.limits.queue / self.limits.processes)))
 
     async def answer(self, job: Job) -> dict[str, Any]:
         """Return a worker's answer to a request; cancelling the call stops the work.
@@ -312,7 +312,7 @@ class Pool:
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
             )
         self._control = ours
-        order = {**self._order, "max_pixels": self.config.max_megapixels * 1e6, "folder": self._folder.name}
+        order = {**self._order, "max_pixels": self.limits.max_megapixels * 1e6, "folder": self._folder.name}
         reply = await asyncio.to_thread(_ordered, ours, order)
         if reply is None:
             raise InputError("the process that loads the maps died; was memory short?")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import re
 from collections.abc import AsyncGenerator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
@@ -16,13 +17,15 @@ from starlette.requests import ClientDisconnect, Request
 
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.json import parse_json
-from bidnerf_core.service.settings import MEBIBYTE, ServiceConfig
+from bidnerf_core.service.settings import MEBIBYTE, ServiceLimits
 from bidnerf_core.settings import LARGEST_SEED
 
 LONGEST_NAME = 200
 """Characters of a name in an answer."""
 FIELDS = 16
 """Largest number of parts of a form."""
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+"""A number as a program writes it; Python's ``float`` takes digits of every script and underscores too."""
 FILES = ("photo", "depth", "camera", "start")
 """The parts of a form that contain files. ``camera`` and ``start`` may be query parameters as well."""
 MULTIPART, JSON = "multipart/form-data", "application/json"
@@ -48,10 +51,7 @@ def number(low: float, high: float) -> Callable[[str, str], float]:
     """Return a parser for a number in a range."""
 
     def parse(name: str, text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
+        value = float(text) if NUMBER.fullmatch(text) else math.nan
         if not low <= value <= high:
             raise Refused(400, f"{name} is {_short(text)}, expected a number from {low:g} to {high:g}")
         return value
@@ -82,24 +82,24 @@ PARAMETERS: dict[str, Callable[[str, str], Any]] = {
 """Parsers of the query parameters, which may be form fields as well."""
 
 
-async def body_of(request: Request, config: ServiceConfig) -> bytes:
+async def body_of(request: Request, limits: ServiceLimits) -> bytes:
     """Read the body of a request. Raises ``Refused`` for one that is too large or does not arrive in time."""
     close = {"Connection": "close"}  # the rest of the body is not read
     announced = request.headers.get("content-length", "0")
-    most = f"expected at most {config.max_megabytes:g} MiB"
+    most = f"expected at most {limits.max_megabytes:g} MiB"
     if not (announced.isascii() and announced.isdigit() and len(announced) <= 20):
         raise Refused(400, f"Content-Length is {_short(announced)}, expected a number", close)
-    if int(announced) > config.max_bytes:
+    if int(announced) > limits.max_bytes:
         raise Refused(413, f"the request has {int(announced) / MEBIBYTE:,.0f} MiB, {most}", close)
     content = bytearray()
     try:
-        async with asyncio.timeout(config.upload_timeout):
+        async with asyncio.timeout(limits.upload_timeout):
             async for chunk in request.stream():
                 content += chunk
-                if len(content) > config.max_bytes:
+                if len(content) > limits.max_bytes:
                     raise Refused(413, f"the request is too large, {most}", close)
     except TimeoutError as error:
-        late = f"the request did not arrive within {config.upload_timeout:g} s"
+        late = f"the request did not arrive within {limits.upload_timeout:g} s"
         raise Refused(408, late, close) from error
     except ClientDisconnect as error:
         raise Refused(499, "the client disconnected") from error

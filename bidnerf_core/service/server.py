@@ -12,10 +12,10 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.service.settings import ChosenMethod, ServiceConfig, checked_token
+from bidnerf_core.service.settings import ChosenMethod, ServiceLimits, checked_token
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -34,22 +34,23 @@ ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if h
 NAME = re.compile(r"[\w.-]{1,100}")
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
-Maps = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
+Scenes: TypeAlias = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
 """The folders of maps, named by themselves or explicitly."""
 
 
 def service_app(
-    maps: Maps,
+    scenes: Scenes,
     *,
-    config: ServiceConfig | None = None,
-    token: str | None = None,
     method: str = "auto",
-    settings: Mapping[str, Any] | None = None,
+    config: Any = None,
     device: str = "cpu",
+    limits: ServiceLimits | None = None,
+    token: str | None = None,
 ) -> Starlette:
     """Return the service for the maps in some folders as an ASGI application, for your own server.
 
-    ``method``, with its ``settings`` by name, finds the poses on ``device``.
+    ``method`` finds the poses on ``device``; ``config`` holds its settings, as an instance of their type or a dictionary of those
+    that differ from the defaults.
 
     Its workers are single-threaded processes, started at ASGI startup and ended at shutdown. Without a
     ``token`` it answers only requests addressed to localhost. Raises ``InputError`` for invalid names and
@@ -59,30 +60,29 @@ def service_app(
         from bidnerf_core.service.app import application
     except ImportError as error:
         raise InputError(NEEDS) from error
-    return application(
-        named(maps), config or ServiceConfig(), checked_token(token), ChosenMethod(method, settings, device)
-    )
+    chosen = ChosenMethod.of(method, config, device)
+    return application(named(scenes), limits or ServiceLimits(), checked_token(token), chosen)
 
 
 def serve(
-    maps: Maps,
+    scenes: Scenes,
     *,
     host: str | None = None,
     port: int = PORT,
-    token: str | None = None,
-    config: ServiceConfig | None = None,
     method: str = "auto",
-    settings: Mapping[str, Any] | None = None,
+    config: Any = None,
     device: str = "cpu",
+    limits: ServiceLimits | None = None,
+    token: str | None = None,
     ready: Callable[[str, str | None], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
-    ``maps``: folders of maps, a list of them, or folders by the names under which clients ask for them. Only
+    ``scenes``: the folder of a map, a list of them, or folders by the names under which clients ask for them. Only
     programs on this machine are answered, unless a ``host``, such as 0.0.0.0, is given: clients then need the
-    ``token``, which is generated if none is given. ``port`` 0 picks a free one. ``ready`` is called with the
-    address and the token once requests are answered. Raises ``InputError`` for maps and settings that cannot
+    ``token``, which is generated if none is given. ``port`` 0 picks a free one. ``method``, ``config`` and ``device`` are those of
+    ``service_app``. ``ready`` is called with the address and the token once requests are answered. Raises ``InputError`` for maps and settings that cannot
     be served, and for a port that is taken.
     """
     try:
@@ -96,7 +96,7 @@ def serve(
     from bidnerf_core.service.access import is_loopback
 
     token = token or (None if host is None or is_loopback(host) else secrets.token_urlsafe(24))
-    app = service_app(maps, config=config, token=token, method=method, settings=settings, device=device)
+    app = service_app(scenes, method=method, config=config, device=device, limits=limits, token=token)
     run_app(app, host, port, lambda address: ready and ready(address, token), stop)
 
 
@@ -122,11 +122,13 @@ def run_app(
         asyncio.run(_run(app, uvicorn.Server(options), bound, ready, stop))
 
 
-def named(maps: Maps) -> dict[str, Path]:
+def named(scenes: Scenes) -> dict[str, Path]:
     """Return the folders of maps by name, by default their own names. Raises ``InputError`` for invalid names."""
-    if isinstance(maps, str | Path):
-        maps = [maps]
-    pairs = [*maps.items()] if isinstance(maps, Mapping) else [(Path(m).resolve().name, m) for m in maps]
+    if isinstance(scenes, str | Path):
+        scenes = [scenes]
+    pairs = (
+        [*scenes.items()] if isinstance(scenes, Mapping) else [(Path(m).resolve().name, m) for m in scenes]
+    )
     if not pairs:
         raise InputError("no map to serve, expected folders of maps")
     for name, folder in pairs:
@@ -206,7 +208,10 @@ async def _signals_end(server: Any) -> AsyncIterator[None]:
 
 def _patient() -> type[Any]:
     """Return uvicorn's protocol with additional limits: on the time of a request's head, and on connections."""
+    import h11
     from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    from bidnerf_core.service.access import closing_problem
 
     class Limited(H11Protocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -220,6 +225,15 @@ def _patient() -> type[Any]:
             answered = self.cycle  # before the next request, which may have arrived already
             super().on_response_complete()
             self.loop.call_later(IDLE_SECONDS + HEAD_SECONDS, self._close_if_silent, answered)
+
+        def send_400_response(self, msg: str) -> None:
+            """Answer bytes that are not HTTP as other bad requests are answered, and close the connection."""
+            headers, body = closing_problem(400, "bad request", "not a valid HTTP request")
+            response = h11.Response(status_code=400, headers=headers, reason=b"Bad Request")
+            with contextlib.suppress(h11.LocalProtocolError):  # an answer has begun already
+                for event in (response, h11.Data(data=body), h11.EndOfMessage()):
+                    self.transport.write(self.conn.send(event) or b"")
+            self.transport.close()
 
         def _close_if_silent(self, last: Any) -> None:
             """Close the connection if no request has arrived since ``last``, even if bytes have."""

@@ -1,13 +1,14 @@
-"""The settings of the service: what it serves, and the limits on requests."""
+"""What the service is told: the limits on requests, how poses are found, and the token."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.settings import to_flat
 
 MEBIBYTE = 2**20
 LEAST_TOKEN = 16
@@ -21,18 +22,20 @@ def usual_workers() -> int:
 
 
 @dataclass(frozen=True)
-class ServiceConfig:
+class ServiceLimits:
     """How many requests are served at a time, and the limits of each.
 
-    A request counts from the moment its head has arrived: ``queue`` bounds the memory of uploads as well.
+    A request counts from the moment its head has arrived, so that ``queue`` bounds the memory of uploads too.
     """
 
     workers: int = 0  # processes that localize, each with one thread; 0: one per core
-    queue: int = 16  # requests that may upload or wait besides those being processed; others get status 429
-    timeout: float = 60.0  # seconds from a complete request to its answer; its worker is then stopped
-    upload_timeout: float = 20.0  # seconds within which a complete request must arrive
-    max_megabytes: float = 32.0  # size of a request (2^20 bytes)
-    max_megapixels: float = 50.0  # size of an image, from its header, before it is decoded
+    queue: int = 16  # requests that may upload or wait besides those at work; further ones get status 429
+    timeout: float = (
+        60.0  # seconds for the answer to a complete request; then status 504, and its work is stopped
+    )
+    upload_timeout: float = 20.0  # seconds within which a request must have arrived; else status 408
+    max_megabytes: float = 32.0  # largest request, in MiB; a larger one gets status 413
+    max_megapixels: float = 50.0  # largest image, by the size in its header; a larger one gets status 422
 
     def __post_init__(self) -> None:
         """Raise ``InputError`` for numbers out of range."""
@@ -64,8 +67,19 @@ class ChosenMethod:
     """How poses are found, and on which device."""
 
     name: str = "auto"
-    settings: Mapping[str, Any] | None = None  # of the method, by name; the others keep their defaults
+    config: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # settings by name; the others keep their defaults
     device: str = "cpu"
+
+    @staticmethod
+    def of(name: str, config: Any, device: str) -> ChosenMethod:
+        """Return a method with its settings as given to Python's functions: an instance of their type, a dictionary, or None."""
+        if config is not None and not isinstance(config, Mapping) and not is_dataclass(config):
+            raise InputError(
+                f"config is a {type(config).__name__}, expected settings of {name}, or a dictionary"
+            )
+        return ChosenMethod(name, dict(to_flat(config) if is_dataclass(config) else config or {}), device)
 
 
 def checked_token(token: str | None) -> str | None:

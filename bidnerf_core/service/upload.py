@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.queries import Photos
 from bidnerf_core.errors import InputError
@@ -37,12 +36,11 @@ class Upload:
         return int(self.parameters.get("seed") or 0)
 
     def read(
-        self, assumed: tuple[Intrinsics, ...], background: Background, folder: Path, max_pixels: float
+        self, usual: CameraSource, background: Background, folder: Path, max_pixels: float
     ) -> tuple[Photos, SE3 | None]:
         """Write the files into ``folder``, check the sizes in their headers, and return the photo and the start.
 
-        ``assumed`` are the cameras that a photo without a focal length may have, and ``background`` is what lies
-        behind transparent pixels.
+        ``usual`` is the camera of photos that come without one, and ``background`` is what lies behind transparent pixels.
         """
         photo = _written(folder, "photo", self.blocks["photo"])
         _check_size(photo, max_pixels)
@@ -54,12 +52,9 @@ class Upload:
             raise InputError(
                 "depth_unit was given without depth, expected the depth image that it belongs to"
             )
-        camera = CameraSource(
-            self._file(folder, "camera"),
-            self.parameters.get("focal"),
-            self.parameters.get("hfov"),
-            assumed,
-        )
+        focal, hfov = self.parameters.get("focal"), self.parameters.get("hfov")
+        own = CameraSource(self._file(folder, "camera"), focal, hfov, usual.assumed)
+        camera = own if own.is_given else usual
         photos = Photos([photo], camera, {} if depth is None else {photo: depth}, unit, background=background)
         start = self._file(folder, "start")
         return photos, None if start is None else read_pose(start)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import BLACK
 from bidnerf_core.localization import Localizer, settings_of
@@ -24,7 +25,7 @@ from bidnerf_core.service.settings import ChosenMethod
 from bidnerf_core.service.upload import Upload
 
 OK, UNUSABLE, FAULT = 200, 422, 500
-TOLD = ("backend", "cameras", "landmarks", "surfels", "distances", "bounds", "complete", "bidnerf")
+TOLD = ("backend", "cameras", "landmarks", "surfels", "unit", "distances", "bounds", "complete", "bidnerf")
 """The facts about a map that clients may see. The others name photos and folders."""
 
 
@@ -60,7 +61,7 @@ class Worker:
 
         On devices other than the CPU, each worker creates its own localizer: no accelerator survives a fork.
         """
-        config = settings_of(method.name, dict(method.settings or {}), "settings")
+        config = settings_of(method.name, dict(method.config))
         served = dict[str, Served]()
         for name, place in maps.items():
             scene = load_map(place)
@@ -120,15 +121,18 @@ class Worker:
 
     def _localize(self, served: Served, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
         """Localize a photo; return the answer, and its JSON values as printed by ``bidnerf localize --json``."""
-        assumed, background = served.localizer.assumed_cameras, served.scene.bounds.background
-        photos, start = upload.read(assumed, background, folder, self.max_pixels)
+        usual, background = (
+            CameraSource(assumed=served.localizer.assumed_cameras),
+            served.scene.bounds.background,
+        )
+        photos, start = upload.read(usual, background, folder, self.max_pixels)
         answers = localize_each(served.localizer, photos, start=lambda _: start, seed=upload.seed)
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}
 
     def _placed(self, maps: MapCollection, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
         """Localize a photo in the map that it shows; return the answer and its JSON values, with that map."""
-        photos, start = upload.read(maps.cameras, BLACK, folder, self.max_pixels)
+        photos, start = upload.read(CameraSource(assumed=maps.cameras), BLACK, folder, self.max_pixels)
         if start is not None:
             raise InputError(f"start was given without map, expected map as one of {', '.join(self.maps)}")
         answers = place_each(maps, photos, seed=upload.seed)

@@ -25,16 +25,17 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.queries import Query, QuerySource
 from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.localization import Localizer
 from bidnerf_core.maps.map import Map
 from bidnerf_core.progress import stopped_by
-from bidnerf_core.service.access import Access
-from bidnerf_core.service.app import SAFE, problem
+from bidnerf_core.service.access import SAFE, Access
+from bidnerf_core.service.app import problem
 from bidnerf_core.service.requests import Refused, body_of, json_of, query_of
-from bidnerf_core.service.settings import ServiceConfig
+from bidnerf_core.service.settings import ServiceLimits
 from bidnerf_core.service.upload import Upload
 from bidnerf_core.viewer.jobs import Busy, Jobs
 from bidnerf_core.viewer.packing import jpeg
@@ -61,23 +62,24 @@ class Shown:
     localizer: Localizer
     source: QuerySource | None
     state: PageState
+    camera: CameraSource  # of photos whose field of view is not given with them
 
     @property
     def map(self) -> Map:
         """The map."""
-        assert isinstance(self.localizer.map, Map)
-        return self.localizer.map
+        assert isinstance(self.localizer.scene, Map)
+        return self.localizer.scene
 
 
-def viewer_app(shown: Shown, token: str | None = None, config: ServiceConfig | None = None) -> Starlette:
-    """Return the viewer as an ASGI application; ``config`` limits uploads.
+def viewer_app(shown: Shown, token: str | None = None, limits: ServiceLimits | None = None) -> Starlette:
+    """Return the viewer as an ASGI application; ``limits`` are those of uploads.
 
     Without a ``token``, only requests that are addressed to localhost are answered.
     """
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        app.state.shown, app.state.config = shown, config or ServiceConfig()
+        app.state.shown, app.state.limits = shown, limits or ServiceLimits()
         app.state.jobs, app.state.painter = Jobs(shown.localizer), ThreadPoolExecutor(1, "rendering")
         try:
             yield
@@ -169,15 +171,15 @@ async def _thumbnail(request: Request) -> Response:
 async def _photo(request: Request) -> Response:
     """Queue the localization of a photo, which is kept in a temporary folder until it is read."""
     state = request.app.state
-    query = await query_of(request, await body_of(request, state.config))
+    query = await query_of(request, await body_of(request, state.limits))
     upload = Upload(query.parameters, query.blocks)
 
     def read() -> Query:
         with tempfile.TemporaryDirectory(prefix="bidnerf-view-") as folder:
             try:
-                localizer, pixels = state.shown.localizer, state.config.max_megapixels * 1e6
-                background = localizer.map.bounds.background
-                photos, _ = upload.read(localizer.assumed_cameras, background, Path(folder), pixels)
+                localizer, pixels = state.shown.localizer, state.limits.max_megapixels * 1e6
+                background = localizer.scene.bounds.background
+                photos, _ = upload.read(state.shown.camera, background, Path(folder), pixels)
                 return named(photos.read(0), upload.name)
             except InputError as error:
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
@@ -211,7 +213,7 @@ async def _job(request: Request) -> Response:
 async def _view(request: Request) -> Response:
     """Respond with a rendering from the virtual camera of the page, unless the client disconnects before it is done."""
     state = request.app.state
-    asked = json_of(await body_of(request, state.config))
+    asked = json_of(await body_of(request, state.limits))
     camera, T, quick = asked_camera(asked)
     cancelled = threading.Event()
 

@@ -27,6 +27,10 @@ class PageState:
     queries: tuple[str, ...] = ()  # names of images that the server can localize
     trajectory: ShownTrajectory | None = None
     results: tuple[ShownRow, ...] = ()
+    hfov: float | None = None  # horizontal field of view (degrees) with which the page's field is filled in
+    camera_given: bool = (
+        False  # whether photos without a field of view have a given camera, not that of EXIF or the map
+    )
 
     def json(self) -> str:
         """Return the state as JSON that is safe to embed in a script element."""

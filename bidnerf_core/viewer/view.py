@@ -59,7 +59,7 @@ def view(
     ``localization`` is localized here, and the page then shows the search too. ``scene`` is a map, or a localizer with settings
     of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if it is neither.
     """
-    scene_map = scene.map if isinstance(scene, Localizer) else scene
+    scene_map = scene.scene if isinstance(scene, Localizer) else scene
     if not isinstance(scene_map, Map):
         raise InputError(
             f"view: scene is a {type(scene_map).__name__}, expected a Map, such as load_map returns"
@@ -100,9 +100,11 @@ def localized(
         return ShownAnswer(query.name, "bad input", False, str(error))
     if found_pose is not None:
         found_pose(
-            shown_answer(localizer.map, query.name, found, query.frame, record, query.truth, side, quick=True)
+            shown_answer(
+                localizer.scene, query.name, found, query.frame, record, query.truth, side, quick=True
+            )
         )
-    return shown_answer(localizer.map, query.name, found, query.frame, record, query.truth, side)
+    return shown_answer(localizer.scene, query.name, found, query.frame, record, query.truth, side)
 
 
 def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> ShownAnswer:

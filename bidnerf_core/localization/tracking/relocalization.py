@@ -100,7 +100,7 @@ def _searched(localizer: Localizer, frame: Frame, lost: int) -> bool:
     assert localizer.matcher is not None
     few = len(localizer.matcher.landmarks) < MANY_LANDMARKS  # else such an answer is not accepted
     return (lost == 0 or _due(lost, FIRST_FULL_SEARCH)) and (
-        localizer.map.surface is not None and (has_points(frame) or few)
+        localizer.scene.surface is not None and (has_points(frame) or few)
     )
 
 

@@ -12,6 +12,8 @@ export class Live {
     this.on = false;
     const choose = find("choose"), drop = find("drop");
     choose.hidden = find("fov").hidden = false;
+    if (page.state.hfov !== null) find("hfov").value = page.state.hfov;
+    if (page.state.camera_given) find("hfov").placeholder = "as given";
     find("photo").addEventListener("change", (event) => { for (const file of event.target.files) this.upload(file); event.target.value = ""; });
     let inside = 0;
     document.addEventListener("dragenter", (event) => { if (event.dataTransfer?.types.includes("Files")) { inside++; drop.hidden = false; } });
