@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -130,6 +131,7 @@ def _with_other_events(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tyro._errors.on_parse_error", registered)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 @pytest.mark.parametrize("changed", [_without_the_hook, _without_the_module, _with_other_events])
 @pytest.mark.parametrize(
     ("words", "message"),
@@ -141,9 +143,12 @@ def _with_other_events(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_refusals_are_a_line_with_another_version_of_the_parser_too(
-    bidnerf: Run, monkeypatch: pytest.MonkeyPatch, changed: Any, words: list[str], message: str
+    bidnerf: Run, monkeypatch: pytest.MonkeyPatch, changed: Any, words: list[str], message: str, encoding: str
 ) -> None:
     changed(monkeypatch)
+    monkeypatch.setattr(
+        sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    )  # of which boxes depend
     status, out, err = bidnerf(*words)
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"bidnerf {words[0]}: {message}")

@@ -65,12 +65,20 @@ def _hooked(hook: Callable[[Any], None]) -> contextlib.AbstractContextManager[No
 
 
 def _plain(text: str) -> str:
-    """Return a message that the parser printed in a box, without the box and without its hint at the help page."""
+    """Return the first sentences of a message that the parser printed: in a box or, on plain terminals, between rules."""
     rows = [row.strip() for row in COLOURS.sub("", text).splitlines()]
     inside = [row.strip(BORDERS).strip() for row in rows if row[:1] in BORDERS and row[-1:] in BORDERS]
-    body = [row for row in inside or rows if row]
-    end = next((number for number, row in enumerate(body) if not any(map(str.isalnum, row))), len(body))
-    return " ".join(body[:end]) or "wrong arguments"
+    is_boxed = any(inside)
+    groups = [list[str]()]
+    for row in inside if is_boxed else rows:
+        if any(map(str.isalnum, row)):
+            groups[-1].append(row)
+        elif row and groups[-1]:
+            groups.append([])
+    said = [" ".join(group) for group in groups if group]
+    return next(
+        iter(said if is_boxed else said[1:] or said), "wrong arguments"
+    )  # a box has its title in its border
 
 
 def _unknown_option(arguments: Sequence[str], options: Collection[str]) -> str | None:

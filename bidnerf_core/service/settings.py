@@ -30,9 +30,7 @@ class ServiceLimits:
 
     workers: int = 0  # processes that localize, each with one thread; 0: one per core
     queue: int = 16  # requests that may upload or wait besides those at work; further ones get status 429
-    timeout: float = (
-        60.0  # seconds for the answer to a complete request; then status 504, and its work is stopped
-    )
+    timeout: float = 60.0  # seconds for an answer, counted from the complete request; else status 504
     upload_timeout: float = 20.0  # seconds within which a request must have arrived; else status 408
     max_megabytes: float = 32.0  # largest request, in MiB; a larger one gets status 413
     max_megapixels: float = 50.0  # largest image, by the size in its header; a larger one gets status 422
