@@ -5,8 +5,8 @@
 SPLAT and HASHGRID are maps of DATA (``bidnerf train --backend gaussians``, ``--backend hashgrid``). Recorded are the quality of rendered test
 images (``--images``, evenly spaced), the size of the weights, the time of a training step of 2048 rays (rendering, loss, derivatives, Adam),
 for which both fields take turns in one process, and the answers of method ``auto`` to test frames without a start, from RGB and from
-RGB-D, in turn as well. ``--methods`` adds those that need a start, on a few frames (``--started``) from seeded starts that are
-``START`` away. Answers are kept in a ``.rows.jsonl`` next to the record, so that an interrupted run resumes where it
+RGB-D, in turn as well. ``--methods`` adds those that need a start, on a few frames (``--started``) of some scenes (``--start-in``)
+from seeded starts that are ``START`` away. Answers are kept in a ``.rows.jsonl`` next to the record, so that an interrupted run resumes where it
 stopped.
 """
 
@@ -161,7 +161,8 @@ def compared(triple: str, given: argparse.Namespace, store: RowStore) -> dict[st
     splat, grid, data = triple.split(":", 2)
     scenes = {"gaussians": Scene.open(f"{splat}:{data}"), "hashgrid": Scene.open(f"{grid}:{data}")}
     localized = answers(scenes, given, store)
-    descents = {method: started(scenes, method, given, store) for method in given.methods}
+    wanted = given.methods if Path(data).name in (given.start_in or [Path(data).name]) else []
+    descents = {method: started(scenes, method, given, store) for method in wanted}
     measured = {}
     for name, scene in scenes.items():
         measured[name] = store.get(
@@ -189,7 +190,13 @@ def main() -> None:
     )
     arguments.add_argument("--methods", nargs="*", default=[], help="methods that need a start")
     arguments.add_argument(
-        "--started", type=int, default=6, help="test frames with a start (default: %(default)s)"
+        "--start-in",
+        nargs="+",
+        metavar="DATA",
+        help="names of the data that they are tried on (default: all)",
+    )
+    arguments.add_argument(
+        "--started", type=int, default=4, help="test frames with a start (default: %(default)s)"
     )
     given = arguments.parse_args()
     one_thread()

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.captures.inria_cameras import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
@@ -47,7 +48,8 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     """Write a map into folder ``out`` in a format of other software, and return the files.
 
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
-      each) and cameras.ply (a pyramid for each camera);
+      each) and cameras.ply (a pyramid for each camera), and cameras.json (the cameras as 3D Gaussian splatting writes them, from which
+      ``import`` looks at the surface);
     - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks, without tracks;
     - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
@@ -83,6 +85,7 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
         what = f"{amount(len(images), 'camera')}, five points each, the first of which is its centre"
         files.append(out / "cameras.ply")
         write_file(files[-1], ply({"x y z": vertices}, head(scene, images, what), faces))
+        files += write_inria_cameras(out, scene.info.cameras)
     return files
 
 

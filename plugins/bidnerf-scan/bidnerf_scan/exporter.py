@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core import Map
+from bidnerf_core.captures.cameras import StoredCamera
+from bidnerf_core.captures.inria_cameras import write_inria_cameras
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io.files import write_file
 from bidnerf_core.results.export import head, ply
@@ -26,7 +29,7 @@ def export_ply(scene: Map, out: Path) -> list[Path]:
     columns = {"x y z": mesh.points, "nx ny nz": mesh.normals, "red green blue": mesh.rgb}
     tensors = {names: torch.from_numpy(column) for names, column in columns.items()}
     write_file(file, ply(tensors, head(scene, [], _content(mesh)), mesh.faces))
-    return [file]
+    return [file, *write_inria_cameras(out, scene.info.cameras)]
 
 
 def export_glb(scene: Map, out: Path) -> list[Path]:
@@ -74,7 +77,15 @@ def _export_upright(scene: Map, out: Path, ending: str) -> list[Path]:
     T_world_file = np.eye(4)
     T_world_file[:3, :3] = turn.T
     write_file(pose, (json.dumps(T_world_file.tolist()) + "\n").encode())
-    return [file, pose]
+    cameras = [_turned(camera, turn) for camera in scene.info.cameras]
+    return [file, pose, *write_inria_cameras(out, cameras)]
+
+
+def _turned(camera: StoredCamera, turn: Float64[np.ndarray, "3 3"]) -> StoredCamera:
+    rotation = np.eye(4)
+    rotation[:3, :3] = turn
+    rows = (rotation @ np.array(camera.T_world_camera)).tolist()
+    return replace(camera, T_world_camera=tuple((r[0], r[1], r[2], r[3]) for r in rows))
 
 
 def _y_upwards(scene: Map) -> Float64[np.ndarray, "3 3"]:

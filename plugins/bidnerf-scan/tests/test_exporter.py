@@ -17,6 +17,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.geometry.looking import look_at
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import SurfaceMap, surface_of_points
@@ -106,11 +107,19 @@ def test_the_importer_reads_the_mesh_in_the_frame_and_unit_of_the_map(
     assert b"triangles, on a grid with cells of" in content
     assert b"lengths in metres" in content
     assert (b"turned so that y is upwards" in content) == (pose is not None)
-    if pose is not None:  # both formats have y upwards
+    if pose is not None:  # these formats have y upwards
         assert T.rotation[:, 1].tolist() == pytest.approx([0, 0.6, 0.8])
-        found = import_map(files[f"mesh.{ending}"], T_world_file=T, bake=False)
-        upright = torch.stack([-camera.pose.rotation[:, 1] for camera in found.info.cameras])
-        assert float((upright @ torch.tensor([0, 0.6, 0.8], dtype=torch.float64)).median()) > 0.5
+    found = import_map(files[f"mesh.{ending}"], T_world_file=T, bake=False)
+    for own, other in zip(scene.info.cameras, found.info.cameras, strict=True):
+        assert own.name == other.name
+        assert torch.allclose(own.pose.matrix(), other.pose.matrix(), atol=1e-9)
+    image, seen = (
+        render_image(each.field, lens, own.pose, each.bounds)
+        for each, lens in ((scene, own.intrinsics), (found, other.intrinsics))
+    )
+    both = (image.opacity > 0.99) & (seen.opacity > 0.5)
+    assert float(both.float().mean()) > 0.9 * float((image.opacity > 0.99).float().mean())
+    assert float(((image.depth - seen.depth).abs() / image.depth)[both].median()) < 0.01
 
 
 def test_what_gives_no_mesh(scene: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
