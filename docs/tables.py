@@ -868,6 +868,25 @@ def splats(records: Records) -> str:
 
 
 @table
+def splats_from_starts(records: Records) -> str:
+    """Methods that need a start, in splats and in hash grids."""
+    rows = []
+    for scene, found in records["splats"]["scenes"].items():
+        for method, ways in found.get("from_starts", {}).items():
+            for mode in MODES:
+                for name, cell in ways[mode].items():
+                    accepted = f"{cell['converged']}, wrong {cell['silent']}"
+                    seconds = _seconds(cell["median_cpu_seconds"])
+                    right = (_of(cell[c]) for c in LIMITS)
+                    rows.append((SCENES[scene], f"`{method}`", mode, f"`{name}`", *right, accepted, seconds))
+    head = ("scene", "method", "input", "backend", *LIMITS.values(), "accepted", "CPU time")
+    return _table(head, rows, records)
+
+
+MODES = ("RGB", "RGB-D")
+
+
+@table
 def round_trips(records: Records) -> str:
     """Maps beside those that come from their exports."""
     rows = []
