@@ -148,9 +148,12 @@ def started(
     localizers = {name: Localizer(scene.map, method, config) for name, scene in scenes.items()}
     views = next(iter(scenes.values())).views(given.tuning_frames, given.started)
 
+    seeds = {view.frame.name: seed for seed, view in enumerate(views)}
+
     def found(name: str, mode: str, view: View) -> Row:
-        start = perturb(view.T_ref_camera, *START, seed=0)
-        key = [*scenes[name].key, method, settings, START, mode, view.frame.name]
+        seed = seeds[view.frame.name]
+        start = perturb(view.T_ref_camera, *START, seed=seed)
+        key = [*scenes[name].key, method, settings, START, seed, mode, view.frame.name]
         return store.get(key, lambda: answer(lambda: localizers[name](view.frame, start), view))
 
     return {"start": START, "settings": settings, **by_mode(scenes, views, method, found)}
