@@ -2,8 +2,8 @@
 
     python benchmarks/round_trips.py MAP:DATA [MAP:DATA ...] --folder WORK [--ways map cloud splat ...]
 
-The surface of each map is exported as a point cloud (``bidnerf export --to ply``) and as Gaussians (``--to splat.ply``, ``splat.spz``), and
-imported again (plugins ``bidnerf-scan``, ``bidnerf-gaussians``) with landmarks from the training photos (``--photos``), or with landmarks
+The surface of each map is exported as a point cloud (``bidnerf export --to ply``), as a mesh (``--to mesh.glb``) and as Gaussians
+(``--to splat.ply``, ``splat.spz``), and imported again (plugins ``bidnerf-scan``, ``bidnerf-gaussians``) with landmarks from the training photos (``--photos``), or with landmarks
 from images that the imported field renders. Method ``auto`` localizes the test frames without a start in all of them in turn, from RGB and from
 RGB-D. Answers are kept in a ``.rows.jsonl`` next to the record, and exports and maps in WORK, so that an interrupted run resumes
 where it stopped.
@@ -36,6 +36,8 @@ from _lab import (
 from bidnerf_core import Localizer, Map, export_map, import_map, load_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.frames.frame import View
+from bidnerf_core.results.pose_files import read_pose
 
 OWN = "map"
 """The map that the others come from."""
@@ -52,9 +54,11 @@ class Way:
 
 WAYS = {
     "cloud": Way("ply", "surface.ply"),
+    "mesh": Way("mesh.glb", "mesh.glb"),
     "splat": Way("splat.ply", "splat.ply"),
     "splat, compressed": Way("splat.spz", "splat.spz"),
     "cloud, no photos": Way("ply", "surface.ply", has_photos=False),
+    "mesh, no photos": Way("mesh.glb", "mesh.glb", has_photos=False),
     "splat, no photos": Way("splat.ply", "splat.ply", has_photos=False),
 }
 
@@ -72,10 +76,12 @@ def returned(scene: Scene, name: str, folder: Path) -> Map:
     except InputError:
         written = folder / f"{scene.name}-{way.to}"
         export_map(scene.map, written, way.to, overwrite=True)
+        pose = written / "T_world_file.json"  # where the export was turned
         return import_map(
             written / way.file,
             place,
             config={"background": scene.map.bounds.background},
+            T_world_file=read_pose(pose) if pose.exists() else None,
             photos=scene.data if way.has_photos else None,
             overwrite=True,
         )
@@ -97,17 +103,18 @@ def scene_rows(scene: Scene, given: argparse.Namespace, store: RowStore) -> dict
     """Return the answers by the kind of input and the way that their map took."""
     ways = [OWN, *(name for name in given.ways if name != OWN)]
     localizers = {name: once(lambda name=name: returned(scene, name, given.folder)) for name in ways}
+
+    def found_in(name: str, view: View) -> Row:
+        localizer = localizers[name]()  # made before the time is taken
+        return answer(lambda: localizer(view.frame), view)
+
     found: dict[str, dict[str, list[Row]]] = {}
     for mode, views in modes(scene.views(given.tuning_frames, given.frames)).items():
         rows: dict[str, list[Row]] = {name: [] for name in ways}
         for place, view in enumerate(views):
             for name in in_turn(ways, place):
                 key = [*scene.key, mode, name, view.frame.name]
-                rows[name].append(
-                    store.get(
-                        key, lambda view=view, name=name: answer(lambda: localizers[name]()(view.frame), view)
-                    )
-                )
+                rows[name].append(store.get(key, lambda view=view, name=name: found_in(name, view)))
         for name in ways:
             print(line(f"{scene.name} {mode} {name}", rows[name]), flush=True)
         found[mode] = rows

@@ -1,11 +1,12 @@
 """Gaussian splats that were trained here, beside hash grids of the same images.
 
-    python benchmarks/splats.py SPLAT:HASHGRID:DATA [SPLAT:HASHGRID:DATA ...] [--images 8] [--pairs 10]
+    python benchmarks/splats.py SPLAT:HASHGRID:DATA [SPLAT:HASHGRID:DATA ...] [--images 8] [--pairs 10] [--methods bid bid-lm]
 
 SPLAT and HASHGRID are maps of DATA (``bidnerf train --backend gaussians``, ``--backend hashgrid``). Recorded are the quality of rendered test
 images (``--images``, evenly spaced), the size of the weights, the time of a training step of 2048 rays (rendering, loss, derivatives, Adam),
 for which both fields take turns in one process, and the answers of method ``auto`` to test frames without a start, from RGB and from
-RGB-D, in turn as well. Answers are kept in a ``.rows.jsonl`` next to the record, so that an interrupted run resumes where it
+RGB-D, in turn as well. ``--methods`` adds those that need a start, on a few frames (``--started``) of some scenes (``--start-in``)
+from seeded starts that are ``START`` away. Answers are kept in a ``.rows.jsonl`` next to the record, so that an interrupted run resumes where it
 stopped.
 """
 
@@ -38,15 +39,20 @@ from _lab import (
 )
 from map_quality import judge
 
-from bidnerf_core import Localizer
+from bidnerf_core import Localizer, perturb, settings_of
 from bidnerf_core.backend import load_backend
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import View
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.training import Supervision
 
 RAYS = 2048
 """Rays of the training step that is timed."""
+START = (0.2, 10.0)
+"""Distance (metres) and angle (degrees) of the starts from the truth."""
+STEPS = {"bid": {"max_steps": 200, "rays": 512}}
+"""Settings of the methods that need a start, where they differ from the defaults."""
 WARM_UP = 2
 """Pairs of steps that are not counted."""
 
@@ -105,24 +111,49 @@ def quality(scene: Scene, images: int) -> dict[str, Any]:
 def answers(scenes: dict[str, Scene], given: argparse.Namespace, store: RowStore) -> dict[str, Any]:
     """Return summaries of the answers in each map, by the kind of input."""
     localizers = {name: Localizer(scene.map) for name, scene in scenes.items()}
-    first, found = next(iter(scenes.values())), {}
-    for mode, views in modes(first.views(given.tuning_frames, given.frames)).items():
+    views = next(iter(scenes.values())).views(given.tuning_frames, given.frames)
+
+    def found(name: str, mode: str, view: View) -> Row:
+        key = [*scenes[name].key, mode, view.frame.name]
+        return store.get(key, lambda: answer(lambda: localizers[name](view.frame), view))
+
+    return by_mode(scenes, views, "auto", found)
+
+
+def by_mode(
+    scenes: dict[str, Scene], views: list[View], method: str, found: Callable[[str, str, View], Row]
+) -> dict[str, Any]:
+    """Return summaries of what is found in each map in turn, by the kind of input."""
+    summaries: dict[str, Any] = {}
+    for mode, some in modes(views).items():
         rows: dict[str, list[Row]] = {name: [] for name in scenes}
-        for place, view in enumerate(views):
+        for place, view in enumerate(some):
             for name in in_turn(list(scenes), place):
-                key = [*scenes[name].key, mode, view.frame.name]
-                rows[name].append(
-                    store.get(
-                        key, lambda view=view, name=name: answer(lambda: localizers[name](view.frame), view)
-                    )
-                )
-        for name in scenes:
-            print(line(f"{first.name} {mode} {name}", rows[name]), flush=True)
-        found[mode] = {
-            name: {"n": len(some), **rates(some), **judgement(some), **cpu_seconds(some)}
-            for name, some in rows.items()
+                rows[name].append(found(name, mode, view))
+        for name, scene in scenes.items():
+            print(line(f"{scene.name} {mode} {method} {name}", rows[name]), flush=True)
+        summaries[mode] = {
+            name: {"n": len(part), **rates(part), **judgement(part), **cpu_seconds(part)}
+            for name, part in rows.items()
         }
-    return found
+    return summaries
+
+
+def started(
+    scenes: dict[str, Scene], method: str, given: argparse.Namespace, store: RowStore
+) -> dict[str, Any]:
+    """Return summaries of the answers of a method that needs a start."""
+    settings = STEPS.get(method, {})
+    config = settings_of(method, settings)
+    localizers = {name: Localizer(scene.map, method, config) for name, scene in scenes.items()}
+    views = next(iter(scenes.values())).views(given.tuning_frames, given.started)
+
+    def found(name: str, mode: str, view: View) -> Row:
+        start = perturb(view.T_ref_camera, *START, seed=0)
+        key = [*scenes[name].key, method, settings, START, mode, view.frame.name]
+        return store.get(key, lambda: answer(lambda: localizers[name](view.frame, start), view))
+
+    return {"start": START, "settings": settings, **by_mode(scenes, views, method, found)}
 
 
 def compared(triple: str, given: argparse.Namespace, store: RowStore) -> dict[str, Any]:
@@ -130,6 +161,8 @@ def compared(triple: str, given: argparse.Namespace, store: RowStore) -> dict[st
     splat, grid, data = triple.split(":", 2)
     scenes = {"gaussians": Scene.open(f"{splat}:{data}"), "hashgrid": Scene.open(f"{grid}:{data}")}
     localized = answers(scenes, given, store)
+    wanted = given.methods if Path(data).name in (given.start_in or [Path(data).name]) else []
+    descents = {method: started(scenes, method, given, store) for method in wanted}
     measured = {}
     for name, scene in scenes.items():
         measured[name] = store.get(
@@ -138,7 +171,8 @@ def compared(triple: str, given: argparse.Namespace, store: RowStore) -> dict[st
     keys = [key for scene in scenes.values() for key in scene.key]
     times = store.get([*keys, "steps", given.pairs], lambda: step_times(scenes, given.pairs))
     print(measured, times, flush=True)
-    return {"data": Path(data).name, "maps": measured, "step_of_2048_rays": times, "answers": localized}
+    kept = {"maps": measured, "step_of_2048_rays": times, "answers": localized, "from_starts": descents}
+    return {"data": Path(data).name, **kept}
 
 
 def main() -> None:
@@ -153,6 +187,16 @@ def main() -> None:
     )
     arguments.add_argument(
         "--pairs", type=int, default=10, help="timed steps of each field (default: %(default)s)"
+    )
+    arguments.add_argument("--methods", nargs="*", default=[], help="methods that need a start")
+    arguments.add_argument(
+        "--start-in",
+        nargs="+",
+        metavar="DATA",
+        help="names of the data that they are tried on (default: all)",
+    )
+    arguments.add_argument(
+        "--started", type=int, default=4, help="test frames with a start (default: %(default)s)"
     )
     given = arguments.parse_args()
     one_thread()

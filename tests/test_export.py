@@ -42,17 +42,17 @@ def read_ply(file: Path) -> tuple[list[str], np.ndarray]:
 
 def test_point_clouds(scene: Map, tmp_path: Path) -> None:
     files = bn.export_map(scene, tmp_path / "out", "ply")
-    assert [file.name for file in files] == ["cameras.ply", "landmarks.ply", "surface.ply"]
+    assert [file.name for file in files] == ["cameras.json", "cameras.ply", "landmarks.ply", "surface.ply"]
     assert scene.surface is not None
     assert scene.landmarks is not None
-    lines, surface = read_ply(files[2])
+    lines, surface = read_ply(files[3])
     assert "comment lengths in metres" in lines
     places = np.stack([surface[axis] for axis in "xyz"], axis=-1)
     np.testing.assert_array_equal(places, scene.surface.surfels.positions.numpy())
     assert np.abs(surface["red"] / 255 - scene.surface.surfels.rgb[:, 0].numpy()).max() < 0.01
-    _, landmarks = read_ply(files[1])
+    _, landmarks = read_ply(files[2])
     assert landmarks["photos"].tolist() == scene.landmarks.views.tolist()
-    _, cameras = read_ply(files[0])
+    _, cameras = read_ply(files[1])
     centre = scene.info.cameras[1].pose.translation
     np.testing.assert_allclose([cameras[axis][5] for axis in "xyz"], centre, atol=1e-6)
 

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.captures.inria_cameras import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
@@ -47,10 +48,11 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     """Write a map into folder ``out`` in a format of other software, and return the files.
 
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
-      each) and cameras.ply (a pyramid for each camera);
+      each) and cameras.ply (a pyramid for each camera), and cameras.json (the cameras as 3D Gaussian splatting writes them, from which
+      ``import`` looks at the surface);
     - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks, without tracks;
     - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
-    - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians``.
+    - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
 
     All use the frame and unit of the map, which their headers state. Images are named as in the map, without file
     extensions. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
@@ -75,14 +77,15 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
         parts = scene.surface.surfels
         columns = {"x y z": parts.positions, "nx ny nz": parts.normals, "red green blue": parts.rgb}
         files.append(out / "surface.ply")
-        write_file(files[-1], ply(columns, _head(scene, images, amount(len(parts), "surfel"))))
+        write_file(files[-1], ply(columns, head(scene, images, amount(len(parts), "surfel"))))
     if scene.landmarks is not None:
         files.append(_write_landmarks(scene, images, out))
     if images:
         vertices, faces = _pyramids(images, FRUSTUM * scene.bounds.side)
         what = f"{amount(len(images), 'camera')}, five points each, the first of which is its centre"
         files.append(out / "cameras.ply")
-        write_file(files[-1], ply({"x y z": vertices}, _head(scene, images, what), faces))
+        write_file(files[-1], ply({"x y z": vertices}, head(scene, images, what), faces))
+        files += write_inria_cameras(out, scene.info.cameras)
     return files
 
 
@@ -123,7 +126,7 @@ def _write_landmarks(scene: Map, images: list[PosedImage], out: Path) -> Path:
     landmarks = scene.landmarks
     assert landmarks is not None
     columns = {"x y z": landmarks.positions, "red green blue": _colours(scene), "photos": landmarks.views}
-    write_file(out / "landmarks.ply", ply(columns, _head(scene, images, amount(len(landmarks), "landmark"))))
+    write_file(out / "landmarks.ply", ply(columns, head(scene, images, amount(len(landmarks), "landmark"))))
     return out / "landmarks.ply"
 
 
@@ -159,7 +162,8 @@ def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | Non
     return "\n".join([*lines, "end_header", ""]).encode() + body
 
 
-def _head(scene: Map, images: list[PosedImage], what: str) -> list[str]:
+def head(scene: Map, images: Sequence[PosedImage], what: str) -> list[str]:
+    """Return the comments of a file: its content, the unit of lengths, the upward direction, and the frame of the images."""
     lengths = "metres" if scene.unit == "metres" else "units of unknown length"
     lines = ["written by bidnerf", what, f"lengths in {lengths}"]
     if scene.up is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core import Map
-from bidnerf_core.captures.cameras import StoredCamera
+from bidnerf_core.captures.inria_cameras import write_inria_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.scaled import ScaledField
-from bidnerf_core.io.files import write_file
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.formats import write_gaussians
@@ -45,11 +43,7 @@ def export_spz(scene: Map, out: Path) -> list[Path]:
 
 def _export(scene: Map, file: Path) -> list[Path]:
     write_gaussians(file, gaussians_of_map(scene))
-    if not scene.info.cameras:
-        return [file]
-    cameras = file.with_name("cameras.json")
-    write_file(cameras, (json.dumps(_inria_cameras(scene.info.cameras)) + "\n").encode())
-    return [file, cameras]
+    return [file, *write_inria_cameras(file.parent, scene.info.cameras)]
 
 
 def gaussians_of_map(scene: Map) -> Gaussians:
@@ -92,23 +86,3 @@ def _spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     found = torch.from_numpy(np.asarray(distances[:, 1:].mean(-1), dtype=np.float32))
     middle = float(found.median()) or float(found.max()) or 1.0
     return found.clamp(middle / WIDEST, middle * WIDEST)
-
-
-def _inria_cameras(cameras: tuple[StoredCamera, ...]) -> list[dict[str, object]]:
-    """Return cameras as Inria's code writes them; their principal point is the middle of the image."""
-    found = []
-    for number, camera in enumerate(cameras):
-        lens, pose = camera.intrinsics, camera.pose
-        found.append(
-            {
-                "id": number,
-                "img_name": camera.name,
-                "width": lens.width,
-                "height": lens.height,
-                "position": pose.translation.tolist(),
-                "rotation": pose.rotation.tolist(),
-                "fx": lens.fx,
-                "fy": lens.fy,
-            }
-        )
-    return found

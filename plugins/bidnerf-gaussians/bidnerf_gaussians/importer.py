@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -12,13 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import StoredCamera
-from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.captures.inria_cameras import cameras_beside
+from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import parse_record
 from bidnerf_core.maps.importers import UNMOVED, ImportedField, bounds_about
 from bidnerf_core.settings import NotNegative, Range, Settings
 from bidnerf_gaussians.field import GaussiansField
@@ -69,7 +65,7 @@ class GaussiansImporter:
         if found is None:
             raise InputError(f"{path}: not a readable file of Gaussians, expected {self.summary}")
         return imported(
-            found.read(path), str(path), config, placement, found, _cameras_beside(path, placement)
+            found.read(path), str(path), config, placement, found, cameras_beside(path, placement)
         )
 
 
@@ -135,40 +131,6 @@ def _distances(means: Float[Tensor, "n 3"], cameras: tuple[StoredCamera, ...]) -
         )
     eyes = torch.stack([camera.pose.translation for camera in cameras]).to(means)
     return torch.cat([torch.cdist(some, eyes).amin(1) for some in means.split(65536)])
-
-
-def _cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
-    """Return the cameras in the ``cameras.json`` that the original 3DGS code writes at the top of its output."""
-    folders = [path.parent, *list(path.parent.parents)[:2]]
-    file = next((folder / "cameras.json" for folder in folders if (folder / "cameras.json").is_file()), None)
-    if file is None:
-        return ()
-    try:
-        return _inria_cameras(file, placement)
-    except InputError as error:  # it may be another program's, unrelated to these Gaussians
-        warnings.warn(f"{error}; ignored", InputWarning, stacklevel=2)
-        return ()
-
-
-def _inria_cameras(file: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
-    record = parse_record(str(file), b'{"cameras":' + read_file(file, "cameras.json") + b"}")
-    cameras = []
-    for entry in record.items("cameras") or []:
-        try:
-            camera = Intrinsics(
-                float(entry["fx"]), float(entry["fy"]), entry["width"] / 2, entry["height"] / 2,
-                int(entry["width"]), int(entry["height"]),
-            )  # fmt: skip
-            rotation = torch.tensor(entry["rotation"], dtype=torch.float64)
-            position = placement.apply(torch.tensor(entry["position"], dtype=torch.float64))
-            pose = SE3(placement.T_target_source.rotation.double() @ rotation, position)
-            rows = tuple((r[0], r[1], r[2], r[3]) for r in pose.matrix().tolist())
-            cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise InputError(
-                f"{file}: camera {len(cameras)} is not readable ({error}), expected Inria's layout"
-            ) from error
-    return tuple(cameras)
 
 
 importer = GaussiansImporter()

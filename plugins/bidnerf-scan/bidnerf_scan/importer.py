@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf_core.captures.cameras import StoredCamera
+from bidnerf_core.captures.inria_cameras import cameras_beside
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import Rays, SceneBounds
 from bidnerf_core.geometry.similarity import Similarity
@@ -79,12 +81,14 @@ class ScanImporter:
         found = format_of(path)
         if found is None:
             raise InputError(f"{path}: not a readable mesh or point cloud, expected {self.summary}")
-        return imported(found.read(path), str(path), config, placement, found)
+        return imported(
+            found.read(path), str(path), config, placement, found, cameras_beside(path, placement)
+        )
 
 
 def imported(
     scan: Scan, where: str, config: ScanSettings = ScanSettings(), placement: Similarity = UNMOVED,
-    of: Format | None = None,
+    of: Format | None = None, cameras: tuple[StoredCamera, ...] = (),
 ) -> ImportedField:  # fmt: skip
     """Build a field from a scan of any source. Raises ``InputError`` if nothing in it can be rendered."""
     kept, dropped = cleaned(scan, where)
@@ -130,7 +134,7 @@ def imported(
         "scan", settings, dict(field.state_dict()), bounds, found=tuple(facts), steps=settings.steps, points=matter,
         up=(float(up[0]), float(up[1]), float(up[2])),
         surface=(matter, torch.full_like(matter, GREY) if colours is None else colours),
-        is_coloured=scan.has_colours, is_solid=solid,
+        is_coloured=scan.has_colours, is_solid=solid, cameras=cameras,
     )  # fmt: skip
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bidnerf_core.errors import InputError
+from bidnerf_scan.extras import library
 from bidnerf_scan.scan import Scan, joined
 
 
@@ -22,18 +21,9 @@ def recognises_e57(path: Path) -> bool:
     return path.suffix.lower() == ".e57"
 
 
-def _library(name: str, path: Path, extra: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(
-            f"{path}: reading it needs {name}, which is not installed (pip install 'bidnerf-scan[{extra}]')"
-        ) from error
-
-
 def read_las(path: Path) -> Scan:
     """Return the points of a LAS or LAZ file."""
-    laspy = _library("laspy", path, "las")
+    laspy = library("laspy", f"{path}: reading it", "las")
     try:
         with laspy.open(str(path)) as file:
             header = file.header
@@ -63,7 +53,7 @@ def read_las(path: Path) -> Scan:
 
 def read_e57(path: Path) -> Scan:
     """Read the points of all scans of an E57 file, each transformed by its pose."""
-    pye57 = _library("pye57", path, "e57")
+    pye57 = library("pye57", f"{path}: reading it", "e57")
     parts = []
     try:
         file = pye57.E57(str(path))
