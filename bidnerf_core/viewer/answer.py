@@ -170,7 +170,7 @@ def shown_answer(
         steps=_steps(found, record),
         path=_path(found.poses),
         matches=None if frame is None or record is None or not finite else _matches(frame, record),
-        figures=acceptance_figures(found, record, given is not None and given.focal_is_approximate),
+        figures=acceptance_figures(found, record),
         contests=contests(found, record),
         runner_up=other,
     )
