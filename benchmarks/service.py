@@ -1,15 +1,17 @@
 """The HTTP service under load, under kills and under attack, asked over sockets as clients do.
 
-    python benchmarks/service.py MAP:DATA [--seconds 60] [--workers 2] [--work FILE] [--part load kills malformed hostile]
+    python benchmarks/service.py MAP:DATA [--seconds 60] [--workers 2] [--work FILE] [--part load kills malformed hostile schema]
 
 - ``load``: 1, 4 and 16 clients ask for the poses of test images, with their depth, for some seconds each. Latency, memory (of all
   processes, shared pages counted once), and whether each answer is that of ``bidnerf localize``;
 - ``kills``: 4 clients, while a worker is killed every other second: no request may be lost;
 - ``malformed``: 1,000 requests whose bytes are drawn or changed at random, the head included: none may be answered with 5xx;
 - ``hostile``: a slow client, clients that leave, bodies of 2 GB, idle connections, images that decode to gigabytes, paths outside,
-  requests by other names of the host.
+  requests by other names of the host;
+- ``schema`` (where Schemathesis is installed): requests that are drawn from the service's own OpenAPI description, valid ones and
+  ones that contradict it, and photos in every way that it describes; without a token, and with one.
 
-Finished parts are kept in the file of ``--work``, and not repeated.
+Finished parts are kept in the file of ``--work``, with the commit that they ran on, and not repeated.
 """
 
 from __future__ import annotations
@@ -35,12 +37,18 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import urlsplit
 
+import _openapi
 import numpy as np
 from _lab import Row, parser, record
+
+from bidnerf_core.evaluation.provenance import provenance
 
 FORM = "multipart/form-data; boundary=boundary"
 CLIENTS = (1, 4, 16)
 GIGABYTES = 2 * 10**9
+TOKEN = "0123456789abcdef0123"
+SCHEMA_PHOTOS, SCHEMA_EXAMPLES = 4, 40
+"""Photos that Schemathesis sends, and the most requests that it draws for each operation."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +57,15 @@ class Photo:
 
     body: bytes
     expected: dict[str, Any]
+    image: bytes = b""
 
 
 class Server:
     """A running ``bidnerf serve``."""
 
     def __init__(self, folder: Path, *options: str) -> None:
-        command = [sys.executable, "-m", "bidnerf_core.cli", "serve", str(folder), "--port", "0", *options]
         program = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
-        command = [sys.executable, "-c", program, *command[3:]]
+        command = [sys.executable, "-c", program, "serve", str(folder), "--port", "0", *options]
         self.process = subprocess.Popen(
             command, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
         )
@@ -168,6 +176,7 @@ def photos(folder: Path, data: Path, count: int) -> list[Photo]:
                 name=image.stem.encode(),
             ),
             answer,
+            image.read_bytes(),
         )
         for image, d, answer in zip(images, depth, answers, strict=True)
     ]
@@ -355,12 +364,12 @@ def hostile(folder: Path, given: list[Photo], workers: int, seconds: float) -> R
         found["memory_MiB"] = {"before": before, "after": server.memory()}
     token = TemporaryDirectory()
     file = Path(token.name) / "token"
-    file.write_text("0123456789abcdef0123")
+    file.write_text(TOKEN)
     with token, served(folder, workers, "--host", "0.0.0.0", "--token-file", str(file)) as server:
         asked_for = b"GET /maps HTTP/1.1\r\nHost: localhost\r\n"
         found["with --host, without the token"] = status_of(server.raw(asked_for + b"\r\n"))
         found["with --host and the token"] = status_of(
-            server.raw(asked_for + b"Authorization: Bearer 0123456789abcdef0123\r\n\r\n")
+            server.raw(asked_for + f"Authorization: Bearer {TOKEN}\r\n\r\n".encode())
         )
     return found
 
@@ -425,7 +434,33 @@ def leave(server: Server, photo: Photo) -> Row:
     return {"work_stopped": server.metric('worker_restarts_total{reason="cancelled"}') - before}
 
 
+def schema(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row:
+    """Let Schemathesis ask a service without a token, and one with a token, which it also leaves out."""
+    images = [photo.image for photo in given[:SCHEMA_PHOTOS]]
+    found: Row = {"photos": len(images)}
+    with TemporaryDirectory() as place:
+        (Path(place) / "token").write_text(TOKEN)
+        closed = ("--host", "0.0.0.0", "--token-file", f"{place}/token")
+        for name, options, token, examples in (
+            ("without a token", (), None, SCHEMA_EXAMPLES),
+            ("with a token", closed, TOKEN, SCHEMA_EXAMPLES // 8),
+        ):
+            with served(folder, workers, *options) as server:
+                before = server.memory()
+                address = f"http://127.0.0.1:{server.address.port}"
+                row = _openapi.tried(address, folder.resolve().name, images, examples, token=token)
+                print(row.pop("output"), file=sys.stderr)
+                row["headers"] = sorted(set().union(*row["headers"].values()))
+                ended = None if token else server.metric('worker_restarts_total{reason="died"}')
+                found[name] = row | {
+                    "memory_MiB": {"before": before, "after": server.memory()}, "workers_ended": ended,
+                }  # fmt: skip
+    return found
+
+
 PARTS = {"load": load, "kills": kills, "malformed": malformed, "hostile": hostile}
+if _openapi.installed():
+    PARTS["schema"] = schema
 
 
 def main() -> None:
@@ -448,11 +483,13 @@ def main() -> None:
     missing = [part for part in given.part if part not in done]
     requests = photos(folder, data, given.photos) if missing else []
     for part in missing:
+        run = provenance("", "")
         done[part] = PARTS[part](folder, requests, given.workers, given.seconds)
+        done[part]["run"] = {"date": run.date, "commit": run.commit, "dirty": run.dirty}
         print(part, json.dumps(done[part]), flush=True)
         if given.work:
             given.work.write_text(json.dumps(done))
-    if set(done) == set(PARTS):
+    if set(done) >= set(PARTS):
         record(
             given.name,
             {"scene": data.name, "workers": given.workers, "different_photos": given.photos, **done},

@@ -753,6 +753,7 @@ LIMITS = {"5deg 0.05": "within 5°, 0.05", "1deg 0.02": "within 1°, 0.02"}
 def service(records: Records) -> str:
     """The service under load, and while its workers are killed."""
     result = records["service"]
+    records.used["service"] |= result["load"].get("run", {})  # its parts may have run on different commits
     levels = {f"{level['clients']} clients": level for level in result["load"]["levels"]}
     levels["1 client"] = levels.pop("1 clients")
     levels["4 clients, while workers are killed"] = result["kills"]

@@ -47,7 +47,7 @@ def matches(
     sight = torch.nn.functional.normalize(TRUTH.rotate(local), dim=-1)
     return ObservedPoints(
         TRUTH.apply(local), 1e-3 * torch.ones((count, 2), dtype=torch.float64), sight, image, FOCAL * each,
-        0 * each, eye, torch.zeros((count, 3), dtype=torch.float64), 0 * each, 0 * each,
+        0 * each, eye, torch.zeros((count, 3), dtype=torch.float64), 0 * each,
     )  # fmt: skip
 
 

@@ -220,7 +220,7 @@ def with_photo_landmarks(shared: Path, folder: Path, bidnerf: Run, monkeypatch: 
     """The map with landmarks of its photos. Its surface is left alone, and what it renders is like photos."""
     photos = read_views(open_dataset(shared / "data", tiny.BACKGROUND), "train")
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr(Map, "_with_surface", lambda scene, surface: scene)
+    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     monkeypatch.setattr(baking, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
     assert bidnerf("bake", folder, "--data", shared / "data").status == 0
     assert load_info(folder).landmark_source == "photos"
@@ -274,7 +274,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
     for part in (baking, training_views):
         monkeypatch.setattr(part, "tracked_views", tracked)
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr(Map, "_with_surface", lambda scene, surface: scene)
+    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
     monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda name: watched)
     stored = train(photos, config=tiny.config(4), background=tiny.BACKGROUND)
@@ -296,7 +296,7 @@ def test_photos_leave_a_record_that_info_shows_and_draws(
     shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr(Map, "_with_surface", lambda scene, surface: scene)
+    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     assert json.loads(bidnerf("info", folder, "--json")[1])["capture"] is None
     status, _, err = bidnerf("info", folder, "--draw", folder / "capture.png")
     assert (status, err.count("\n")) == (1, 1)

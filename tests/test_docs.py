@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -193,8 +193,8 @@ def parsed_only(parser: Any) -> Any:
 
     def cli(function: Any, *rest: Any, **options: Any) -> Any:
         @functools.wraps(function)
-        def nothing(*_: Any, **__: Any) -> None:
-            return None
+        def nothing(*_: Any, **__: Any) -> Callable[[], None]:
+            return lambda: None
 
         return parser(nothing, *rest, **options)
 

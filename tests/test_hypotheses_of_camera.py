@@ -91,9 +91,9 @@ def probability(found: Posterior, group: str) -> float:
     [
         (GIVEN, Stated.EXACT),
         (Calibration(log_focal=0.025), Stated.INEXACT),
-        (Calibration(log_focal=0.08), "mistaken focal length"),
-        (Calibration(shift_u=0.09, shift_v=-0.04), "cropped"),
-        (Calibration(log_focal=0.06, radial=0.06), "mistaken"),
+        (Calibration(log_focal=0.08), Stated.WRONG),
+        (Calibration(shift_u=0.09, shift_v=-0.04), Stated.CROPPED),
+        (Calibration(log_focal=0.06, radial=0.06), Stated.WRONG),
     ],
 )
 def test_the_best_explanation_is_the_smallest_that_suffices(true: Calibration, name: str) -> None:

@@ -52,7 +52,6 @@ def observed(T: SE3, places: Tensor) -> ObservedPoints:
         rotation=eye.expand(count, 3, 3),
         translation=torch.zeros((count, 3), dtype=torch.float64),
         exposure_times=nothing,
-        transposed_exposure_times=nothing,
     )
 
 

@@ -23,11 +23,13 @@ from bidnerf_core.fields.rendering import (
     query_samples,
     render,
     render_image,
+    render_picture,
     render_samples,
     rendering_weights,
 )
 from bidnerf_core.fields.sampling import Importance, Stratified, inverse_transform
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
 from bidnerf_core.scenes.fields import HomogeneousBall
 
 BLUE = (0.1, 0.2, 0.9)
@@ -291,3 +293,36 @@ def test_a_rendered_image_has_planar_depth() -> None:
 def test_levels_fall_back_on_the_field_itself() -> None:
     ball = HomogeneousBall(1.0, 5.0)
     assert levels(ball) == (ball,)
+
+
+@pytest.mark.parametrize("size", [(64, 48), (63, 49), (1, 1), (2, 3)])
+def test_a_picture_is_nearly_the_image_and_renders_fewer_pixels(size: tuple[int, int]) -> None:
+    scene = closed_form_map("demo:blobs")
+    camera = Intrinsics.from_hfov(50, *size)
+    pose = closed_form_data("demo:blobs").views("test")[0].T_ref_camera
+    counted = 0
+
+    class Counting:
+        def __init__(self, field: RadianceField) -> None:
+            self.field, self.sampler = field, self.sample
+
+        def sample(self, rays: Rays, jitter: torch.Generator | None = None) -> RaySamples:
+            nonlocal counted
+            counted += rays.near.numel()
+            return self.field.sampler(rays, jitter)
+
+        def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+            return self.field.query(positions, directions)
+
+    whole = render_image(scene.field, camera, pose, scene.bounds)
+    picture = render_picture(Counting(scene.field), camera, pose, scene.bounds)
+    assert torch.equal(picture.rgb[::2, ::2], whole.rgb[::2, ::2])
+    pixels = camera.width * camera.height
+    if pixels < 10:  # what is smaller than two pixels may be missed
+        assert counted <= pixels
+        return
+    assert counted < 0.8 * pixels
+    assert float((picture.rgb - whole.rgb).square().mean()) < 1e-4  # 40 dB
+    both = (picture.depth > 0) & (whole.depth > 0)
+    assert torch.equal(both, (picture.depth > 0) | (whole.depth > 0))
+    assert float(((picture.depth - whole.depth)[both] / whole.depth[both]).abs().max()) < 0.12

@@ -145,7 +145,7 @@ def test_a_frame_without_colours_and_depth_is_reported() -> None:
 
 def test_odometry_finds_the_motion_between_two_frames_without_a_map() -> None:
     (_, first, T_first), (_, second, T_second) = flight()[0], flight()[1]
-    odometry, before, now = Odometry(100), grey_image(first.rgb), grey_image(second.rgb)
+    odometry, before, now = Odometry(100, 0.5), grey_image(first.rgb), grey_image(second.rgb)
     corners = odometry.replenished(first, before, FollowedPoints.none(), T_first)
     state = TrackerState(Tracker(localizer())._state.clock, points=corners, image=before)
     seen = followed(state, now, second, T_first)
@@ -163,7 +163,7 @@ def test_odometry_finds_the_motion_between_two_frames_without_a_map() -> None:
 
 def test_odometry_refuses_corners_that_contradict_each_other() -> None:
     (_, first, T_first), (_, second, _) = flight()[0], flight()[1]
-    odometry = Odometry(100)
+    odometry = Odometry(100, 0.5)
     corners = odometry.replenished(first, grey_image(first.rgb), FollowedPoints.none(), T_first)
     order = torch.randperm(len(corners), generator=torch.Generator().manual_seed(0))
     shuffled = replace(corners, pixels=corners.pixels[order])
@@ -172,7 +172,9 @@ def test_odometry_refuses_corners_that_contradict_each_other() -> None:
 
 def test_corners_have_the_depth_noise_of_the_sensor() -> None:
     _, frame, T = flight()[0]
-    corners = Odometry(100, KINECT.noise).replenished(frame, grey_image(frame.rgb), FollowedPoints.none(), T)
+    corners = Odometry(100, 0.5, KINECT.noise).replenished(
+        frame, grey_image(frame.rgb), FollowedPoints.none(), T
+    )
     depth = T.inverse().apply(corners.positions)[:, 2]
     assert len(corners) > 0
     torch.testing.assert_close(corners.deviations[:, 1], KINECT.noise.quadratic * depth**2)
@@ -180,7 +182,7 @@ def test_corners_have_the_depth_noise_of_the_sensor() -> None:
 
 def test_corners_without_measured_depth_are_left_out() -> None:
     _, frame, T = flight()[0]
-    odometry, image = Odometry(100), grey_image(frame.rgb)
+    odometry, image = Odometry(100, 0.5), grey_image(frame.rgb)
     none = FollowedPoints.none()
     assert len(odometry.replenished(without_depth(frame), image, none, T)) == 0
     half = frame.depth.clone() if frame.depth is not None else torch.zeros(0)

@@ -54,15 +54,7 @@ def exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Te
     Sensors are wider than they are high, so the sensor's rows are the columns of a portrait image; square
     images count as landscape. The direction of the readout does not matter: reversing it reverses the motion.
     """
-    return _times_along(pixels, camera, 0 if camera.height > camera.width else 1)
-
-
-def transposed_exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return ``exposure_times`` with rows along the other axis, as in a portrait crop of a landscape image."""
-    return _times_along(pixels, camera, 1 if camera.height > camera.width else 0)
-
-
-def _times_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) -> Float[Tensor, "m"]:
+    axis = 0 if camera.height > camera.width else 1
     return pixels[:, axis].double() / (camera.width, camera.height)[axis] - 0.5
 
 

@@ -40,10 +40,6 @@ from bidnerf_core.localization.settings import ColourSettings, RefinementSetting
 from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.mapping.geometry.calibration import FIXED
 
-BY_START = 6.0
-"""Log odds per factor e between the distances from a start: in six dimensions, the density of a normal distribution of unknown
-width about the start falls with the sixth power of the distance.
-"""
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which an image is not compared with its mirror image."""
 AT_COPIES = 6.0
@@ -161,13 +157,17 @@ def _mirror(problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: 
 
 
 def _log_odds_by_start(start: SE3, T: SE3, rival: SE3, distance: float) -> float:
-    """Return the log odds of a pose against its rival by their distances from a start, for a scene at ``distance`` (metres)."""
+    """Return the log odds of a pose against its rival by their distances from a start, for a scene at ``distance`` (metres).
+
+    In six dimensions, the density of a normal distribution of unknown width about the start falls with the sixth power of the
+    distance.
+    """
 
     def motion(T: SE3) -> float:
         update = (start.to("cpu", T.translation.dtype).inverse() @ T).log()
         return max(float(update[:3].norm() + distance * update[3:].norm()), 1e-9)
 
-    return BY_START * math.log(motion(rival) / motion(T))
+    return 6 * math.log(motion(rival) / motion(T))
 
 
 def log_odds_by_rendering(one: Problem, other: Problem, seed: int, steps: int = FITTED.steps) -> float:

@@ -48,14 +48,10 @@ FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
 """Outcomes of a pose by landmarks that no other measurement can correct: with wrong intrinsics, aligning points with the surface
 fails too.
 """
-UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
-"""Outcomes of a pose that landmarks determine with too little accuracy or confidence."""
 IN_FRONT = 0.9
 """Minimum fraction of an occluder's points that must lie in front of the surface."""
-WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=math.inf)
-"""Thresholds for landmarks that match near a pose found by other means."""
 LEAST_SUPPORT = 0.5
-"""Minimum confidence of landmarks that support a pose accepted on the surface."""
+"""Minimum confidence for landmarks to support a pose accepted on the surface."""
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
@@ -135,7 +131,7 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
     if matcher is None:
         return _Proposal(found if problem.matcher is not None else _without_landmarks(found))
     proposal = _compared_with_landmarks(found, problem, matcher, config, seed, began)
-    is_unsure = answer is not None and answer.verdict.outcome in UNSURE
+    is_unsure = answer is not None and answer.verdict.outcome in (Outcome.IMPRECISE, Outcome.UNCERTAIN)
     if by_landmarks is not None and is_unsure and proposal.found.outcome is Outcome.TOO_FEW_MATCHES:
         return by_landmarks
     return proposal
@@ -187,13 +183,15 @@ def _compared_with_landmarks(
     near = confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True)
     if near.pose is not None and (record := current_record()) is not None:
         record.landmarks.append(near.pose)
-    verdict = None if near.pose is None else landmark_verdict(near.pose, WITHOUT_SEARCH)
+    # Matches are no accident near a pose found by other means.
+    verdict = (
+        None if near.pose is None else landmark_verdict(near.pose, LandmarkThresholds(log10_nfa=math.inf))
+    )
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
         supported = found.converged and (answer.confidence or 0.0) >= LEAST_SUPPORT
-        refined = localization_by_landmarks(
-            problem, replace(answer, verdict=verdict) if supported else answer, began
-        )
+        answer = replace(answer, verdict=verdict) if supported else answer
+        refined = localization_by_landmarks(problem, answer, began)
         return _Proposal(replace(refined, reason=f"found on the surface; {refined.reason}"), near.pose)
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"

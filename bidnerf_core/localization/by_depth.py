@@ -35,8 +35,6 @@ from bidnerf_core.mapping import SurfaceMap
 
 WORSE = 0.05
 """Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict each other."""
-JUDGED_POINTS = 1000
-"""Number of points on which two poses are compared."""
 
 
 def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:

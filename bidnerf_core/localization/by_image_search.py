@@ -30,8 +30,6 @@ from bidnerf_core.localization.search.starts import Surroundings, hypotheses_for
 from bidnerf_core.localization.settings import AutoConfig, ByColourConfig
 from bidnerf_core.mapping import SurfaceMap
 
-COMPARED_WIDTH = 96
-"""Longer side (pixels) of the thumbnails on which the rounds' answers are compared: that of the first round's last stage."""
 MANY_RAYS = 4
 """Factor by which more rays are rendered if part of the scene may be hidden."""
 MANY_LANDMARKS = 500
@@ -72,8 +70,8 @@ def localized_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfi
         answers.append(this.refined(problem, found, config.by_colour, generator))
         if answers[-1].verdict.accepted:
             return localization_of(problem, answers[-1], config.by_colour, began, "auto")
-    judge = replace(search, scales=COMPARED_SCALES)
-    best = min(answers, key=lambda answer: judge.cost(answer.refined.T, COMPARED_WIDTH))
+    judge, width = replace(search, scales=COMPARED_SCALES), IMAGE_STAGES[-1].width
+    best = min(answers, key=lambda answer: judge.cost(answer.refined.T, width))
     return localization_of(problem, best, config.by_colour, began, "auto")
 
 

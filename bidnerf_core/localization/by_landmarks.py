@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass, replace
 
@@ -31,6 +30,7 @@ from bidnerf_core.localization.fusion import (
     fused_pose,
     nearby_start,
 )
+from bidnerf_core.localization.landmarks.chance import log_odds_of
 from bidnerf_core.localization.landmarks.hypotheses import Whose
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
@@ -74,7 +74,6 @@ class LandmarkAnswer:
     covariance: Float[Tensor, "6 6"]
     diagnostics: LandmarkDiagnostics
     terms: tuple[str, ...] = ()  # the measurements fused with the landmarks
-    depth_factor: float = 1.0  # the fused pose's factor on depths, in addition to that of ``corrected``
     left_out: str = ""  # measurements not fused because they contradict the landmarks
     confidence: float | None = None  # probability that the pose is right
     has_rival: bool = False  # whether it is rejected because an alternative explanation may be right
@@ -145,27 +144,24 @@ def fused_answer(
     """
     diagnostics = landmark_diagnostics(found, searched)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.stated_covariance, diagnostics)
-    approximate = problem.focal_is_approximate
     may_be_fused = verdict.accepted or verdict.outcome is Outcome.IMPRECISE
     if not may_be_fused or found.estimates_calibration:
         if problem.has_depth and found.estimates_calibration:
             answer = replace(answer, left_out="depth, which needs known intrinsics")
-        return _with_confidence(
-            answer, approximate
-        )  # rendering would need intrinsics as exact as the landmarks' too
+        return _with_confidence(answer)  # rendering would need intrinsics as exact as the landmarks' too
     problem = corrected(problem, found)
     points = None
     if problem.surface is not None and problem.has_depth:
         points = _cost_of_points(problem, problem.surface, Generator().manual_seed(seed))
         diagnostics = landmark_diagnostics(found, searched, points, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
-    answer = _with_confidence(answer, approximate)
+    answer = _with_confidence(answer)
     return _fused(problem, answer, points, rays, seed)
 
 
-def _with_confidence(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
+def _with_confidence(answer: LandmarkAnswer) -> LandmarkAnswer:
     """Return the answer with its confidence, which can turn its verdict into a rejection."""
-    judgement = judged(answer.verdict, answer.diagnostics, approximate)
+    judgement = judged(answer.verdict, answer.diagnostics)
     return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 
@@ -212,7 +208,7 @@ def _fused(
     if (record := current_record()) is not None:
         record.add(f"fused with {enumeration(names)}", fused.T)
     covariance = fused.covariance + answer.found.shared_covariance
-    return replace(answer, T=fused.T, covariance=covariance, terms=names, depth_factor=fused.state.factor)
+    return replace(answer, T=fused.T, covariance=covariance, terms=names)
 
 
 def _vague_start(
@@ -253,7 +249,7 @@ def _is_likelier(problem: Problem, T: SE3, answer: LandmarkAnswer, seed: int) ->
     """Return whether a pose is more likely than that by landmarks, given renderings and the confidence in the landmarks."""
     sure = min(max(answer.confidence or 0.5, 1e-12), 1 - 1e-12)
     odds = log_odds_by_rendering(replace(problem, start=T), replace(problem, start=answer.T), seed, steps=0)
-    return odds > math.log(sure / (1 - sure))
+    return odds > log_odds_of(sure)
 
 
 def _elsewhere(

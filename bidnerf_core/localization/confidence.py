@@ -17,11 +17,6 @@ from bidnerf_core.localization.beyond_chance import ACCEPTED
 from bidnerf_core.localization.landmarks.chance import probability_of
 from bidnerf_core.localization.result import Outcome, Verdict
 
-ACCEPTED_ESTIMATED = 0.6
-"""Minimum confidence of a pose whose intrinsics were also estimated, because landmarks contradict the given ones.
-
-The contradiction requires evidence of its own, which the model does not take into account.
-"""
 TRUSTED = 0.95
 """Minimum confidence at which a pose by landmarks is trusted without further measurements."""
 
@@ -48,24 +43,13 @@ class LogisticModel:
         return probability_of(self.bias + sum(terms))
 
 
-def judged(
-    verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics, approximate: bool = False
-) -> Judgement:
-    """Return the verdict with the confidence in the pose, which can turn it into a rejection.
-
-    ``approximate`` is whether the focal length was given as approximate, and was therefore estimated in any case.
-    """
+def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> Judgement:
+    """Return the verdict with the confidence in the pose, which can turn it into a rejection."""
     value = confidence(diagnostics)
-    if value is not None and verdict.accepted and value < least_confidence(diagnostics, approximate):
+    if value is not None and verdict.accepted and value < ACCEPTED:
         percent = math.floor(100 * value)
         verdict = Verdict(Outcome.UNCERTAIN, f"only {percent}% likely to be right; {verdict.reason}")
     return Judgement(verdict, value)
-
-
-def least_confidence(diagnostics: object, approximate: bool = False) -> float:
-    """Return the least confidence with which a pose is accepted; ``approximate`` is as for ``judged``."""
-    estimated = isinstance(diagnostics, LandmarkDiagnostics) and diagnostics.estimated_calibration
-    return ACCEPTED_ESTIMATED if estimated and not approximate else ACCEPTED
 
 
 def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float | None:

@@ -60,12 +60,9 @@ class DepthScale:
         return 1 + weight * (self.by_landmarks - 1)
 
 
-def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Problem:
-    """Return the problem with a pose as its start, the pose's intrinsics and motion, and depth corrected to the map's scale.
-
-    ``factor`` is the fused pose's further correction of that scale.
-    """
-    scale, views = factor * DepthScale.of(found, problem.sensor).estimate, []
+def corrected(problem: Problem, found: LandmarkPose) -> Problem:
+    """Return the problem with a pose as its start, the pose's intrinsics and motion, and depth corrected to the map's scale."""
+    scale, views = DepthScale.of(found, problem.sensor).estimate, []
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
         camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics

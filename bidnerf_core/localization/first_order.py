@@ -42,8 +42,6 @@ from bidnerf_core.settings import Settings
 
 SUPPORTING_RAYS = 1024
 """Number of rays on which a pose is compared with its rivals."""
-WIDE_REACH = ReachSettings(candidates=3, box_weight=1.0)
-"""Favour pixels on matter, and keep measured points in the scene's box: the best variant on Lego (``benchmarks/bid_variants.py``)."""
 PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
 """The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is provisional."""
 
@@ -101,14 +99,8 @@ class BidConfig(Settings):
     adam: AdamSettings = AdamSettings(learning_rate=0.04, decay=0.4, decay_steps=80)
     colour: ColourSettings = ColourSettings()
     depth: DepthSettings = DepthSettings()
-    reach: ReachSettings = WIDE_REACH
-
-
-BID_PRESETS = {
-    "paper": BidConfig(DescentSettings(level=0, pivot="camera"), PAPER_STEPS, reach=ReachSettings()),
-    "paper-scene": BidConfig(DescentSettings(level=0, pivot="scene"), PAPER_STEPS, reach=ReachSettings()),
-}
-"""The paper's settings, with updates in the camera's frame as in its Alg. 1, and about the middle of the scene as by default."""
+    # Favour pixels on matter, and keep measured points in the scene's box: the best variant on Lego (``benchmarks/bid_variants.py``).
+    reach: ReachSettings = ReachSettings(candidates=3, box_weight=1.0)
 
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
@@ -122,7 +114,11 @@ BID = Method(
     bid,
     BidConfig,
     needs_start=True,
-    presets=BID_PRESETS,
+    # The paper's settings, with updates in the camera's frame as in its Alg. 1, and about the middle of the scene as by default.
+    presets={
+        "paper": BidConfig(DescentSettings(level=0, pivot="camera"), PAPER_STEPS, reach=ReachSettings()),
+        "paper-scene": BidConfig(DescentSettings(level=0, pivot="scene"), PAPER_STEPS, reach=ReachSettings()),
+    },
     summary="Adam on colour and depth at the coarse level (BID-NeRF)",
 )
 
@@ -134,10 +130,6 @@ class InerfConfig(Settings):
     descent: DescentSettings = DescentSettings(pixels="interest-regions", pivot="world")
     adam: AdamSettings = AdamSettings(max_steps=300)
     colour: ColourSettings = ColourSettings(colour_loss="l2")
-
-
-INERF_PRESETS = {"paper": replace(InerfConfig(), adam=AdamSettings(max_steps=1000))}
-"""The settings of BID-NeRF's comparison: iNeRF's own learning rate, and 1000 steps of 2048 rays."""
 
 
 def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
@@ -153,6 +145,7 @@ INERF = Method(
     InerfConfig,
     needs_start=True,
     uses_depth=False,
-    presets=INERF_PRESETS,
+    # The settings of BID-NeRF's comparison: iNeRF's own learning rate, and 1000 steps of 2048 rays.
+    presets={"paper": replace(InerfConfig(), adam=AdamSettings(max_steps=1000))},
     summary="Adam on the colours of one image in full detail (iNeRF)",
 )

@@ -256,7 +256,7 @@ class TrackerConfig(Settings):
     depth_points: Annotated[int, Range(50, 10**6)] = 400  # maximum number of measured pixels that are aligned
     # number of keypoints of an image that are matched with landmarks
     keypoints: Annotated[int, Range(50, 10**5), EXPERT] = 600
-    # remaining fraction of the tracked landmarks at which new ones are detected
+    # remaining fraction of the tracked landmarks or corners at which new ones are detected
     refresh_share: Annotated[float, Range(0, 1), EXPERT] = 0.5
     # number of frames after which new landmarks are detected in any case
     refresh_frames: Annotated[int, Range(1, 10**6), EXPERT] = 20

@@ -80,7 +80,7 @@ class Tracker:
             features = strongest(localizer.matcher.features, config.keypoints)
             detector = LandmarkDetector(localizer.matcher.landmarks, features)
             self._by_landmarks = ByLandmarks(scene, detector, config, localizer.depth_sensor)
-        self._odometry = Odometry(config.points, localizer.depth_sensor.noise)
+        self._odometry = Odometry(config.points, config.refresh_share, localizer.depth_sensor.noise)
 
     @property
     def tracking(self) -> bool:

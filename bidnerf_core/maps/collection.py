@@ -249,9 +249,7 @@ def _info(scene: Map | Path) -> MapInfo:
 def _landmarks(scene: Map | Path, info: MapInfo) -> LandmarkMap | None:
     if isinstance(scene, Map):
         return None if scene.landmarks is None else scene.landmarks.to("cpu")
-    if info.landmarks is None:
-        return None
-    return replace(load_landmarks(scene / info.landmarks), features=info.landmark_features)
+    return load_landmarks(scene, info)
 
 
 def _unrecognised(reason: str, method: str) -> Localization:

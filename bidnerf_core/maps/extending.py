@@ -48,8 +48,8 @@ from bidnerf_core.mapping import (
 from bidnerf_core.mapping.landmarks.landmark_map import concatenated
 from bidnerf_core.maps.baking import bake_landmarks
 from bidnerf_core.maps.checkpoints import Checkpoints
-from bidnerf_core.maps.description import cameras_of, load_info
-from bidnerf_core.maps.files import save_map
+from bidnerf_core.maps.description import cameras_of, load_info, longest_side
+from bidnerf_core.maps.files import save_map, with_images
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scaling import in_map_frame
 from bidnerf_core.maps.views import Images, read_views
@@ -184,8 +184,7 @@ def locate(
 
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
     """Read photos, downscaled to the size of the map's largest image; also return those that cannot be read."""
-    sides = [max(c.intrinsics.width, c.intrinsics.height) for c in scene.info.cameras]
-    side, unread = max(sides, default=None), list[LeftOut]()
+    side, unread = longest_side(scene.info), list[LeftOut]()
     source = _opened(Path(photos), scene) if isinstance(photos, str | Path) else photos
     if isinstance(source, Dataset | Photos):
         frames, unread = _read_each(source, split, side)
@@ -245,7 +244,7 @@ def _old_views(
     for number, ((intrinsics, pose), camera) in enumerate(
         zip(cameras, scene.info.cameras, strict=True), start=1
     ):
-        small = intrinsics.scaled(min(1.0, STAND_IN_SIDE / max(intrinsics.width, intrinsics.height)))
+        small = intrinsics.at_most(STAND_IN_SIDE)
         image = render_image(scene.field, small, pose, scene.bounds)
         frame = Frame(camera.name, image.rgb.cpu().clamp(0, 1), small)
         views.append(
@@ -298,7 +297,7 @@ def _extended(
     else:
         landmarks, record = _with_more_landmarks(scene, tracked), scene.capture
     if landmarks is not None:
-        landmarks = replace(landmarks, cameras=tuple(camera.intrinsics for camera in info.cameras))
+        landmarks = with_images(landmarks, info)
     grown = replace(whole, info=info, surface=surface or scene.surface, landmarks=landmarks, record=record)
     before, after = (0 if each is None else len(each) for each in (scene.landmarks, landmarks))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")
@@ -382,7 +381,9 @@ def _surface(
     progress: ProgressCallback | None,
     cancel: Cancel | None,
 ) -> SurfaceMap | None:
-    """Bake the surface from measured depth if views have it, and otherwise from rendered depth."""
+    """Bake the surface from the measured depth of views and, unlike ``bake_surface``, also from depth rendered from the
+    other cameras: the photos of these are not at hand, and what they measured must not be lost.
+    """
     measured = [view for view in views if view.frame.has_dense_depth]
     names = {view.frame.name for view in measured}
     cameras = [

@@ -171,9 +171,17 @@ def load_surface(path: Path) -> SurfaceMap:
     return load_part(path, surface_from_tensors, "a baked surface", BAKED)
 
 
-def load_landmarks(path: Path) -> LandmarkMap:
-    """Load the landmarks of a map. Raises ``InputError`` if the file does not hold the tensors of landmarks."""
-    return load_part(path, landmarks_from_tensors, "landmarks", BAKED)
+def load_landmarks(folder: Path, info: MapInfo) -> LandmarkMap | None:
+    """Load the landmarks of a map; None if it has none. Raises ``InputError`` if the file does not hold their tensors."""
+    if info.landmarks is None:
+        return None
+    return with_images(load_part(folder / info.landmarks, landmarks_from_tensors, "landmarks", BAKED), info)
+
+
+def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
+    """Return the landmarks with what a map's description records about the images they were built from."""
+    cameras = tuple(camera.intrinsics for camera in info.cameras)
+    return replace(landmarks, cameras=cameras, features=info.landmark_features)
 
 
 def load_capture(path: Path) -> CaptureReport:

@@ -27,16 +27,16 @@ from bidnerf_core.geometry.units import LengthUnit
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.mapping import BakeConfig, find_features, surface_of_points
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.maps.baking import bake_surface
 from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.files import map_folder, save_map
 from bidnerf_core.maps.importers import ImportedField, importer_of, robust_box
 from bidnerf_core.maps.map import Map, frozen_field
 from bidnerf_core.maps.same_scene import check_alike
-from bidnerf_core.maps.training import USUAL_BAKE
+from bidnerf_core.maps.training import USUAL_BAKE, baked_or_kept
 from bidnerf_core.maps.viewpoints import viewpoints
 from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback
-from bidnerf_core.registry import PluginError
 from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
@@ -117,7 +117,11 @@ def import_map(
             state = TrainingState(found.steps, found.tensors, {})
             scene = replace(scene, info=save_map(place, scene.info, state), folder=place)
         settings_of_bake = bake if isinstance(bake, BakeConfig) else USUAL_BAKE
-        return _baked(scene, found, views, settings_of_bake, progress, cancel) if bake else scene
+        if not bake:
+            return scene
+        return baked_or_kept(
+            scene, lambda scene: _baked(scene, found, views, settings_of_bake, progress, cancel)
+        )
 
 
 def _own_photos(found: ImportedField, where: str) -> Dataset | None:
@@ -213,19 +217,15 @@ def _baked(
             f"{scene.info.data}: landmarks are from rendered images, which match photos less well; --photos"
             " builds them from photos, as in training"
         )
-    try:
-        surface = None
-        if found.surface is not None:
-            surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)
-            log.info(
-                f"{scene.info.data}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
-                f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
-            )
-        if not has_landmarks:
-            return scene.with_baked_surface(config, surface, progress, cancel)
+    surface = None
+    if found.surface is not None:
+        surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)
+        log.info(
+            f"{scene.info.data}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
+            f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
+        )
+    if has_landmarks:
         return scene.with_baked_parts(list(views), config, not views, None, progress, cancel, surface)
-    except PluginError:  # nothing that other images would fix
-        raise
-    except InputError as error:  # the map itself is valid
-        log.info(f"{scene.info.data}: no surface baked: {error}")
-        return scene
+    return scene.with_surface(
+        surface or bake_surface(scene.info, scene.field, [], config, scene.name, progress, cancel)
+    )

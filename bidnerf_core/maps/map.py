@@ -42,6 +42,7 @@ from bidnerf_core.maps.files import (
     save_landmarks,
     save_map,
     save_surface,
+    with_images,
 )
 from bidnerf_core.maps.same_scene import check_same_scene
 from bidnerf_core.maps.scaling import in_map_frame, scaled
@@ -239,7 +240,7 @@ class Map:
         """
         check_cancelled(cancel, "baking")
         surface = surface or bake_surface(self.info, self.field, views, config, self.name, progress, cancel)
-        scene = self._with_surface(surface)
+        scene = self.with_surface(surface)
         if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
             log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
             return replace(scene, landmarks=kept)
@@ -251,24 +252,16 @@ class Map:
         """Return the landmarks that were built from photos, unless their file is damaged."""
         if self.info.landmark_source == "rendered images":
             return None
-        if self.landmarks is not None or self.folder is None or self.info.landmarks is None:
+        if self.landmarks is not None or self.folder is None:
             return self.landmarks
         try:
-            return _with_cameras(load_landmarks(self.folder / self.info.landmarks), self.info)
+            return load_landmarks(self.folder, self.info)
         except InputError as error:
             log.info(str(error))
             return None
 
-    def with_baked_surface(
-        self, config: BakeConfig, surface: SurfaceMap | None = None, progress: ProgressCallback | None = None,
-        cancel: Cancel | None = None,
-    ) -> Map:  # fmt: skip
-        """Bake only the surface, unless it is given, while the caller holds the lock of the folder."""
-        if surface is None:
-            surface = bake_surface(self.info, self.field, [], config, self.name, progress, cancel)
-        return self._with_surface(surface)
-
-    def _with_surface(self, surface: SurfaceMap) -> Map:
+    def with_surface(self, surface: SurfaceMap) -> Map:
+        """Return the map with another surface, and store that, while the caller holds the lock of the folder."""
         info = self.info if self.folder is None else save_surface(self.folder, self.info, surface)
         return replace(self, info=info, surface=surface)
 
@@ -279,7 +272,7 @@ class Map:
                 info, colour_noise=found.colour_noise, landmark_source=found.source,
                 landmark_features=found.landmarks.features,
             )  # fmt: skip
-            landmarks = _with_cameras(found.landmarks, info)
+            landmarks = with_images(found.landmarks, info)
             if self.folder is not None:
                 info = save_landmarks(self.folder, self.info, landmarks, found.colour_noise, found.source)
         if found.capture is not None and self.folder is not None:
@@ -317,8 +310,8 @@ class Map:
         surface, landmarks = self.surface, self.landmarks
         if surface is None and self.info.surface is not None:
             surface = load_surface(self.folder / self.info.surface)
-        if landmarks is None and self.info.landmarks is not None:
-            landmarks = _with_cameras(load_landmarks(self.folder / self.info.landmarks), self.info)
+        if landmarks is None:
+            landmarks = load_landmarks(self.folder, self.info)
         anchor = self.anchor or load_anchor(self.folder, self.info.anchor)
         return replace(self, surface=surface, landmarks=landmarks, anchor=anchor)
 
@@ -334,8 +327,6 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     if info.interruption is not None:
         log.info(f"{folder}: {info.interruption}")
     field = frozen_field(info, tensors, folder)
-    if landmarks is not None:
-        landmarks = _with_cameras(landmarks, info)
     return Map(info, field, surface, landmarks, folder, anchor=anchor).to(device)
 
 
@@ -356,12 +347,6 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
     cast(nn.Module, field).load_state_dict(tensors)
     cast(nn.Module, field).requires_grad_(False).eval()
     return in_map_frame(field, info)
-
-
-def _with_cameras(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
-    """Return the landmarks with what a map's description records about the images they were built from."""
-    cameras = tuple(camera.intrinsics for camera in info.cameras)
-    return replace(landmarks, cameras=cameras, features=info.landmark_features)
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
@@ -403,7 +388,7 @@ def _read(
                 continue
             weights = read_tensors(folder / info.weights, EXPECTED_PART)
             surface = load_surface(folder / info.surface) if baked and info.surface else None
-            landmarks = load_landmarks(folder / info.landmarks) if baked and info.landmarks else None
+            landmarks = load_landmarks(folder, info) if baked else None
             return info, weights, surface, landmarks, anchor
         except InputError:
             before, info = info, load_info(folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -22,6 +22,7 @@ from bidnerf_core.datasets import Background
 from bidnerf_core.datasets.colmap import SparseChoice
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.fields.contract import device_of
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.io.tensors import packed
@@ -280,21 +281,25 @@ def _trained(
     weights = packed(cast(nn.Module, field).state_dict())
     del field, built
     scene = Map(report.info, frozen_field(report.info, weights, work.out), folder=work.out).to(work.device)
-    if work.bake is not None:
-        scene = _baked(scene, views, tracked, work.bake, work)
+    if (config := work.bake) is not None:
+        scene = baked_or_kept(
+            scene,
+            lambda whole: whole.with_baked_parts(
+                list(views), config, False, tracked, work.progress, work.cancel
+            ),
+        )
     if work.out is not None:
         size = sum(file.stat().st_size for file in work.out.iterdir()) / 2**20
         log.info(f"{where}: map of {info.data or 'views in memory'}, {size:.1f} MiB")
     return scene
 
 
-def _baked(
-    scene: Map, views: Sequence[View], tracked: TrackedViews | None, config: BakeConfig, work: _Work
-) -> Map:
+def baked_or_kept(scene: Map, bake: Callable[[Map], Map]) -> Map:
+    """Return what ``bake`` returns or, if the images do not allow it, the map as it is: it is valid without a surface."""
     try:
-        return scene.with_baked_parts(list(views), config, False, tracked, work.progress, work.cancel)
+        return bake(scene)
     except PluginError:  # nothing that other images would fix
         raise
-    except InputError as error:  # the map itself is valid
+    except InputError as error:
         log.info(f"{scene.name}: no surface baked: {error}")
-        return scene if scene.folder is None else load_map(scene.folder, work.device)
+        return scene if scene.folder is None else load_map(scene.folder, device_of(scene.field))

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.fields.rendering import render_picture
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
@@ -70,7 +70,7 @@ class Painter:
 
     def rendered(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
         """Render the map as the photo's camera would see it."""
-        return render_image(self._map.field, self._camera, T_world_camera, self._map.bounds).rgb
+        return render_picture(self._map.field, self._camera, T_world_camera, self._map.bounds).rgb
 
     def blended(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
         """Return the photo blended with the rendering, with the edges of each."""

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.rendering import RenderedImage, render_image
+from bidnerf_core.fields.rendering import RenderedImage, render_picture
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
@@ -170,7 +170,7 @@ def shown_answer(
         steps=_steps(found, record),
         path=_path(found.poses),
         matches=None if frame is None or record is None or not finite else _matches(frame, record),
-        figures=acceptance_figures(found, record, given is not None and given.focal_is_approximate),
+        figures=acceptance_figures(found, record),
         contests=contests(found, record),
         runner_up=other,
     )
@@ -216,7 +216,7 @@ def _compared(
 ) -> tuple[Picture, DepthDifference | None]:
     if quick:
         return photograph(quick_image(scene, camera, T)), None
-    image = render_image(scene.field, camera, T, scene.bounds)
+    image = render_picture(scene.field, camera, T, scene.bounds)
     return photograph(image.rgb), depth_difference(image, frame)
 
 

@@ -25,7 +25,6 @@ LEAST_SHOWN = 0.001
 CAMERA_NAMES: dict[str, str] = {
     Stated.EXACT: "given camera",
     Stated.INEXACT: "given camera (slightly off)",
-    Stated.WRONG_FOCAL: "another focal length",
     Stated.WRONG: "another camera",
     Stated.APPROXIMATE: "given camera (approximate)",
     Stated.CROPPED: "a cropped image",
@@ -33,7 +32,6 @@ CAMERA_NAMES: dict[str, str] = {
 MOTIONS = {
     Motion.STILL: "",
     Motion.MOVING: ", with rolling shutter",
-    Motion.TRANSPOSED: ", with rolling shutter along the other axis",
 }
 HERE = "the pose found"
 

@@ -16,7 +16,6 @@ from bidnerf_core.localization.acceptance import (
     landmark_diagnostics,
 )
 from bidnerf_core.localization.beyond_chance import ACCEPTED, LEAST_EXPLAINED, Support
-from bidnerf_core.localization.confidence import least_confidence
 from bidnerf_core.localization.landmarks.chance import DECISIVE, probability_of
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
@@ -57,13 +56,8 @@ class Figure:
     meaning: str
 
 
-def acceptance_figures(
-    found: Localization, record: SearchRecord | None, approximate: bool = False
-) -> tuple[Figure, ...]:
-    """Return the measures of an answer and, if recorded, those of a pose by landmarks that was rejected on the way to it.
-
-    ``approximate`` is whether the focal length was given as approximate.
-    """
+def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
+    """Return the measures of an answer and, if recorded, those of a pose by landmarks that was rejected on the way to it."""
     by_landmarks = None if record is None or not record.landmarks else record.landmarks[-1]
     said, figures = found.diagnostics, list[Figure]()
     if isinstance(said, LandmarkDiagnostics):
@@ -82,11 +76,17 @@ def acceptance_figures(
         )
     support = support_of(found)
     if found.confidence is not None and (support is None or support.confidence != found.confidence):
-        least = least_confidence(said, approximate)
         meaning = "probability that the pose is right, from all figures together"
         figures.insert(
             0,
-            _least("confidence", found.confidence, least, f"{found.confidence:.1%}", f"{least:.0%}", meaning),
+            _least(
+                "confidence",
+                found.confidence,
+                ACCEPTED,
+                f"{found.confidence:.1%}",
+                f"{ACCEPTED:.0%}",
+                meaning,
+            ),
         )
     return tuple(sorted(figures, key=lambda figure: figure.passed is not False))  # what failed comes first
 

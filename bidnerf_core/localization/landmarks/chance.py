@@ -42,6 +42,11 @@ def probability_of(log_odds: float) -> float:
     return 1 / (1 + odds(-log_odds))
 
 
+def log_odds_of(probability: float) -> float:
+    """Return the log odds of an explanation with a given probability."""
+    return math.log(probability / (1 - probability))
+
+
 def log_odds_of_share(share: float) -> float:
     """Return the log odds of a pose against an explanation with this fraction of its evidence by landmarks."""
     return -BY_SHARE * math.log(share) if share > 0 else math.inf

@@ -98,9 +98,7 @@ def _generalized(
     return (T_rig_world.inverse(), int(info["iterations"])) if _sound(T_rig_world) else None
 
 
-def focal_consensus(
-    data: ObservedPoints, threshold: float, seed: int, most_draws: int = MOST_DRAWS_WITH_FOCAL
-) -> Candidate | None:
+def focal_consensus(data: ObservedPoints, threshold: float, seed: int) -> Candidate | None:
     """Return the pose and focal length of one camera with the most inliers within ``threshold`` pixels, or None.
 
     The matches in ``data`` must be ordered from the most to the least reliable. The focal length is searched within
@@ -110,7 +108,7 @@ def focal_consensus(
         return None
     random = np.random.default_rng(seed)
     pixels, points = (data.image * data.focal[:, None]).numpy(), data.points.numpy()
-    given, best, needed, draws = float(data.focal[0]), None, most_draws, 0
+    given, best, needed, draws = float(data.focal[0]), None, MOST_DRAWS_WITH_FOCAL, 0
     while draws < needed:
         draws += 1
         pool = min(len(points), max(20, len(points) * draws // 200))  # PROSAC: the most reliable ones first

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import transposed_exposure_times
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
@@ -75,7 +74,4 @@ def observed_points(
         T_camera_rig.rotation[found.view],
         T_camera_rig.translation[found.view],
         torch.cat([image.exposure_times for image in images])[number],
-        torch.cat([transposed_exposure_times(image.keypoints.pixels, image.intrinsics) for image in images])[
-            number
-        ],
     )

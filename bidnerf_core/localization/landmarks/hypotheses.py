@@ -22,7 +22,8 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import MotionPrior
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.map_camera import SAME_LOG_ODDS, SHARE_SAME_CAMERA, MapCamera
+from bidnerf_core.localization.landmarks.chance import log_odds_of
+from bidnerf_core.localization.landmarks.map_camera import SHARE_SAME_CAMERA, MapCamera
 from bidnerf_core.mapping.geometry.calibration import (
     ANY,
     CALIBRATED,
@@ -39,26 +40,17 @@ from bidnerf_core.mapping.geometry.calibration import (
     Calibration,
     CalibrationPrior,
 )
-from bidnerf_core.mapping.geometry.eliminated_pose import TIED, Conditional, EliminatedPose
+from bidnerf_core.mapping.geometry.eliminated_pose import Conditional, EliminatedPose
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.projection import Array
 from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
 from bidnerf_core.mapping.geometry.resection import RESECTION_STEPS, minimized
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
-CROPS_BESIDE_APPROXIMATE = 0.1
-"""Fraction of crops among images with an approximate focal length."""
 SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
 """Prior probability that an image has motion during readout, and the same if the map's images do.
 
 The first is low because image stabilisers, and lens distortion that is not modelled, distort images in similar ways.
-"""
-TRANSPOSED = 0.1
-"""Fraction of motions for which the shutter rolls along the other axis than the image's shape suggests: crops, rotated squares."""
-MAX_MOTION = 22.5
-"""Maximum squared motion, in standard deviations of its prior (chi-squared at 99.9 %, six degrees of freedom).
-
-A larger one more probably compensates for another camera. It is not used, and the resulting shift of the pose adds to the doubt.
 """
 MIN_POINTS = 20
 """Minimum number of points for estimating a motion; with fewer, the noise is as uncertain as the motion itself."""
@@ -73,7 +65,6 @@ class Stated(StrEnum):
         "approximate"  # and stated to be; intrinsics are estimated under this hypothesis and those below
     )
     CROPPED = "cropped"
-    WRONG_FOCAL = "mistaken focal length"
     WRONG = "mistaken"
 
 
@@ -90,7 +81,6 @@ class Motion(StrEnum):
 
     STILL = "still"
     MOVING = "moving"
-    TRANSPOSED = "transposed"  # moving, with a shutter that rolls along the other axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,28 +125,21 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         )
 
     if prior != FIXED:
-        own = [about(Stated.APPROXIMATE, 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
+        own = [about(Stated.APPROXIMATE, 1 - CROPS, prior, prior)]
         if prior.shift < ANY.shift:
             cropped = replace(prior, shift=ANY.shift)
-            own.append(about(Stated.CROPPED, CROPS_BESIDE_APPROXIMATE, cropped, cropped))
-        of_map = [(camera, SAME_LOG_ODDS) for camera in cameras]
+            own.append(about(Stated.CROPPED, CROPS, cropped, cropped))
+        of_map = [(camera, log_odds_of(SHARE_SAME_CAMERA)) for camera in cameras]
     else:
         # If the stated intrinsics are those of the map, they are wrong only where the image is from another camera.
         as_map = any(camera.is_near(CALIBRATED) and not bool(camera.differs.any()) for camera in cameras)
         share = 1 - SHARE_SAME_CAMERA if as_map else 1.0
         wrong = (MISTAKES + CROPS) * share
-        other_focal = replace(USUAL, log_focal=MISTAKEN.log_focal)
         own = [
             about(Stated.EXACT, 1 - USUALLY - wrong, RIGHT),
             about(Stated.INEXACT, USUALLY, USUAL),
             # A mistaken parameter may be off by any amount, so it is estimated without its prior.
-            about(
-                Stated.WRONG_FOCAL,
-                0.6 * MISTAKES * share,
-                other_focal,
-                replace(other_focal, log_focal=ANY.log_focal),
-            ),
-            about(Stated.WRONG, 0.4 * MISTAKES * share, MISTAKEN, NOMINAL),
+            about(Stated.WRONG, MISTAKES * share, MISTAKEN, NOMINAL),
             about(Stated.CROPPED, CROPS * share, CROPPED, CROPPED),
         ]
         of_map = [(camera, camera.log_odds) for camera in cameras if bool(camera.differs.any())]
@@ -195,7 +178,6 @@ class Explanation:
     by_fit: Float[
         Tensor, "6 6"
     ]  # ``covariance`` without the scatter of calibrations among the map's own images
-    is_plausible: bool = True  # whether its motion is within ``MAX_MOTION``
 
     @property
     def calibration(self) -> Calibration:
@@ -266,16 +248,9 @@ class Posterior:
         return self.best_of(max(totals, key=lambda key: totals[key]))
 
     def best_of(self, name: str) -> Explanation:
-        """Return the explanation to use for a hypothesis: moving or static, whichever is more probable.
-
-        A motion is used if it is more probable than all alternatives together. One with the shutter rolling along the other
-        axis is never used; it adds to the doubt.
-        """
-        inside = [(each, p) for each, p in self._weighted if each.hypothesis.name == name]
-        moving = sum(p for each, p in inside if each.motion is Motion.MOVING and each.is_plausible)
-        still = sum(p for each, p in inside) - moving
-        motion = Motion.MOVING if moving > still else Motion.STILL
-        return next(each for each, _ in inside if each.motion is motion)
+        """Return the explanation to use for a hypothesis: moving or static, whichever is more probable."""
+        inside = [pair for pair in self._weighted if pair[0].hypothesis.name == name]
+        return max(inside, key=lambda pair: pair[1])[0]
 
     @property
     def with_stated(self) -> Posterior:
@@ -381,38 +356,26 @@ def posterior(
     widest = np.hypot(np.maximum(deviations, np.abs(mean)).max(0), np.append(scatter.numpy(), 0.0))
     wide = np.concatenate([widest, usual])
     free, spurious = wide.nonzero()[0], np.concatenate([scatter.numpy(), np.zeros(7)])
-    still = ReprojectionErrors(data, start)
-    ways: dict[ReprojectionErrors, tuple[Motion, ...]] = {still: (Motion.STILL,)}
-    if share:
-        ways[still] = (Motion.STILL, Motion.MOVING)
-        ways[still.exposed_at(data.transposed_exposure_times)] = (Motion.TRANSPOSED,)
-    state = State.of(start, calibration)
-    fits = [(errors, *minimized(errors, state, wide, noise, correlation, steps=steps)) for errors in ways]
-    least = min(fitted for *_, fitted in fits)
-    shares = {
-        Motion.STILL: 1 - share,
-        Motion.MOVING: share * (1 - TRANSPOSED),
-        Motion.TRANSPOSED: share * TRANSPOSED,
-    }
-    T, found = fits[0][1].state.pose(), []
-    for errors, here, _, _ in fits:
-        system = errors.system(here, least).weighted(1 / correlation)
-        eliminated = EliminatedPose.of(system, here.state.camera[free])
-        offset = (T.inverse() @ here.state.pose()).log()
-        for motion in ways[errors]:
-            moving = np.zeros(6) if motion is Motion.STILL else usual
-            priors = np.concatenate([deviations, np.tile(moving, (len(which), 1))], axis=1)[:, free]
-            means = np.concatenate([mean, np.zeros((len(which), 6))], axis=1)[:, free]
-            explained = eliminated.given(means, priors, spurious[free])
-            known = eliminated.given(means[:1], np.where(free < 5, 0.0, priors[:1]), 0.0 * spurious[free])
-            found += _explanations(
-                which, motion, explained, known.covariance[0], usual, free, shares[motion], offset
-            )
-    _, here, system, _ = fits[0]
+    errors = ReprojectionErrors(data, start)
+    here, system, fitted = minimized(
+        errors, State.of(start, calibration), wide, noise, correlation, steps=steps
+    )
+    eliminated = EliminatedPose.of(
+        errors.system(here, fitted).weighted(1 / correlation), here.state.camera[free]
+    )
+    found: list[Explanation] = []
+    for motion, prior, moving in ((Motion.STILL, 1 - share, np.zeros(6)), (Motion.MOVING, share, usual)):
+        if prior == 0:
+            continue
+        priors = np.concatenate([deviations, np.tile(moving, (len(which), 1))], axis=1)[:, free]
+        means = np.concatenate([mean, np.zeros((len(which), 6))], axis=1)[:, free]
+        explained = eliminated.given(means, priors, spurious[free])
+        known = eliminated.given(means[:1], np.where(free < 5, 0.0, priors[:1]), 0.0 * spurious[free])
+        found += _explanations(which, motion, explained, known.covariance[0], free, prior)
     spread = np.zeros(11)
     spread[free] = np.sqrt(np.diag(np.linalg.inv(system.hessian))[6:].clip(min=0))
     apparent, certain = (torch.from_numpy(value[:5].copy()) for value in (here.state.camera, spread))
-    return Posterior(T, least, apparent, certain, distance, tuple(found))
+    return Posterior(here.state.pose(), fitted, apparent, certain, distance, tuple(found))
 
 
 def _explanations(
@@ -420,16 +383,13 @@ def _explanations(
     motion: Motion,
     explained: Conditional,
     by_motion: Array,
-    usual: Array,
     free: Array,
     share: float,
-    offset: Float[Tensor, "6"],
 ) -> list[Explanation]:
     """Return the explanations by each hypothesis with a kind of motion, whose prior probability is ``share``."""
     parameters = np.zeros((len(which), 11))
     parameters[:, free] = explained.parameters
-    sizes = ((parameters[:, 5:] / np.maximum(usual, TIED)) ** 2).sum(1)
-    evidence = explained.log_evidence + math.log(max(share, 1e-300))
+    evidence = explained.log_evidence + math.log(share)
     update, covariance, by_fit = (
         torch.from_numpy(part) for part in (explained.update, explained.covariance, explained.by_fit)
     )
@@ -438,12 +398,11 @@ def _explanations(
             each,
             motion,
             each.log_prior + float(evidence[i]),
-            offset + update[i],
+            update[i],
             torch.from_numpy(parameters[i]),
             covariance[i],
             torch.from_numpy(by_motion),
             by_fit[i],
-            bool(sizes[i] <= MAX_MOTION),
         )
         for i, each in enumerate(which)
     ]

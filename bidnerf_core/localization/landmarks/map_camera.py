@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
+from bidnerf_core.localization.landmarks.chance import log_odds_of
 from bidnerf_core.mapping.geometry.calibration import (
     CALIBRATED,
     CROPPED,
@@ -32,21 +33,18 @@ MAX_CAMERAS = 9
 """Maximum number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
 MAX_RESIDUAL = 0.002
 """Root mean square difference, as a fraction of the image's width, above which a correction does not describe a camera."""
-UNUSUAL = 0.03
-"""Fraction of the map's images up to which a matching camera counts as an extreme of autofocus instead of another camera."""
 GRID = 7
 """Number of rows and columns of pixels at which cameras are compared."""
-DISTINGUISHABLE_DEVIATIONS = 2.0
-"""Minimum difference of distinguishable cameras, in standard deviations of a good calibration."""
+MAX_DEVIATIONS = 2.0
+"""Multiple of the standard deviations of a prior beyond which a difference of intrinsics does not agree with it."""
 SHARE_SAME_CAMERA = 0.9
 """Fraction of queries with nearly the map's intrinsics that are from the map's camera."""
-SAME_LOG_ODDS = math.log(SHARE_SAME_CAMERA / (1 - SHARE_SAME_CAMERA))
-OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1, stretch=STRETCH_TOLERANCE / 1.5)
+OTHER_CAMERA = CalibrationPrior(
+    log_focal=0.08, shift=0.03, radial=0.1, stretch=STRETCH_TOLERANCE / MAX_DEVIATIONS
+)
 """Standard deviations of the differences between the intrinsics of different cameras with images of the same shape."""
 RESIZED = 0.05
 """Fraction of resized images among those with another pixel aspect ratio than the map's images at their size."""
-MAX_DEVIATIONS = 1.5
-"""Multiple of the standard deviations of a prior beyond which a difference of intrinsics does not agree with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +58,7 @@ class MapCamera:
     @property
     def differs(self) -> Bool[Tensor, "5"]:
         """Mask of the parameters that differ."""
-        return self.correction.abs() > DISTINGUISHABLE_DEVIATIONS * self.deviations
+        return self.correction.abs() > MAX_DEVIATIONS * self.deviations
 
     @property
     def log_odds(self) -> float:
@@ -72,10 +70,12 @@ class MapCamera:
         if not self.is_near(STRETCHED):
             return -math.inf
         if self.is_stretched:
-            return math.log(RESIZED / (1 - RESIZED))
+            return log_odds_of(RESIZED)
         shares = ((USUAL, USUALLY), (MISTAKEN, MISTAKES), (CROPPED, CROPS))
         misstated = torch.stack([self._log_density(prior) + math.log(share) for prior, share in shares])
-        return float(misstated.logsumexp(0) - self._log_density(OTHER_CAMERA)) + SAME_LOG_ODDS
+        return float(misstated.logsumexp(0) - self._log_density(OTHER_CAMERA)) + log_odds_of(
+            SHARE_SAME_CAMERA
+        )
 
     @property
     def is_stretched(self) -> bool:
@@ -95,8 +95,8 @@ class MapCamera:
 def map_cameras(given: Intrinsics, cameras: tuple[Intrinsics, ...], crops: bool = False) -> list[MapCamera]:
     """Return the map's cameras that may have taken an image with the ``given`` intrinsics.
 
-    Among the map's cameras with images of one shape, the one that agrees with the given intrinsics is chosen or, if that took
-    hardly any of the images, the one with the median focal length. Cameras with a lens too different for ``Calibration`` are
+    Among the map's cameras with images of one shape, one that agrees with the given intrinsics is chosen or, if there is none,
+    the one with the median focal length. Cameras with a lens too different for ``Calibration`` are
     left out.
 
     A camera with only landscape images is rotated to either side for a portrait image. An image with a shape that the map does
@@ -115,8 +115,7 @@ def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCame
     """Return the camera that ``map_cameras`` chooses among ``cameras``, which all have the same image size."""
     alike = list(cameras)
     agreeing = [camera for camera in alike if _agree(given, camera)]
-    if len(agreeing) > UNUSUAL * len(alike):
-        alike = agreeing[:1]
+    alike = agreeing[:1] or alike
     alike.sort(key=lambda camera: camera.fx)
     count = min(len(alike), MAX_CAMERAS)
     chosen = [alike[i] for i in torch.linspace(0, len(alike) - 1, count).round().int().tolist()]
@@ -138,7 +137,7 @@ def _agree(a: Intrinsics, b: Intrinsics) -> bool:
     ]  # fmt: skip
     bends = (camera.distortion + (0.0,) * (size - len(camera.distortion)) for camera in (a, b))
     parts += [(x - y, known.radial) for x, y in zip(*bends, strict=True)]
-    return all(abs(difference) <= DISTINGUISHABLE_DEVIATIONS * deviation for difference, deviation in parts)
+    return all(abs(difference) <= MAX_DEVIATIONS * deviation for difference, deviation in parts)
 
 
 def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "5"] | None:

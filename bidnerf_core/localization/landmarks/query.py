@@ -23,6 +23,9 @@ from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 THRESHOLD = 0.005
 """Maximum reprojection error of an inlier, as a fraction of the image's diagonal; at least 2 pixels."""
 
+MAX_DISTANCE = 0.6
+"""Maximum descriptor distance of a guided match, in units of the distance between descriptors of different landmarks."""
+
 
 @dataclass(frozen=True, eq=False)
 class LandmarkQuery:
@@ -42,6 +45,11 @@ class LandmarkQuery:
     def threshold(self) -> float:
         """The maximum reprojection error of an inlier, pixels."""
         return pixel_threshold(self.images[-1].intrinsics)
+
+    @property
+    def max_distance(self) -> float:
+        """The maximum squared descriptor distance of a guided match."""
+        return (MAX_DISTANCE * self.landmarks.unrelated_distance) ** 2
 
     @property
     def map_cameras(self) -> list[MapCamera]:

@@ -33,14 +33,9 @@ GUIDED_ROUNDS = 3
 """Maximum number of rounds of guided matching with the last radius; they end once the matches no longer change."""
 UNCHANGED = 0.02
 """Fraction of the matches that may change in the last round."""
-LOOSE = 1.3
-"""Maximum descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Maximum relative difference between a landmark's depth and the depth measured at its keypoint."""
-MAX_DISTANCE = 0.6
-"""Maximum descriptor distance of a guided match without first inliers, in units of the distance between descriptors of different
-landmarks.
-"""
+
 MAX_REFITS = 2
 """Maximum number of repeated refinements because other intrinsics or another motion have become more probable."""
 
@@ -53,7 +48,6 @@ class GuidedPose:
     matches: LandmarkMatches  # by descriptors alone
     fit: ReprojectionFit
     correspondences: LandmarkMatches
-    max_distance: float  # maximum squared descriptor distance of a guided match
     posterior: Posterior
     best: Explanation  # with the intrinsics and the motion of the fit
 
@@ -68,7 +62,7 @@ class GuidedPose:
         projections = projected_landmarks(
             seen.images, seen.landmarks, fit.T_world_rig, fit.calibration, radius, fit.motion
         )
-        return sum(map(len, projections)), matches_by_chance(projections, radius, self.max_distance)
+        return sum(map(len, projections)), matches_by_chance(projections, radius, seen.max_distance)
 
     def updated(self, log_odds: Mapping[str, float]) -> GuidedPose:
         """Return the pose with the most probable intrinsics given further evidence, see ``Posterior.updated``."""
@@ -83,41 +77,27 @@ def refined_pose(query: LandmarkQuery, matches: LandmarkMatches, first: Candidat
     fit = resect(
         query.observed(inliers), first.T_world_rig, noise, query.prior, first.calibration, correlation
     )
-    return _refined(query, matches, fit, inliers, usual_distance(query, inliers))
-
-
-def usual_distance(query: LandmarkQuery, inliers: LandmarkMatches) -> float:
-    """Return the maximum squared descriptor distance of a guided match, from those of the first inliers."""
-    return LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
-
-
-def _most_distance(query: LandmarkQuery) -> float:
-    """Return the maximum squared descriptor distance of a guided match, from the map alone."""
-    return (MAX_DISTANCE * query.landmarks.unrelated_distance) ** 2
+    return _refined(query, matches, fit, inliers)
 
 
 def confirmed(query: LandmarkQuery, matches: LandmarkMatches, T_world_rig: SE3) -> GuidedPose | None:
     """Refine a pose found by other means on guided matches; None if there are too few."""
-    radius, most = RADII[0] * query.threshold, _most_distance(query)
-    found = guided_matches(query.images, query.landmarks, T_world_rig, radius, most)
+    radius = RADII[0] * query.threshold
+    found = guided_matches(query.images, query.landmarks, T_world_rig, radius, query.max_distance)
     if len(found) < MIN_MATCHES:
         return None
     correlation = query.landmarks.correlation_of(len(found))
     fit = resect(query.observed(found), T_world_rig, radius / 2, query.prior, correlation=correlation)
-    return _refined(query, matches, fit, found, most)
+    return _refined(query, matches, fit, found)
 
 
 def _refined(
-    query: LandmarkQuery,
-    matches: LandmarkMatches,
-    fit: ReprojectionFit,
-    found: LandmarkMatches,
-    max_distance: float,
+    query: LandmarkQuery, matches: LandmarkMatches, fit: ReprojectionFit, found: LandmarkMatches
 ) -> GuidedPose:
     """Refine a pose on guided matches, first with the stated intrinsics, then with the most probable ones."""
-    fit, found = _guided(query, query.prior, fit, found, max_distance, RADII)
+    fit, found = _guided(query, query.prior, fit, found, RADII)
     judged = _posterior(query, fit, found, fit.calibration)
-    return _explained(GuidedPose(query, matches, fit, found, max_distance, judged, judged.stated), {})
+    return _explained(GuidedPose(query, matches, fit, found, judged, judged.stated), {})
 
 
 def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
@@ -129,17 +109,17 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
         prior, seen = best.hypothesis.refitted, _seen(pose.query, best)
         motion = MotionPrior.usual(pose.posterior.distance) if best.motion is Motion.MOVING else STILL
         start = best.calibration if best.hypothesis.whose is Whose.ESTIMATED else GIVEN
-        T, most = pose.posterior.pose(best), pose.max_distance
+        T = pose.posterior.pose(best)
         inliers = pose.matches[agreeing_with(seen, pose.matches, T, start)]
-        if len(inliers) > len(pose.correspondences):  # the new camera differs much from the previous one
-            most = max(most, usual_distance(seen, inliers))
-        else:
+        if len(inliers) <= len(
+            pose.correspondences
+        ):  # otherwise, the new camera differs much from the previous one
             inliers = pose.correspondences
         data, correlation = seen.observed(inliers), _correlation(seen, inliers)
         fit = resect(data, T, pose.posterior.noise, prior, start, correlation, motion)
-        fit, found = _guided(seen, prior, fit, inliers, most, RADII[1:], motion)
+        fit, found = _guided(seen, prior, fit, inliers, RADII[1:], motion)
         judged = _posterior(pose.query, fit, found, best.calibration).updated(log_odds)
-        pose = replace(pose, fit=fit, correspondences=found, max_distance=most, posterior=judged, best=best)
+        pose = replace(pose, fit=fit, correspondences=found, posterior=judged, best=best)
     # If two intrinsics alternate as the more probable, the last are kept.
     return replace(pose, posterior=pose.posterior.with_best(pose.best, pose.fit.T_world_rig))
 
@@ -179,15 +159,14 @@ def _guided(
     prior: CalibrationPrior,
     fit: ReprojectionFit,
     found: LandmarkMatches,
-    most: float,
     radii: Sequence[float],
     motion: MotionPrior = STILL,
 ) -> tuple[ReprojectionFit, LandmarkMatches]:
     """Alternate guided matching and fitting of the pose until the matches no longer change."""
     for radius in (*radii[:-1], *[radii[-1]] * GUIDED_ROUNDS):
         guided = guided_matches(
-            query.images, query.landmarks, fit.T_world_rig, radius * query.threshold, most, fit.calibration,
-            fit.motion,
+            query.images, query.landmarks, fit.T_world_rig, radius * query.threshold, query.max_distance,
+            fit.calibration, fit.motion,
         )  # fmt: skip
         data = query.observed(guided)
         agrees = _depth_agrees(data, fit.T_world_rig)
@@ -218,7 +197,7 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
 
 def visible_and_matching(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
     """Return the numbers of landmarks that should be visible from a pose, that match near it, and that would by chance."""
-    radius, most = RADII[0] * query.threshold, _most_distance(query)
+    radius, most = RADII[0] * query.threshold, query.max_distance
     projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)
     matches = sum(len(found.matches(radius, most)) for found in projections)
     return sum(map(len, projections)), matches, matches_by_chance(projections, radius, most)

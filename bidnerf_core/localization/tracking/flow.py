@@ -12,8 +12,6 @@ from bidnerf_core.mapping.landmarks.features import FIRST_CENTRE
 
 FLOW_WINDOW = (13, 13)
 """Size of the compared patches, pixels."""
-LEVELS = 3
-"""Number of pyramid levels above the image itself; each halves it."""
 FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 """Maximum number of iterations on each level, and the step (pixels) below which they end."""
 RETURN = 0.7
@@ -41,7 +39,7 @@ def flow(
     before = _as_bright_as(now, before)
     start = _corner_based(pixels)
     there, seen, _ = cv2.calcOpticalFlowPyrLK(
-        before, now, start, _corner_based(guess), winSize=FLOW_WINDOW, maxLevel=LEVELS,
+        before, now, start, _corner_based(guess), winSize=FLOW_WINDOW,
         criteria=FLOW_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE,
     )  # fmt: skip
     back, seen_back, _ = cv2.calcOpticalFlowPyrLK(

@@ -29,6 +29,7 @@ from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.points import (
     FRESH,
+    INLIER,
     FollowedPoints,
     PointFit,
     fit_pose,
@@ -53,12 +54,8 @@ from bidnerf_core.mapping import SurfaceMap
 
 WIDEST = 0.4
 """Maximum search radius around the predicted landmarks, as a fraction of the image's diagonal."""
-SIGMAS = 3.0
-"""Radius of that search, in standard deviations of the prediction."""
 ENOUGH_LANDMARKS = 40
 """Minimum number of tracked inliers at which no new landmarks are needed, and the pose needs no confirmation."""
-SINGLE = LandmarkThresholds(precision=math.inf)
-"""Thresholds for landmarks in one image. The precision is checked after fusing them with depth and the prediction."""
 VAGUE = 0.35
 """Maximum uncertainty of a prediction that shape alone may correct, as a fraction of the distance to the scene."""
 
@@ -138,7 +135,8 @@ class ByLandmarks:
         doubt: CameraDoubt,
     ) -> tuple[LandmarkPose, Verdict]:
         pose = landmark_pose(points, found, evidence, self.detector.landmarks, doubt, frame.intrinsics)
-        return pose, landmark_verdict(pose, SINGLE)
+        # The precision is checked after fusion with depth and the prediction.
+        return pose, landmark_verdict(pose, LandmarkThresholds(precision=math.inf))
 
     def _wants_more(self, state: TrackerState, found: LandmarkPose, measured: Measurement) -> bool:
         few = found.inliers < max(ENOUGH_LANDMARKS, self.config.refresh_share * state.sought)
@@ -161,7 +159,7 @@ class ByLandmarks:
             radius = max(least, search_radius(predicted, camera))
             if radius > most:
                 return None
-        seen = self.detector(frame, T, radius, state.usual_distance, state.noise, state.moves)
+        seen = self.detector(frame, T, radius, state.noise, state.moves)
         if seen is None:
             return None
         pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence, seen.doubt)
@@ -174,7 +172,6 @@ class ByLandmarks:
             state,
             sought=len(some),
             age=0,
-            usual_distance=seen.usual_distance,
             doubt=seen.doubt,
         )
         return pose, verdict, seen.points, replace(seen.found, inliers=kept), state
@@ -221,7 +218,7 @@ class ByLandmarks:
 
 def search_radius(predicted: Motion, camera: Intrinsics) -> float:
     """Return the radius (pixels) around its prediction within which a landmark is very likely to appear."""
-    return SIGMAS * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
+    return INLIER * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
 
 
 def is_vague(predicted: Motion, camera: Intrinsics) -> bool:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times, transposed_exposure_times
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
@@ -90,7 +90,6 @@ class FollowedPoints:
             torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
             torch.zeros((count, 3), dtype=torch.float64),
             exposure_times(self.pixels, camera),
-            transposed_exposure_times(self.pixels, camera),
         )
 
 

@@ -5,7 +5,6 @@ Landmarks give the camera's pose in the map; corners give the motion between con
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -31,7 +30,7 @@ from bidnerf_core.localization.landmarks.guided import OBLIQUE, guided_matches, 
 from bidnerf_core.localization.landmarks.matching import EXHAUSTIVE, LandmarkMatcher, unguided_matches
 from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery, pixel_threshold
-from bidnerf_core.localization.landmarks.refinement import RADII, matches_by_chance, usual_distance
+from bidnerf_core.localization.landmarks.refinement import RADII, matches_by_chance
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
@@ -67,7 +66,6 @@ class Recognized:
     points: FollowedPoints
     found: PointFit
     evidence: Evidence
-    usual_distance: float  # maximum squared descriptor distance of a match
     doubt: CameraDoubt  # about the intrinsics
 
 
@@ -83,37 +81,35 @@ class LandmarkDetector:
         frame: Frame,
         T_world_camera: SE3,
         radius: float,
-        most_distance: float,
         noise: float,
         moves: bool = False,
     ) -> Recognized | None:
         """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
 
-        ``most_distance`` is the maximum squared descriptor distance of a match, ``noise`` a first guess at that of keypoints
-        (pixels), ``moves`` a guess as for ``fit_pose``. Returns None if too few keypoints match.
+        ``noise`` is a first guess at that of keypoints (pixels), ``moves`` a guess as for ``fit_pose``. Returns None if too few
+        keypoints match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
         image = image_keypoints(View(frame, SE3.identity()), self.features)
         query = LandmarkQuery([image], self.landmarks[number], FIXED)
         tight = RADII[-1] * query.threshold
-        seen = self._seen(frame, query, T_world_camera, radius, most_distance, noise, moves)
+        seen = self._seen(frame, query, T_world_camera, radius, noise, moves)
         surprise = 0.0
-        if seen is not None and (radius > tight or math.isinf(most_distance)):
+        if seen is not None and radius > tight:
             if radius > WIDE * tight:
                 within = min(0.5, (query.threshold / radius) ** 2)
                 surprise = log10_nfa(len(seen[0]), seen[1].within(query.threshold), within)
             T, noise = seen[1].T_world_camera, seen[1].fit.noise
-            most_distance = seen[2] if math.isinf(most_distance) else most_distance
-            seen = self._seen(frame, query, T, tight, most_distance, noise, moves)
+            seen = self._seen(frame, query, T, tight, noise, moves)
         if seen is None:
             return None
-        points, found, _ = seen
+        points, found = seen
         found = with_motion(found, self.landmarks)
-        evidence = _guided_evidence(query, found, tight, most_distance)
+        evidence = _guided_evidence(query, found, tight)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         points = replace(points, landmark=number[points.landmark])
         doubt = CameraDoubt() if found.judged is None else CameraDoubt.of(found.judged)
-        return Recognized(points, found, evidence, most_distance, doubt)
+        return Recognized(points, found, evidence, doubt)
 
     def _seen(
         self,
@@ -121,21 +117,20 @@ class LandmarkDetector:
         query: LandmarkQuery,
         T: SE3,
         radius: float,
-        most_distance: float,
         noise: float,
         moves: bool,
-    ) -> tuple[FollowedPoints, PointFit, float] | None:
-        """Return the matches within a radius, the pose that they determine, and ``usual_distance`` of its inliers."""
+    ) -> tuple[FollowedPoints, PointFit] | None:
+        """Return the matches within a radius, and the pose that they determine."""
         if radius > WIDE * RADII[-1] * query.threshold:
             matches = _matches_within(query, T, radius)
         else:
-            matches = guided_matches(query.images, query.landmarks, T, radius, most_distance)
+            matches = guided_matches(query.images, query.landmarks, T, radius, query.max_distance)
         points = FollowedPoints.of_landmarks(query.landmarks, matches.landmark, query.pixels(matches))
         correlation = self.landmarks.correlation_of(len(points))
         found = fit_pose(points.observed(frame), T, noise, query.threshold, correlation, moves)
         if found is None or not bool(found.inliers.any()):
             return None
-        return points, found, usual_distance(query, matches[found.inliers])
+        return points, found
 
     def _near(self, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "n"]:
         """Return up to ``EXHAUSTIVE`` numbers of landmarks in view, mapped from roughly this direction, those in most images."""
@@ -150,11 +145,11 @@ class LandmarkDetector:
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:EXHAUSTIVE].sort().values]
 
 
-def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most: float) -> Evidence:
+def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float) -> Evidence:
     """Return the evidence from comparing the number of matches with that around shifted projections, which is due to chance."""
     agreeing, keypoints = int(found.inliers.sum()), len(query.images[0].keypoints)
     projections = projected_landmarks(query.images, query.landmarks, found.T_world_camera, GIVEN, radius)
-    chance = matches_by_chance(projections, radius, most)
+    chance = matches_by_chance(projections, radius, query.max_distance)
     probability = min(0.5, max(LEAST_CHANCE, chance) / max(1, keypoints))
     nfa = log10_nfa(keypoints, agreeing, probability)
     return Evidence(keypoints, agreeing, nfa, chance, sum(map(len, projections)), keypoints)
@@ -238,8 +233,6 @@ LEAST_SHARE = 0.5
 """Minimum inlier fraction of the corners."""
 SIGNIFICANT_NFA = -6.0
 """Maximum log10 of the number of false alarms."""
-REPLENISHED = 0.5
-"""Fraction of ``count`` below which new corners are detected."""
 
 
 @dataclass(frozen=True)
@@ -247,6 +240,7 @@ class Odometry:
     """Tracks up to ``count`` corners with measured depth of the given ``noise``."""
 
     count: int
+    refresh_share: float  # remaining fraction of these at which new ones are detected
     noise: DepthNoise = UNKNOWN.noise
 
     def moved(
@@ -276,7 +270,7 @@ class Odometry:
     ) -> FollowedPoints:
         """Return the corners among ``points``, or new ones at the pose of this frame if they have become few."""
         points = points[points.landmark == FRESH]
-        if image is None or not frame.has_depth or len(points) >= REPLENISHED * self.count:
+        if image is None or not frame.has_depth or len(points) >= self.refresh_share * self.count:
             return points
         apart = 0.7 * (image.shape[0] * image.shape[1] / self.count) ** 0.5
         pixels = corners(image, self.count, apart)

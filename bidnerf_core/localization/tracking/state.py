@@ -90,7 +90,7 @@ def after_search(
 
 R = TypeVar("R")
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 7
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 8
 KINDS: Kinds = {
     "points.pixels": ((-1, 2), torch.float32), "points.positions": ((-1, 3), torch.float64),
     "points.deviations": ((-1, 2), torch.float64), "points.directions": ((-1, 3), torch.float64),
@@ -118,7 +118,6 @@ class TrackerState:
     image: Grey | None = None  # the last one, in which the points were observed
     sought: int = 0  # number of points when they were last detected
     age: int = 0  # frames since then
-    usual_distance: float = float("inf")  # maximum squared descriptor distance of a match
     doubt: CameraDoubt = field(default_factory=CameraDoubt)  # about the intrinsics
     camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are used
     noise: float = 1.0  # pixels: of the points in the last image
@@ -144,7 +143,6 @@ class StoredNumbers:
     age: int
     noise: float
     moves: bool
-    usual_distance: float | None  # None for infinity, which JSON cannot represent
     reach: float | None  # None if there is no motion
     agility: float | None
 
@@ -161,10 +159,9 @@ class StoredNumbers:
 
     @staticmethod
     def of(state: TrackerState) -> StoredNumbers:
-        distance = None if math.isinf(state.usual_distance) else state.usual_distance
         reach, agility = (None, None) if state.motion is None else (state.motion.reach, state.motion.agility)
         same = {f.name: getattr(state, f.name) for f in fields(StoredNumbers) if hasattr(state, f.name)}
-        return StoredNumbers(**same | {"usual_distance": distance}, reach=reach, agility=agility)
+        return StoredNumbers(**same, reach=reach, agility=agility)
 
 
 def save_state(path: Path, state: TrackerState, key: str) -> None:
@@ -215,8 +212,6 @@ def _state(numbers: StoredNumbers, tensors: dict[str, Tensor]) -> TrackerState:
         velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
         T = _record(SE3, "motion", tensors)
         values["motion"] = Motion(T, velocity, noise, bias, reach, agility)
-    if values["usual_distance"] is None:
-        del values["usual_distance"]
     return TrackerState(
         **values, points=_record(FollowedPoints, "points", tensors),
         doubt=_doubt(tensors),

@@ -29,7 +29,6 @@ class ObservedPoints:
     rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
     translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
     exposure_times: Float[Tensor, "m"]  # see the function ``exposure_times``
-    transposed_exposure_times: Float[Tensor, "m"]  # the same for a shutter that rolls along the other axis
 
     def __len__(self) -> int:
         return len(self.points)

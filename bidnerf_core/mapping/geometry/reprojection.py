@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
@@ -164,12 +163,6 @@ class ReprojectionErrors:
         self._focal = data.focal.numpy()
         self._observed = data.image.numpy() * self._focal[:, None]
         self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
-
-    def exposed_at(self, times: Float[Tensor, "m"]) -> ReprojectionErrors:
-        """Return the errors of the same observations with other exposure times."""
-        found = copy.copy(self)
-        found._exposure_times = times.numpy()
-        return found
 
     def linearized(self, state: State, free: Array) -> LinearizedErrors:
         """Return the errors at a state and their Jacobian with respect to the pose and the ``free`` camera parameters."""

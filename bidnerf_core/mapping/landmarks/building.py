@@ -108,7 +108,7 @@ def observed_at_rest(sightings: Sightings, positions: Float[Tensor, "n 3"], T: S
     eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
     return ObservedPoints(
         T.apply(sightings.in_camera(positions)), zeros[:, :2], zeros + torch.tensor([0.0, 0.0, 1.0]),
-        sightings.image, sightings.focal, zeros[:, 0], eye, zeros, sightings.exposure_times, zeros[:, 0],
+        sightings.image, sightings.focal, zeros[:, 0], eye, zeros, sightings.exposure_times,
     )  # fmt: skip
 
 

@@ -55,7 +55,7 @@ def rendered_views(
     views = list[View]()
     for number, (intrinsics, T) in enumerate(chosen):
         progress(number, len(chosen))
-        small = intrinsics.scaled(min(1.0, KEYFRAME_SIDE / max(intrinsics.width, intrinsics.height)))
+        small = intrinsics.at_most(KEYFRAME_SIDE)
         image = render_image(field, small, T, bounds)
         views.append(View(Frame(f"{number:04d}", image.rgb, small, image.depth), T))
     return views
