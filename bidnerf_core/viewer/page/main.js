@@ -268,12 +268,12 @@ class Page {
     if (last) this.space?.clear("search"); else this.space?.hypotheses(steps[this.step], this.answer.shape);
   }
 
-  // The losses of a descent, from zero up, with a mark at the present step.
+  // The losses of a descent, from the least to the greatest, with a mark at the present step.
   drawLosses(steps) {
-    const known = steps.map(({ loss }) => loss), svg = find("losses"), most = Math.max(...known);
+    const known = steps.map(({ loss }) => loss), svg = find("losses"), most = Math.max(...known), least = Math.min(...known);
     svg.toggleAttribute("hidden", known.some((loss) => loss === null));
     if (svg.hasAttribute("hidden")) return;
-    const at = (i) => [100 * i / (known.length - 1), 30 - 28 * known[i] / (most || 1)];
+    const at = (i) => [100 * i / (known.length - 1), 28 - 26 * (known[i] - least) / (most - least || 1)];
     svg.querySelector("polyline").setAttribute("points", known.map((_, i) => at(i).join()).join(" "));
     const [x, y] = at(this.step), line = svg.querySelector("line");
     for (const [name, value] of [["x1", x], ["x2", x], ["y1", y], ["y2", 30]]) line.setAttribute(name, value);

@@ -22,7 +22,7 @@ export function outcomeOf(answer) {
 }
 
 export function uncertainty(answer, factor) {
-  if (!answer.ellipsoid) return [element("h2", {}, "Uncertainty"), element("p", { class: "empty" }, "No covariance is known for this pose.")];
+  if (!answer.ellipsoid) return [element("h2", {}, "Uncertainty"), element("p", { class: "empty" }, "The answer has no covariance.")];
   const { lengths, rotation_deg: turns } = answer.ellipsoid;
   const enlarged = factor > 1 ? ` It is drawn ${factor} times as large.` : "";
   return [
