@@ -191,6 +191,7 @@ export class Space {
   // Text at a place of a layer.
   label(layer, place, text, colour) {
     const tag = document.createElement("span");
+    tag.textContent = text;
     tag.style.color = colour;
     document.getElementById("labels").append(tag);
     this.tags.push({ layer, tag, text, place: new THREE.Vector3(...place) });
