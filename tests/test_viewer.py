@@ -34,8 +34,8 @@ from bidnerf_core.localization.recording import (
 )
 from bidnerf_core.progress import stopped_by
 from bidnerf_core.results.pose_files import PosedImage, write_poses
-from bidnerf_core.viewer.answer import ShownAnswer, depth_difference, ellipsoid, shown_answer
-from bidnerf_core.viewer.explanations import contests
+from bidnerf_core.viewer.answer import MOST_STEPS, ShownAnswer, depth_difference, ellipsoid, shown_answer
+from bidnerf_core.viewer.explanations import EARLIER, HERE, KEPT, contests
 from bidnerf_core.viewer.figures import Bar, acceptance_figures
 from bidnerf_core.viewer.packing import packed_points
 from bidnerf_core.viewer.page_state import PageState
@@ -98,18 +98,19 @@ def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: ShownAnswer
     assert refused.runner_up is not None
 
 
-def test_a_bar_is_beyond_its_tick_on_the_side_that_passes(found: ShownAnswer, refused: ShownAnswer) -> None:
+def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(found: ShownAnswer, refused: ShownAnswer) -> None:
     figures = [figure for answer in (found, refused) for figure in answer.figures if figure.bar]
     assert {figure.passed for figure in figures} == {True, False}
     for figure in figures:
         assert figure.bar is not None
-        value, threshold, at_least = figure.bar.value, figure.bar.threshold, figure.bar.at_least
-        assert figure.passed is (value >= threshold if at_least else value <= threshold), figure
-        assert max(value, threshold) <= 1
+        value, at_least = figure.bar.value, figure.bar.at_least
+        assert figure.passed is (value >= 0.5 if at_least else value <= 0.5), figure
+        assert 0 <= value <= 1
         assert at_least is figure.threshold.startswith("at least")
-    bar = Bar.of(3.22, 3.0, at_least=False)
+    bar, far = Bar.of(3.22, 3.0, at_least=False), Bar.of(1.47, 0.25, at_least=False)
     assert bar is not None
-    assert math.isclose(bar.value / bar.threshold, 3.22 / 3.0)
+    assert math.isclose(bar.value / 0.5, 3.22 / 3.0)
+    assert far == Bar(1.0, False)
     assert Bar.of(math.nan, 3.0, True) is None
 
 
@@ -148,8 +149,57 @@ def test_the_loss_of_a_descent_is_the_first_figure(localizer: Localizer) -> None
     said, answer = Support(0.9, 5.0, -3.0, 9.0), localizer(viewed.query().views)
     lost = replace(answer, confidence=said.confidence, diagnostics=DescentDiagnostics(0.036, 0.02, said))
     first = acceptance_figures(lost, None)[0]
-    assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "at most 0.02", False)  # fmt: skip
+    assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "below 0.02", False)  # fmt: skip
     assert "not even a local optimum" in contests(lost, None)[0].remark
+
+
+def test_a_descent_is_shown_step_by_step_with_its_loss(localizer: Localizer) -> None:
+    answer = localizer(viewed.query().views)
+    T, losses = SE3.stack([*viewed.walk(500), answer.T_world_camera]), torch.linspace(0.5, 0.1, 500)
+    steps = shown_answer(viewed.room(), "descent", replace(answer, poses=T, losses=losses)).steps
+    assert len(steps) <= MOST_STEPS + 1
+    assert [steps[0].caption, steps[-1].caption] == ["step 0 of 500", HERE]
+    assert [step.loss for step in steps] == sorted((step.loss for step in steps if step.loss), reverse=True)
+    assert steps[0].loss == 0.5
+
+
+def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(localizer: Localizer) -> None:
+    query = viewed.query()
+    with recorded() as record:
+        answer = localizer(query.views)
+    here = shown_answer(viewed.room(), "here", answer, query.frame, record)
+    assert {figure.pose for figure in here.figures} == {here.matches.pose if here.matches else None} == {""}
+    away = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 1.0)
+    given_up = replace(answer, T_world_camera=away, diagnostics=None, confidence=None)
+    there = shown_answer(viewed.room(), "there", given_up, query.frame, record)
+    assert (
+        {figure.pose for figure in there.figures}
+        == {there.matches.pose if there.matches else None}
+        == {EARLIER}
+    )
+    assert EARLIER in next(each.remark for each in there.contests if not each.of_pose)
+
+
+def test_a_likelier_pose_is_shown_as_such_also_once_it_was_taken(localizer: Localizer) -> None:
+    query = viewed.query()
+    with recorded() as record:
+        answer = localizer(query.views)
+    T = answer.T_world_camera
+    there = replace(T, translation=T.translation + 1.0)
+    compared = SearchRecord(record.steps, record.landmarks, [ComparedExplanation("two places", -2.0, there)])
+    kept = shown_answer(viewed.room(), "a", replace(answer, outcome=Outcome.AMBIGUOUS), record=compared)
+    assert kept.runner_up is not None
+    assert kept.runner_up.probability == pytest.approx(1 / (1 + math.exp(-2)))
+    assert kept.contests[0].remark == KEPT
+    assert kept.steps[-2].caption == "two places"  # both poses, the likelier first
+    assert kept.steps[-2].scores == (-2.0, 0.0)
+    taken = shown_answer(viewed.room(), "b", replace(answer, T_world_camera=there), record=compared)
+    assert taken.runner_up is not None
+    assert taken.runner_up.probability == pytest.approx(1 / (1 + math.exp(2)))
+    assert taken.runner_up.pose == pytest.approx(
+        record.landmarks[-1].T_world_camera.matrix().flatten().tolist()
+    )
+    assert taken.contests[0].answers[0].probability > 0.8
 
 
 def test_a_localization_is_not_recorded_unless_asked_for(localizer: Localizer) -> None:

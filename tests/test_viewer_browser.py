@@ -8,11 +8,13 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import pytest
+import torch
 
 pytest.importorskip("starlette", reason="the extra 'viewer' is not installed")
 pytest.importorskip("playwright", reason="Playwright is not installed")
@@ -20,8 +22,9 @@ pytest.importorskip("playwright", reason="Playwright is not installed")
 from playwright.sync_api import sync_playwright
 
 import viewed
-from bidnerf_core import Localizer
+from bidnerf_core import SE3, Localizer
 from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.viewer.answer import shown_answer
 from bidnerf_core.viewer.saving import save_page
 from bidnerf_core.viewer.table import shown_row
 from bidnerf_core.viewer.trajectories import shown_trajectory
@@ -52,6 +55,8 @@ FARTHEST = """() => {
 }"""
 """Where the cameras and the poses are in the window, whose edge is at 1."""
 LAPTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+LOOKED_AT = """() => page.space.controls.target.distanceTo(new THREE.Vector3(page.pose[3], page.pose[7], page.pose[11]))"""
+"""How far the middle of the view is from the pose that the page tells of."""
 WAIT = 120_000  # ms
 
 
@@ -192,7 +197,7 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
         assert page.text_content(".outcome b").startswith("Refused")
         assert page.locator("#figures tr.failed").count() > 0
         assert page.text_content(".advice").count("What to try: ") == 1
-        assert page.is_disabled("#show-ellipsoid") is (page.evaluate("page.answer.ellipsoid") is None)
+        assert page.is_hidden("#show-ellipsoid") is (page.evaluate("page.answer.ellipsoid") is None)
         labels = page.locator("#labels span").all_text_contents()
         assert {"pose found, refused", "runner-up"} <= {*labels}
         steps = int(page.get_attribute("#step", "max"))
@@ -202,15 +207,47 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
         page.evaluate("document.activeElement.blur()")
         page.keyboard.press("ArrowRight")
         assert value(page, "#step") == "1"
+        assert any("this step" in label for label in page.locator("#labels span").all_text_contents())
         page.click("#runner")
         assert page.get_attribute("#runner", "aria-pressed") == "true"
+        for other in (True, False):  # the view goes to the pose that is told of
+            assert page.evaluate(LOOKED_AT) < 1e-6
+            figures = page.locator("#figures").count()
+            assert figures == (0 if other else 1)  # only those of the pose found are known
+            assert page.evaluate("page.pose === page.answer.runner_up.pose") is other
+            page.click("#runner")
         assert "runner-up" in page.text_content(".pictures .tag.right")
         assert "You are looking at the runner-up" in page.text_content(".banner")
+        page.click("#about summary")
+        page.wait_for_selector("#facts dt")
         page.keyboard.press("?")
         page.wait_for_selector("#words dt")
+        assert not page.is_visible("#facts")
         keys = page.locator("#keys kbd").all_text_contents()
         assert "r" in keys
         assert "v" not in keys  # of the live viewer
+        modes = page.locator(".modes button").count()
+        assert f"1 … {modes}" in keys
+        page.click("#space", position={"x": 200, "y": 500})
+        assert not page.is_visible("#words")
+
+
+def test_a_descent_can_be_replayed(browser: Any, tmp_path: Path) -> None:
+    found = Localizer(viewed.room())(viewed.query().views)
+    poses, losses = SE3.stack([*viewed.walk(30), found.T_world_camera]), torch.linspace(0.5, 0.1, 30)
+    answer = shown_answer(viewed.room(), "descent", replace(found, poses=poses, losses=losses))
+    file = save_page(page_of(viewed.room(), [answer]).state, tmp_path / "page.html")
+    with opened(browser, file.as_uri(), LAPTOP, offline=True) as page:
+        page.locator("#step").fill("10")
+        assert page.text_content("#caption") == "step 10 of 30: loss 0.362"
+        assert "this step" in page.locator("#labels span").all_text_contents()
+        assert page.is_visible("#losses")
+        heights = [
+            float(point.split(",")[1]) for point in page.get_attribute("#losses polyline", "points").split()
+        ]
+        assert heights == sorted(heights)  # the loss falls
+        page.locator("#step").fill("30")
+        assert page.text_content("#caption") == "the pose found"
 
 
 def test_rows_are_filtered_and_lead_to_their_frames(browser: Any, saved: Path) -> None:

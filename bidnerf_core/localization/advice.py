@@ -18,7 +18,7 @@ class Advice:
 ADVICE = {
     Outcome.AMBIGUOUS: Advice(
         "Another pose explains the image about as well.",
-        "Give several views with known relative poses, or a rough start (`--start`).",
+        "Give several views with known relative poses, or a rough start (`--start`). If there is one such place, check whether the map holds it twice.",
     ),
     Outcome.OFF_SURFACE: Advice(
         "Fewer than 85% of the measured points lie on the map's surface.",
@@ -45,7 +45,7 @@ ADVICE = {
         "Localize again from the pose, or raise `--fine-steps` and `--fine-rays`.",
     ),
     Outcome.HIGH_LOSS: Advice(
-        "A descent of `bid` or `inerf` ended too far from the image, mostly in a local minimum.",
+        "A descent of `bid` or `inerf` ended where the rendering differs too much from the image.",
         "Use `auto`, a closer start, more `--max-steps` or several views.",
     ),
     Outcome.DIVERGED: Advice(
@@ -70,7 +70,7 @@ ADVICE = {
     ),
     Outcome.TOO_FEW_MATCHES: Advice(
         "The map has many landmarks, but hardly any appear in the image.",
-        "Ask the map of the place that it shows, or take a sharper, brighter image from nearer to where the map's images were taken, and give its camera.",
+        "If the image shows another place, try that place's map; else take a sharper, brighter one from nearer to where the map's images were taken, and check its camera.",
     ),
 }
 """Advice for each outcome but ``CONVERGED``; a test compares it with the page."""

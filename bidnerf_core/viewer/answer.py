@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -18,12 +19,13 @@ from bidnerf_core.geometry.units import symbol
 from bidnerf_core.io.images import reduced, resampled
 from bidnerf_core.localization import METHODS, Localization
 from bidnerf_core.localization.advice import ADVICE
+from bidnerf_core.localization.landmarks.chance import probability_of
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.recording import SearchRecord
 from bidnerf_core.registry import PluginError
 from bidnerf_core.results.errors import pose_error
-from bidnerf_core.viewer.explanations import Contest, contests
+from bidnerf_core.viewer.explanations import APART, HERE, TURNED_DEG, Contest, contests, earlier, told
 from bidnerf_core.viewer.figures import Figure, acceptance_figures
 from bidnerf_core.viewer.packing import Packed, Picture, drawing, packed, photograph
 from bidnerf_core.viewer.rendering import quick_image
@@ -31,12 +33,10 @@ from bidnerf_core.viewer.scene import CameraShape, rows_of
 
 PICTURE_SIDE, RUNNER_UP_SIDE = 320, 240
 """Longer sides (pixels) of a photo and its rendering, and of the runner-up and its rendering; rendering takes time."""
-MOST_MATCHES = 600
-"""Maximum number of matches that are shown; larger sets are subsampled at a regular stride."""
+MOST_MATCHES, MOST_STEPS = 600, 200
+"""Maximum numbers of matches and of steps of a descent that are shown; more are subsampled at a regular stride."""
 SIGMAS = 2.0
 """Semi-axes of the ellipsoid of the position, in standard deviations."""
-APART, TURNED_DEG = 0.1, 10.0
-"""Distance (fraction of that to the centre of the scene) and angle beyond which another pose of a search is a different answer."""
 TOO_NEAR, RIGHT, TOO_FAR = (0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)
 """Colours for rendered depth that is smaller than, equal to and larger than the measured depth."""
 
@@ -58,11 +58,12 @@ class ShownStep:
     poses: Packed  # T_world_camera without the last row, float32 (h, 12), best first
     scores: tuple[float | None, ...]
     kept: int
+    loss: float | None = None  # of a step of a descent
 
 
 @dataclass(frozen=True)
 class ShownMatches:
-    """Keypoints, and the projections at the pose found of the landmarks with which they were matched."""
+    """Keypoints, and the projections of the landmarks with which they were matched at the last pose by landmarks."""
 
     keypoints: Packed  # float32 (m, 2), as fractions of the image's width and height
     projections: Packed  # the same; NaN behind the camera
@@ -72,6 +73,7 @@ class ShownMatches:
     by_appearance: (
         int  # of these, matched by descriptors alone; the others were matched near their projections
     )
+    pose: str  # which one it is, if not the pose found
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class RunnerUp:
     reason: str
     pose: tuple[float, ...]  # T_world_camera, 16 numbers by rows
     rendered: Picture | None
+    probability: float | None = None  # against the pose found alone; None if they were not compared
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,7 @@ def shown_answer(
             rendered, depth = _compared(scene, camera, T, frame, quick)
     error = None if truth is None or not finite else pose_error(T, truth, found.unit)
     advice = ADVICE.get(found.outcome)
-    other = None if record is None or not finite else _runner_up(scene, T, record, frame, quick)
+    other = None if record is None or not finite else _runner_up(scene, found, record, frame, quick)
     return ShownAnswer(
         name=name,
         outcome=str(found.outcome),
@@ -169,8 +172,8 @@ def shown_answer(
         depth=depth,
         steps=_steps(found, record),
         path=_path(found.poses),
-        matches=None if frame is None or record is None or not finite else _matches(frame, record),
-        figures=acceptance_figures(found, record),
+        matches=None if frame is None or record is None or not finite else _matches(frame, found, record),
+        figures=acceptance_figures(found, record, scene.colour_noise),
         contests=contests(found, record),
         runner_up=other,
     )
@@ -238,12 +241,29 @@ def _summary(method: str) -> str:
 
 
 def _steps(found: Localization, record: SearchRecord | None) -> tuple[ShownStep, ...]:
-    steps = [] if record is None else list(record.steps)
-    shown = [ShownStep(s.caption, _poses(s.T), _numbers(s.scores), s.kept) for s in steps]
-    last = found.T_world_camera
-    if bool(last.matrix().isfinite().all()):
-        shown.append(ShownStep("the pose found", _poses(last[None]), (0.0,), 1))
-    return tuple(shown)
+    """Return the steps of the search, or else of the descent, then the pose with each of its rivals, and the pose found."""
+    shown, last = list[ShownStep](), found.T_world_camera.to("cpu", torch.float64)
+    if record is not None:
+        shown += [ShownStep(s.caption, _poses(s.T), _numbers(s.scores), s.kept) for s in record.steps]
+    if not shown:
+        shown += _descent(found)
+    if not bool(last.matrix().isfinite().all()):
+        return tuple(shown)
+    for other in [] if record is None else told(found, record):
+        if other.T is not None:
+            T, scores = SE3.stack([last, other.T.to("cpu", torch.float64)]), torch.tensor([0.0, other.log_odds])  # fmt: skip
+            best = scores.argsort()
+            shown.append(ShownStep(other.reason, _poses(T[best]), _numbers(scores[best]), 2))
+    return (*shown, ShownStep(HERE, _poses(last[None]), (0.0,), 1, shown[-1].loss if shown else None))
+
+
+def _descent(found: Localization) -> Iterator[ShownStep]:
+    """Yield the poses of a descent with their losses, but the last, which is the pose found."""
+    count = min(len(found.losses), len(found.poses.translation) - 1)
+    for number in range(0, count, max(1, math.ceil(count / MOST_STEPS))):
+        T, loss = found.poses[number : number + 1], _finite(float(found.losses[number]))
+        if bool(T.matrix().isfinite().all()):
+            yield ShownStep(f"step {number} of {count}", _poses(T), (loss,), 1, loss)
 
 
 def _poses(T: SE3) -> Packed:
@@ -264,7 +284,7 @@ def _path(poses: SE3) -> tuple[tuple[float, float, float], ...]:
     return tuple((x, y, z) for x, y, z in places.tolist())
 
 
-def _matches(frame: Frame, record: SearchRecord) -> ShownMatches | None:
+def _matches(frame: Frame, found: Localization, record: SearchRecord) -> ShownMatches | None:
     """Return the matches of the last pose that was checked by landmarks: those used in its refinement, and those rejected."""
     if not record.landmarks:
         return None
@@ -283,6 +303,7 @@ def _matches(frame: Frame, record: SearchRecord) -> ShownMatches | None:
         int(agree.sum()),
         int((~agree).sum()),
         by_appearance,
+        earlier(found, pose),
     )
 
 
@@ -311,14 +332,16 @@ def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m
 
 
 def _runner_up(
-    scene: SceneMap, T: SE3, record: SearchRecord, frame: Frame | None, quick: bool
+    scene: SceneMap, found: Localization, record: SearchRecord, frame: Frame | None, quick: bool
 ) -> RunnerUp | None:
     """Return the most probable alternative explanation with a pose, else the best different pose of the last search."""
-    rivals = [other for other in record.explanations if other.T is not None]
+    rivals = [other for other in told(found, record) if other.T is not None]
     if rivals:
         best = min(rivals, key=lambda other: other.log_odds)
         assert best.T is not None
-        return _rendered(scene, best.T, best.reason, frame, quick)
+        shown = _rendered(scene, best.T, best.reason, frame, quick)
+        return replace(shown, probability=probability_of(-best.log_odds))
+    T = found.T_world_camera.to("cpu", torch.float64)
     x, y, z = scene.bounds.centre
     reach = APART * float((T.translation - torch.tensor([x, y, z], dtype=torch.float64)).norm())
     for step in reversed([step for step in record.steps if step.compared]):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.geometry.units import symbol
 from bidnerf_core.localization import Localization
-from bidnerf_core.localization.acceptance import DescentDiagnostics, LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.acceptance import DescentDiagnostics, SurfaceDiagnostics
 from bidnerf_core.localization.beyond_chance import DISPLACEMENT, NO_RIVAL, Support
 from bidnerf_core.localization.landmarks.chance import DECISIVE, odds, probability_of
 from bidnerf_core.localization.landmarks.hypotheses import (
@@ -17,7 +18,9 @@ from bidnerf_core.localization.landmarks.hypotheses import (
     Stated,
     Whose,
 )
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.viewer.scene import rows_of
 
 LEAST_SHOWN = 0.001
@@ -33,7 +36,14 @@ MOTIONS = {
     Motion.STILL: "",
     Motion.MOVING: ", with rolling shutter",
 }
-HERE = "the pose found"
+HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
+APART, TURNED_DEG = 0.1, 10.0
+"""Distance (fraction of that to the scene) and angle beyond which two poses are different answers."""
+
+
+KEPT = (
+    f"The search keeps the pose that it found first unless another is {probability_of(DECISIVE):.1%} likely."
+)
 
 
 @dataclass(frozen=True)
@@ -52,6 +62,7 @@ class Contest:
     question: str
     answers: tuple[ShownExplanation, ...]
     remark: str = ""
+    of_pose: bool = True  # whether it compares poses, else cameras
 
 
 def contests(found: Localization, record: SearchRecord | None) -> tuple[Contest, ...]:
@@ -63,17 +74,37 @@ def contests(found: Localization, record: SearchRecord | None) -> tuple[Contest,
     if support is not None:
         shown.append(_of_support(support))
     if record is not None and record.landmarks and record.landmarks[-1].guided is not None:
-        shown.append(_of_camera(record.landmarks[-1].guided.posterior, found))
+        shown.append(_of_camera(record.landmarks[-1].guided.posterior, earlier(found, record.landmarks[-1])))
     return tuple(shown)
 
 
 def told(found: Localization, record: SearchRecord) -> list[ComparedExplanation]:
-    """Return the recorded comparisons, except those in which a rejected pose is more probable than a mirror image."""
+    """Return the recorded comparisons of the pose found, except those of a rejected pose with a less probable mirror image.
+
+    If the other pose of a comparison was taken instead, the pose that it replaced is the other one.
+    """
     return [
-        each
+        _from_found(found, each, record)
         for each in record.explanations
         if found.converged or each.T is not None or each.log_odds < DECISIVE
     ]
+
+
+def _from_found(found: Localization, each: ComparedExplanation, record: SearchRecord) -> ComparedExplanation:
+    if each.T is None or not record.landmarks or is_elsewhere(found, each.T, record.landmarks[-1].distance):
+        return each
+    return replace(each, log_odds=-each.log_odds, T=record.landmarks[-1].T_world_camera)
+
+
+def is_elsewhere(found: Localization, T_world_camera: SE3, distance: float) -> bool:
+    """Return whether a pose is another answer than the pose found, for a scene at a ``distance`` in the unit of the map."""
+    off = pose_error(T_world_camera.to("cpu"), found.T_world_camera.to("cpu"))
+    return not (float(off.translation) <= APART * distance and float(off.rotation_deg) <= TURNED_DEG)
+
+
+def earlier(found: Localization, pose: LandmarkPose) -> str:
+    """Return ``EARLIER`` if a pose by landmarks is another answer than the pose found, else an empty text."""
+    return EARLIER if is_elsewhere(found, pose.T_world_camera, pose.distance) else ""
 
 
 def support_of(found: Localization) -> Support | None:
@@ -92,10 +123,11 @@ def _against(found: Localization, other: ComparedExplanation) -> Contest:
         apart = float((other.T.translation - found.T_world_camera.to("cpu", other.T.translation.dtype).translation).norm())  # fmt: skip
         name = f"a pose {apart:.3g} {symbol(found.unit)} away"
         rival, question = ShownExplanation(name, 1 - p, rows_of(other.T)), "This pose or another?"
-    return Contest(question, (ShownExplanation(HERE, p), rival), other.reason)
+    keeps = other.T is not None and p < 0.5 and not found.converged
+    return Contest(question, (ShownExplanation(HERE, p), rival), KEPT if keeps else other.reason)
 
 
-def _of_camera(posterior: Posterior, found: Localization) -> Contest:
+def _of_camera(posterior: Posterior, earlier: str) -> Contest:
     answers = sorted(
         (
             ShownExplanation(_name(each), p)
@@ -104,9 +136,8 @@ def _of_camera(posterior: Posterior, found: Localization) -> Contest:
         ),
         key=lambda shown: -shown.probability,
     )
-    taken = isinstance(found.diagnostics, LandmarkDiagnostics)
-    remark = "" if taken else "Weighed at a pose by landmarks, which is not the one shown."
-    return Contest("Whose camera took it?", tuple(answers), remark)
+    remark = f"Weighed at {earlier}." if earlier else ""
+    return Contest("Whose camera took it?", tuple(answers), remark, of_pose=False)
 
 
 def _name(each: Explanation) -> str:

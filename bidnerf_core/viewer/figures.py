@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bidnerf_core.localization import Localization
 from bidnerf_core.localization.acceptance import (
@@ -16,23 +16,22 @@ from bidnerf_core.localization.acceptance import (
     landmark_diagnostics,
 )
 from bidnerf_core.localization.beyond_chance import ACCEPTED, LEAST_EXPLAINED, Support
+from bidnerf_core.localization.by_landmarks import SHARPEST
 from bidnerf_core.localization.landmarks.chance import DECISIVE, probability_of
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
-from bidnerf_core.viewer.explanations import support_of, told
+from bidnerf_core.localization.result import Outcome
+from bidnerf_core.viewer.explanations import earlier, support_of, told
 
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 """Digits of an exponent."""
-BEYOND = 1.1
-"""Upper end of a bar's scale, as a multiple of the larger of the value and its threshold."""
 
 
 @dataclass(frozen=True)
 class Bar:
-    """A value and its threshold on one linear scale from 0 to 1."""
+    """A value on a linear scale from 0 to 1, whose middle is the threshold and whose end is twice that or more."""
 
     value: float
-    threshold: float
     at_least: bool  # whether values below the threshold fail, else those above
 
     @staticmethod
@@ -40,8 +39,7 @@ class Bar:
         """Return the bar for a value and a threshold; None if the value is not finite or the threshold is not positive."""
         if not math.isfinite(value) or threshold <= 0:
             return None
-        scale = BEYOND * max(value, threshold)
-        return Bar(max(0.0, value) / scale, threshold / scale, at_least)
+        return Bar(min(max(0.0, value / threshold / 2), 1.0), at_least)
 
 
 @dataclass(frozen=True)
@@ -50,14 +48,20 @@ class Figure:
 
     name: str
     value: str
-    threshold: str  # with "at least" or "at most"; empty for a measure without one
+    threshold: str  # with "at least", "at most" or "below"; empty for a measure without one
     passed: bool | None  # None if there is no threshold
     bar: Bar | None
     meaning: str
+    pose: str = ""  # which one is measured, if not the pose found
 
 
-def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
-    """Return the measures of an answer and, if recorded, those of a pose by landmarks that was rejected on the way to it."""
+def acceptance_figures(
+    found: Localization, record: SearchRecord | None, colour_noise: float | None = None
+) -> tuple[Figure, ...]:
+    """Return the measures of an answer and, if recorded, those of a pose by landmarks that was rejected on the way to it.
+
+    ``colour_noise`` is that of the map.
+    """
     by_landmarks = None if record is None or not record.landmarks else record.landmarks[-1]
     said, figures = found.diagnostics, list[Figure]()
     if isinstance(said, LandmarkDiagnostics):
@@ -71,9 +75,10 @@ def acceptance_figures(found: Localization, record: SearchRecord | None) -> tupl
     if record is not None and (compared := told(found, record)):
         figures.append(_of_explanations(compared))
     if by_landmarks is not None and not isinstance(said, LandmarkDiagnostics):
-        figures += _of_landmarks(
-            landmark_diagnostics(by_landmarks, _by_appearance(by_landmarks)), by_landmarks
-        )
+        pose, measured = earlier(found, by_landmarks), landmark_diagnostics(by_landmarks, _by_appearance(by_landmarks))  # fmt: skip
+        figures += [replace(figure, pose=pose) for figure in _of_landmarks(measured, by_landmarks)]
+    if found.outcome is Outcome.TOO_FEW_MATCHES and colour_noise is not None:
+        figures.append(_of_sharpness(colour_noise))
     support = support_of(found)
     if found.confidence is not None and (support is None or support.confidence != found.confidence):
         meaning = "probability that the pose is right, from all figures together"
@@ -125,7 +130,8 @@ def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Itera
     )  # fmt: skip
     yield Figure(
         "agreements this good by chance", _power(said.log10_nfa), f"at most {_power(bounds.log10_nfa)}",
-        said.log10_nfa <= bounds.log10_nfa, None, "expected number at wrong poses",
+        said.log10_nfa <= bounds.log10_nfa, Bar.of(bounds.log10_nfa / min(said.log10_nfa, -0.01), 1.0, False),
+        "expected number at wrong poses; the bar compares exponents",
     )  # fmt: skip
     yield _least(
         "spread over the image", said.spread, bounds.spread, f"{said.spread:.0%}", f"{bounds.spread:.0%}",
@@ -141,14 +147,21 @@ def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Itera
             f"{bounds.expected_shift:.2%}", "how far doubts about the camera move the position, as a share of that distance",
         )  # fmt: skip
     yield Figure(
-        "noise of keypoints", f"{said.noise_ratio:.1f} times", "", None, None,
-        "reprojection errors over those of the map's own images",
+        "reprojection errors", f"{said.noise_ratio:.1f} times", "", None, None,
+        "those of the map's own images; not tested",
     )  # fmt: skip
     if said.on_surface is not None:
         yield Figure(
             "measured points on the surface", f"{said.on_surface:.0%}", "", None, None,
-            "share of the measured depth that lies on the map's surface",
+            "share of the measured depth that lies on the map's surface; not tested",
         )  # fmt: skip
+
+
+def _of_sharpness(colour_noise: float) -> Figure:
+    return _most(
+        "error of rendered colours", colour_noise, SHARPEST, f"{colour_noise:.1%}", f"{SHARPEST:.0%}",
+        "of the map on its own images; a more blurred map is not compared with images whose landmarks are unknown",
+    )  # fmt: skip
 
 
 def _power(log10: float) -> str:
@@ -189,9 +202,9 @@ def _of_surface(said: SurfaceDiagnostics) -> Iterator[Figure]:
 
 
 def _of_descent(said: DescentDiagnostics) -> Iterator[Figure]:
-    yield _most(
-        "mean loss", said.mean_loss, said.converged_loss, f"{said.mean_loss:.3g}", f"{said.converged_loss:.3g}",
-        "of the last steps of the descent",
+    yield Figure(
+        "mean loss", f"{said.mean_loss:.3g}", f"below {said.converged_loss:.3g}", said.mean_loss < said.converged_loss,
+        Bar.of(said.mean_loss, said.converged_loss, False), "of the last steps of the descent",
     )  # fmt: skip
     yield from _of_support(said.support)
 

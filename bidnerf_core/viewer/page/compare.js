@@ -28,7 +28,7 @@ function gradient({ data, width, height }) {
 
 export class Comparison {
   constructor() {
-    this.mode = "Wipe"; this.share = 50; this.gain = 3; this.refused = true; this.agreeing = true;
+    this.wanted = "Wipe"; this.share = 50; this.gain = 3; this.refused = true; this.agreeing = true;
     this.root = element("div", { class: "compare" });
   }
 
@@ -42,11 +42,11 @@ export class Comparison {
     clearInterval(this.timer);
     const modes = this.available();
     if (!modes.length) { this.root.replaceChildren(shown.observed ? this.still(shown.observed, "photo") : ""); return; }
-    if (!modes.includes(this.mode)) this.mode = modes[0];
+    this.mode = modes.includes(this.wanted) ? this.wanted : modes[0];
     this.draw();
   }
 
-  choose(mode) { if (this.shown && this.available().includes(mode)) { this.mode = mode; this.draw(); } }
+  choose(mode) { if (this.shown && this.available().includes(mode)) { this.mode = this.wanted = mode; this.draw(); } }
 
   image(picture, label) { return element("img", { src: picture.url, alt: label, draggable: false }); }
 
@@ -123,8 +123,8 @@ export class Comparison {
     paint();
   }
 
-  matchesText({ refused, by_appearance: looks }) {
-    const whose = this.shown.label === "runner-up" ? "Matches of the pose found, not of the runner-up. " : "";
+  matchesText({ refused, by_appearance: looks, pose }) {
+    const whose = pose ? `Matches of ${pose}. ` : "";
     const which = refused ? `Of those, ${looks} were matched by appearance alone, ${refused - looks} near where the pose predicts the landmark, but too far off. ` : "";
     return `${whose}${which}Lines lead to where the landmark is.`;
   }
@@ -133,7 +133,7 @@ export class Comparison {
     const { width, height } = this.shown.rendered, canvas = element("canvas", { width, height });
     box.append(canvas);
     under.append(element("span", {}, element("i", { class: "dot", style: "background:#00be6e" }), "edges of the photo"),
-      element("span", {}, element("i", { class: "dot", style: "background:#eb008c" }), `of the ${this.shown.label === "runner-up" ? "runner-up" : "rendering"}`));
+      element("span", {}, element("i", { class: "dot", style: "background:#eb008c" }), "of the rendering"));
     const [a, b] = await Promise.all([this.shown.observed, this.shown.rendered].map(({ url }) => pixels(url, width, height)));
     const ours = gradient(a), theirs = gradient(b), out = new ImageData(width, height);
     const green = [0, 190, 110], pink = [235, 0, 140];

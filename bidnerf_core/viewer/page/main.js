@@ -1,5 +1,5 @@
 // Puts the page together: state, keys, slider, and what a server adds if there is one.
-import { colourOf, element, find, lengthText, withCode } from "./data.js";
+import { colourOf, element, find, lengthText, percent, withCode } from "./data.js";
 import { Space } from "./space.js";
 import { Comparison } from "./compare.js";
 import { contests, figures, outcomeOf, poseText, uncertainty } from "./panel.js";
@@ -8,17 +8,22 @@ import { Track } from "./track.js";
 import { Live } from "./live.js";
 
 const LAYERS = [["surface", "Surface", "s"], ["splats", "Splats", "x"], ["landmarks", "Landmarks", "l"], ["cameras", "Cameras", "c"], ["ellipsoid", "Ellipsoid", "e"]];
-const WORDS = [["accepted, refused", "whether the pose passed all tests; a refused one is shown so that you see why"],
-  ["landmark", "a point of the map that is recognised by its looks"], ["rendered", "what the map shows from the pose"],
-  ["runner-up", "the best pose that differs from the one found"], ["confidence", "probability that the pose is right"],
-  ["ellipsoid", "where the camera is: two standard deviations of the position"]];
+// Words, and whether an answer uses them.
+const WORDS = [["accepted, refused", "whether the pose passed all tests; a refused one is shown so that you see why", () => true],
+  ["field", "the trained radiance field, which is rendered", () => true], ["surface", "points of the field's surface (surfels), on which poses are searched", () => true],
+  ["landmark", "a point of the map that is recognised by its looks", () => true], ["rendered", "what the map shows from the pose", (a) => a.rendered],
+  ["runner-up", "the best pose that differs from the one found; called likelier if it is", (a) => a.runner_up],
+  ["confidence", "probability that the pose is right", (a) => a.figures.some(({ name }) => name === "confidence")],
+  ["ellipsoid", "where the camera is: two standard deviations of the position", (a) => a.ellipsoid]];
+const SWATCHES = { landmarks: "var(--landmark)", cameras: "var(--soft)" };  // colours in which layers are drawn
 const ENLARGED = [1, 10, 100, 1000];
 
 const placeOf = (pose) => [pose[3], pose[7], pose[11]];
+const between = (one, other) => Math.hypot(...one.map((x, i) => x - other[i]));
 
 class Page {
   constructor(state) {
-    Object.assign(this, { state, map: state.map, answers: state.answers, current: -1, step: 0, runner: false, hidden: new Set(), factor: 1 });
+    Object.assign(this, { state, map: state.map, answers: state.answers, current: -1, step: 0, runner: false, hidden: new Set(), factor: 1, look: "fit" });
     this.comparison = new Comparison();
     document.title = state.title || `${this.map.name} – bidnerf view`;
     find("title").textContent = this.map.name;
@@ -44,15 +49,15 @@ class Page {
   // The words and the keys that have a use on this page as it is now.
   fillHelp() {
     const any = (has) => this.answers.some(has), pose = any((a) => a.pose), compared = any((a) => a.observed && a.rendered);
-    const layers = LAYERS.filter(([name]) => find(`show-${name}`) && !find(`show-${name}`).disabled);
+    const layers = LAYERS.filter(([name]) => find(`show-${name}`)?.hidden === false), ways = this.answer ? this.comparison.available().length : 0;
     const keys = [[any((a) => a.steps.length > 1), "← →", "step of the search"], [any((a) => a.steps.length > 1), "space", "play the search"],
-      [this.answers.length > 1 || this.live?.queries.length > 1, "n p", "next, previous image"], [compared, "1 … 6", "way of comparing"], [compared, "w W", "wipe"],
+      [this.answers.length > 1 || this.live?.queries.length > 1, "n p", "next, previous image"], [ways > 1, `1 … ${ways}`, "way of comparing"], [compared, "w W", "wipe"],
       [this.space, "f", "whole map"], [pose, "g", "go to the pose"], [pose, "o", "from the photo"], [any((a) => a.runner_up), "r", "runner-up"],
       [layers.length, layers.map(([, , key]) => key).join(" "), layers.map(([, label]) => label.toLowerCase()).join(", ")], [this.live, "v", "field from here"]];
     const outcomes = new Map(this.answers.filter((a) => a.meaning).map((a) => [a.outcome, a.meaning]));
     const methods = new Map(this.answers.filter((a) => a.method_summary).map((a) => [`method ${a.method}`, a.method_summary]));
     const rows = (pairs, made) => pairs.flatMap(([name, what]) => [element("dt", {}, made(name)), element("dd", {}, ...withCode(what))]);
-    find("words").replaceChildren(...rows([...outcomes, ...methods, ...WORDS], (name) => name));
+    find("words").replaceChildren(...rows([...outcomes, ...methods, ...WORDS.filter(([, , use]) => any(use))], (name) => name));
     find("keys").replaceChildren(...rows(keys.filter(([use]) => use).map(([, key, what]) => [key, what]), (key) => element("kbd", {}, key)));
   }
 
@@ -100,7 +105,7 @@ class Page {
 
   buttons() {
     const toggle = (name, label, key) => element("button", { id: `show-${name}`, "aria-pressed": String(!this.hidden.has(name)), title: `${label} (${key})`,
-      onclick: () => this.toggle(name) }, label);
+      onclick: () => this.toggle(name) }, ...(name in SWATCHES ? [element("i", { class: "dot", style: `background:${SWATCHES[name]}` })] : []), label);
     find("toggles").append(...LAYERS.filter(([name]) => name === "ellipsoid" ? this.answers.length || this.state.live : this.map[name] && (name !== "cameras" || this.map.cameras.length))
       .map((each) => toggle(...each)));
     find("views").append(element("button", { id: "fit", title: "Whole map (f)", onclick: () => this.fit() }, "Whole map"),
@@ -109,7 +114,7 @@ class Page {
   }
 
   toggle(name) {
-    if (find(`show-${name}`)?.disabled !== false) return;
+    if (find(`show-${name}`)?.hidden !== false) return;
     if (!this.hidden.delete(name)) this.hidden.add(name);
     find(`show-${name}`).setAttribute("aria-pressed", String(!this.hidden.has(name)));
     if (name === "ellipsoid") this.drawAnswer(); else this.space?.show(name, !this.hidden.has(name));
@@ -119,11 +124,11 @@ class Page {
 
   get pose() { return this.runner && this.answer?.runner_up ? this.answer.runner_up.pose : this.answer?.pose; }
 
-  fit() { this.space?.fit(); }
+  fit() { this.look = "fit"; this.space?.fit(); }
 
-  go() { if (this.pose) this.space?.near(this.pose); }
+  go() { if (this.pose) { this.look = "go"; this.space?.near(this.pose); } }
 
-  from() { if (this.pose) this.space?.from(this.pose, this.answer.shape); }
+  from() { if (this.pose) { this.look = "from"; this.space?.from(this.pose, this.answer.shape); } }
 
   list() {
     const select = find("query"), many = this.answers.length > 1;
@@ -149,7 +154,8 @@ class Page {
     addEventListener("keydown", (event) => this.key(event));
     addEventListener("hashchange", () => this.follow());
     find("help").addEventListener("toggle", () => this.fillHelp());
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawAnswer());
+    addEventListener("pointerdown", ({ target }) => { for (const id of ["about", "help"]) if (!find(id).contains(target)) find(id).open = false; });
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.drawAnswer(); if (this.answer) this.showStep(this.step); });
   }
 
   // Show what the camera of the map under the pointer sees.
@@ -171,11 +177,11 @@ class Page {
     const actions = {
       ArrowLeft: () => this.showStep(this.step - 1), ArrowRight: () => this.showStep(this.step + 1), " ": () => this.play(),
       n: () => this.turn(1), p: () => this.turn(-1), f: () => this.fit(), g: () => this.go(), o: () => this.from(), r: () => this.toggleRunner(),
-      w: () => move(5), W: () => move(-5), v: () => this.live?.toggleField(), "?": () => { find("help").open = !find("help").open; },
+      w: () => move(5), W: () => move(-5), v: () => this.live?.toggleField(), "?": () => { find("about").open = false; find("help").open = !find("help").open; },
       Escape: () => { find("help").open = find("about").open = false; },
     };
     for (const [name, , key] of LAYERS) actions[key] = () => this.toggle(name);
-    if (/^[1-6]$/.test(event.key)) this.comparison.choose(["Wipe", "Blink", "Difference", "Edges", "Depth", "Matches"][event.key - 1]);
+    if (/^[1-6]$/.test(event.key)) this.comparison.choose(this.answer && this.comparison.available()[event.key - 1]);
     else if (actions[event.key] && !(event.key === " " && event.target.tagName === "BUTTON")) { actions[event.key](); event.preventDefault(); }
   }
 
@@ -201,7 +207,8 @@ class Page {
     const { ellipsoid, steps } = this.answer;
     const size = this.space?.size ?? 1, { answer } = this;
     this.space?.frame([answer.pose, answer.truth, answer.runner_up?.pose].filter(Boolean).map(placeOf).concat(answer.path.slice(0, 1)));
-    this.factor = ellipsoid ? ENLARGED.find((factor) => factor * ellipsoid.lengths[0] >= 0.3 * size) ?? 1000 : 1;
+    this.factors = ENLARGED.filter((factor) => factor === 1 || factor * ellipsoid?.lengths[0] <= 10 * size);  // none far beyond the view
+    this.factor = this.factors.find((factor) => factor * ellipsoid?.lengths[0] >= 0.3 * size) ?? this.factors.at(-1);
     find("timeline").hidden = steps.length < 2;
     find("step").max = String(Math.max(0, steps.length - 1));
     this.step = Math.max(0, steps.length - 1);
@@ -211,28 +218,32 @@ class Page {
   }
 
   drawPanel() {
-    const answer = this.answer, other = answer.runner_up;
+    const answer = this.answer, other = answer.runner_up, name = this.otherName;
     const runner = other ? element("p", { class: this.runner ? "row banner" : "row" },
-      this.runner ? element("span", {}, element("b", {}, "You are looking at the runner-up"), `, ${lengthText(this.apart, answer.unit)} from the pose found.`) : null,
+      this.runner ? element("b", {}, `You are looking at the ${name}`) : null,
       element("button", { id: "runner", "aria-pressed": String(this.runner), onclick: () => this.toggleRunner(), title: "Runner-up (r)" },
-        this.runner ? "Back to the pose found" : "Show the runner-up"),
-      this.runner ? null : element("span", { class: "small" }, `${lengthText(this.apart, answer.unit)} away${answer.reason.includes(other.reason) ? "" : `: ${other.reason}`}`)) : null;
-    const sizes = ENLARGED.map((factor) => element("option", { value: String(factor), selected: factor === this.factor }, `× ${factor}`));
+        this.runner ? "Back to the pose found" : `Show the ${name}`),
+      element("span", { class: "small" }, this.aboutOther)) : null;
+    const sizes = this.factors.map((factor) => element("option", { value: String(factor), selected: factor === this.factor }, `× ${factor}`));
     const enlarge = answer.ellipsoid ? element("p", { class: "row small" }, "Ellipsoid drawn", element("select", { id: "enlarge", "aria-label": "Size of the ellipsoid",
       onchange: (event) => { this.factor = Number(event.target.value); this.drawAnswer(); this.drawPanel(); } }, ...sizes)) : null;
-    this.comparison.show({ ...answer, rendered: this.runner ? other?.rendered : answer.rendered, label: this.runner ? "runner-up" : "rendered",
-      depth: this.runner ? null : answer.depth });
-    const allPassed = answer.figures.every((figure) => figure.passed !== false);  // then an explanation tells why it was refused
-    const said = allPassed && !answer.accepted ? [...contests(answer), ...figures(answer)] : [...figures(answer), ...contests(answer)];
+    this.comparison.show(this.runner ? { ...answer, rendered: other.rendered, label: name, depth: null, matches: null } : answer);
+    const compared = contests(answer, true), measured = figures(answer);
+    const said = this.runner ? compared : [...(answer.accepted ? [...measured, ...compared] : [...compared, ...measured]), ...contests(answer, false),
+      ...uncertainty(answer, this.factor), enlarge];
     find("verdict").replaceChildren(...outcomeOf(answer));
     find("answer").replaceChildren(...[this.runner ? runner : null, this.comparison.root, this.runner ? null : runner,
-      ...said, ...uncertainty(answer, this.factor), enlarge, ...poseText(answer)].filter(Boolean));
+      ...said, ...poseText(answer, this.pose)].filter(Boolean));
   }
 
-  // How far the runner-up is from the pose found.
-  get apart() {
-    const [here, there] = [this.answer.pose, this.answer.runner_up.pose].map(placeOf);
-    return Math.hypot(...here.map((x, i) => x - there[i]));
+  get otherName() { return this.answer.runner_up?.probability > 0.5 ? "likelier pose" : "runner-up"; }
+
+  // How far the runner-up is from the pose found, and both from where the map was seen.
+  get aboutOther() {
+    const { pose, runner_up: other, unit, reason } = this.answer, [here, there] = [pose, other.pose].map(placeOf), seen = this.map.cameras;
+    const nearest = (place) => lengthText(Math.min(...seen.map((camera) => between(place, placeOf(camera.pose)))), unit);
+    return `${lengthText(between(here, there), unit)} from the pose found${reason.includes(other.reason) ? "" : `: ${other.reason}`}.`
+      + (other.probability !== null && seen.length ? ` The nearest camera of the map is ${nearest(there)} from it, and ${nearest(here)} from the pose found.` : "");
   }
 
   toggleRunner() {
@@ -240,6 +251,7 @@ class Page {
     this.runner = !this.runner;
     this.drawPanel();
     this.drawAnswer();
+    if (this.look === "from") this.from(); else this.go();
   }
 
   showStep(step) {
@@ -247,9 +259,24 @@ class Page {
     if (!steps.length) return;
     this.step = Math.max(0, Math.min(steps.length - 1, step));
     find("step").value = String(this.step);
-    find("caption").textContent = `${this.step + 1} of ${steps.length}: ${steps[this.step].caption}`;
-    find("caption").title = steps[this.step].caption;
-    if (this.step < steps.length - 1) this.space?.hypotheses(steps[this.step], this.answer.shape); else this.space?.clear("search");
+    const { caption, loss, scores } = steps[this.step], last = this.step === steps.length - 1;
+    const text = loss === null || last ? caption : `${caption}: loss ${Number(loss.toPrecision(3))}`;
+    find("caption").textContent = loss === null ? `${this.step + 1} of ${steps.length}: ${text}` : text;
+    find("caption").title = text;
+    find("scores").hidden = last || scores.length < 2;
+    this.drawLosses(steps);
+    if (last) this.space?.clear("search"); else this.space?.hypotheses(steps[this.step], this.answer.shape);
+  }
+
+  // The losses of a descent, from the least to the greatest, with a mark at the present step.
+  drawLosses(steps) {
+    const known = steps.map(({ loss }) => loss), svg = find("losses"), most = Math.max(...known), least = Math.min(...known);
+    svg.toggleAttribute("hidden", known.some((loss) => loss === null));
+    if (svg.hasAttribute("hidden")) return;
+    const at = (i) => [100 * i / (known.length - 1), 28 - 26 * (known[i] - least) / (most - least || 1)];
+    svg.querySelector("polyline").setAttribute("points", known.map((_, i) => at(i).join()).join(" "));
+    const [x, y] = at(this.step), line = svg.querySelector("line");
+    for (const [name, value] of [["x1", x], ["x2", x], ["y1", y], ["y2", 30]]) line.setAttribute(name, value);
   }
 
   play() {
@@ -258,7 +285,7 @@ class Page {
     if (steps.length < 2) return;
     if (this.step >= steps.length - 1) this.showStep(0);
     find("play").textContent = "❚❚";
-    this.playing = setInterval(() => { this.showStep(this.step + 1); if (this.step >= steps.length - 1) this.stop(); }, 900);
+    this.playing = setInterval(() => { this.showStep(this.step + 1); if (this.step >= steps.length - 1) this.stop(); }, Math.min(900, 10000 / steps.length));
   }
 
   stop() { clearInterval(this.playing); this.playing = null; find("play").textContent = "▶"; }
@@ -266,9 +293,9 @@ class Page {
   offerEllipsoid() {
     const button = find("show-ellipsoid"), known = Boolean(this.answer?.ellipsoid);
     if (!button) return;
-    button.textContent = this.factor > 1 && known ? `Ellipsoid × ${this.factor}` : "Ellipsoid";
-    button.disabled = !known;
-    button.setAttribute("aria-pressed", String(known && !this.hidden.has("ellipsoid")));
+    button.textContent = this.factor > 1 ? `Ellipsoid × ${this.factor}` : "Ellipsoid";
+    button.hidden = !known;
+    button.setAttribute("aria-pressed", String(!this.hidden.has("ellipsoid")));
   }
 
   drawAnswer() {
@@ -278,21 +305,23 @@ class Page {
     space.clear("answer");
     if (!answer.pose) return;
     const colour = colourOf(answer.accepted ? "--good" : "--bad");
-    space.frustum("answer", answer.pose, answer.shape, colour, { picture: answer.observed?.url });
+    space.frustum("answer", answer.pose, answer.shape, colour, { picture: this.runner ? null : answer.observed?.url });
     space.axes("answer", answer.pose, 0.4 * space.size);
     if (answer.ellipsoid && !this.hidden.has("ellipsoid")) space.ellipsoid("answer", answer.pose, answer.ellipsoid.axes, this.factor, colour);
     const soft = colourOf("--soft"), accent = colourOf("--accent"), { runner_up: other, path } = answer;
-    space.label("answer", placeOf(answer.pose), answer.accepted ? "pose found" : "pose found, refused", colour);
+    const likely = (p) => p === undefined || p === null ? "" : ` (${percent(p)})`;
+    space.label("answer", placeOf(answer.pose), `${answer.accepted ? "pose found" : "pose found, refused"}${likely(other?.probability && 1 - other.probability)}`, colour);
     if (path.length > 1) {
       space.lines("answer", path, colour, { strip: true });
-      if (Math.hypot(...path[0].map((x, i) => x - placeOf(answer.pose)[i])) > space.size) space.label("answer", path[0], "start of the optimization", colour);
+      if (between(path[0], placeOf(answer.pose)) > space.size) space.label("answer", path[0], "start", colour);
     }
     if (answer.truth) {
       space.frustum("answer", answer.truth, answer.shape, soft, { depth: 0.9 * space.size, opacity: 0.7 });
+      if (between(placeOf(answer.truth), placeOf(answer.pose)) > 0.5 * space.size) space.label("answer", placeOf(answer.truth), "true pose", soft);
     }
     if (other) {
-      space.frustum("answer", other.pose, answer.shape, accent, { picture: this.runner ? other.rendered?.url : null, opacity: this.runner ? 1 : 0.6 });
-      space.label("answer", placeOf(other.pose), this.runner ? "runner-up, shown" : "runner-up", accent);
+      space.frustum("answer", other.pose, answer.shape, accent, { picture: this.runner ? answer.observed?.url : null, opacity: this.runner ? 1 : 0.6 });
+      space.label("answer", placeOf(other.pose), `${this.otherName}${likely(other.probability)}`, accent);
     }
   }
 }

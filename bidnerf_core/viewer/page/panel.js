@@ -22,7 +22,7 @@ export function outcomeOf(answer) {
 }
 
 export function uncertainty(answer, factor) {
-  if (!answer.ellipsoid) return [element("h2", {}, "Uncertainty"), element("p", { class: "empty" }, "No covariance is known for this pose.")];
+  if (!answer.ellipsoid) return [element("h2", {}, "Uncertainty"), element("p", { class: "empty" }, "The answer has no covariance.")];
   const { lengths, rotation_deg: turns } = answer.ellipsoid;
   const enlarged = factor > 1 ? ` It is drawn ${factor} times as large.` : "";
   return [
@@ -32,29 +32,38 @@ export function uncertainty(answer, factor) {
   ];
 }
 
-// A bar from zero to the value, with a tick at the threshold; the side where values fail is tinted.
-function gauge({ value, threshold, at_least: least }) {
-  const fill = element("i"), tick = element("b"), bar = element("div", { class: `gauge ${least ? "least" : "most"}` }, fill, tick);
+// A bar from zero to the value, with a tick at the threshold in its middle; the side where values fail is tinted.
+function gauge({ value, at_least: least }) {
+  const fill = element("i"), bar = element("div", { class: `gauge ${least ? "least" : "most"}` }, fill, element("b"));
   fill.style.width = `${100 * value}%`;
-  bar.style.setProperty("--tick", `${100 * threshold}%`);
   return bar;
 }
 
-export function figures(answer) {
-  if (!answer.figures.length) return [];
-  const rows = answer.figures.map((figure) => {
+function table(figures) {
+  const rows = figures.map((figure) => {
     const mark = figure.passed === null ? "" : figure.passed ? "✓" : "✗";
     return element("tr", { class: figure.passed === false ? "failed" : "" },
       element("td", { class: "mark", "aria-label": figure.passed === false ? "failed" : figure.passed ? "passed" : "" }, mark),
       element("th", { scope: "row" }, figure.name, element("small", {}, figure.meaning), figure.bar ? gauge(figure.bar) : null),
       element("td", { class: "number" }, figure.value, element("small", {}, figure.threshold)));
   });
-  return [element("h2", {}, "Figures and thresholds"), element("p", { class: "small" }, "Each bar is the value, its tick the threshold; values in the tinted part fail."),
-    element("table", { id: "figures" }, element("tbody", {}, ...rows))];
+  return element("table", {}, element("tbody", {}, ...rows));
 }
 
-export function contests(answer) {
-  return answer.contests.flatMap(({ question, answers, remark }) => {
+// Figures of each pose that was measured; those that did not fail are folded away behind those that did.
+export function figures(answer) {
+  const parts = [...new Set(answer.figures.map(({ pose }) => pose))].flatMap((pose) => {
+    const all = answer.figures.filter((figure) => figure.pose === pose), failed = all.filter(({ passed }) => passed === false);
+    const others = all.filter((figure) => !failed.includes(figure));
+    const folded = failed.length && others.length ? element("details", { class: "folded" }, element("summary", {}, `${others.length} more, which did not fail`), table(others)) : null;
+    return [element("h2", {}, pose ? `Figures of ${pose}` : "Figures"), table(folded ? failed : all), ...(folded ? [folded] : [])];
+  });
+  return parts.length ? [element("div", { id: "figures" }, ...parts,
+    element("p", { class: "small" }, "The mark on a bar is the threshold, its end twice that or more; values in the tinted part fail."))] : [];
+}
+
+export function contests(answer, ofPose) {
+  return answer.contests.filter((each) => each.of_pose === ofPose).flatMap(({ question, answers, remark }) => {
     const most = Math.max(...answers.map((each) => each.probability));
     const lines = answers.flatMap(({ name, probability }) => {
       const fill = element("i");
@@ -68,9 +77,9 @@ export function contests(answer) {
   });
 }
 
-export function poseText(answer) {
-  if (!answer.pose) return [];
-  const rows = [0, 4, 8, 12].map((i) => answer.pose.slice(i, i + 4).map((x) => x.toFixed(4).padStart(9)).join(" ")).join("\n");
+export function poseText(answer, pose) {
+  if (!pose) return [];
+  const rows = [0, 4, 8, 12].map((i) => pose.slice(i, i + 4).map((x) => x.toFixed(4).padStart(9)).join(" ")).join("\n");
   return [element("h2", {}, "Pose, camera to world (OpenCV axes)"), element("pre", {}, rows),
     answer.camera ? element("p", { class: "small" }, `Camera of this pose: ${answer.camera}`) : null,
     answer.method_summary ? element("p", { class: "small" }, `Method ${answer.method}: ${answer.method_summary}`) : null];

@@ -1,5 +1,5 @@
 // The map in space: points, cameras, poses of the search, ellipsoid and trajectory.
-import { colourOf, numbers, scaleColour } from "./data.js";
+import { colourOf, numbers } from "./data.js";
 
 const FOV = 55;
 const SPREAD = 2.2;  // radius of a point of the surface over that of its surfel, which closes gaps
@@ -49,7 +49,7 @@ export class Space {
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(FOV, 1, map.extent / 2000, map.extent * 60);
     this.layers = {};
-    this.size = 0.05 * map.extent;
+    this.size = 0.05 * map.extent;  // depth of a pyramid that is drawn for a camera
     for (const name of ["surface", "landmarks", "splats", "cameras", "search", "answer", "runner", "matches", "track"]) {
       this.layers[name] = new THREE.Group();
       this.scene.add(this.layers[name]);
@@ -159,6 +159,7 @@ export class Space {
 
   fit() {
     this.touched = false;
+    this.faint(false);
     const from = this.where();
     this.overview();
     this.travel(from);
@@ -193,28 +194,40 @@ export class Space {
     tag.textContent = text;
     tag.style.color = colour;
     document.getElementById("labels").append(tag);
-    this.tags.push({ layer, tag, place: new THREE.Vector3(...place) });
+    this.tags.push({ layer, tag, text, place: new THREE.Vector3(...place) });
     this.changed();
   }
 
-  // Put labels above their places; one that would lie on another moves up.
+  // Put labels above the cameras at their places; one that would lie on another moves up.
   placeLabels() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement, v = new THREE.Vector3(), taken = [];
-    for (const { tag, place } of this.tags) {
+    for (const { layer, tag, text, place } of this.tags) {
       v.copy(place).project(this.camera);
-      tag.hidden = v.z >= 1 || Math.abs(v.x) > 1 || Math.abs(v.y) > 1;
+      const outside = v.z >= 1 || Math.abs(v.x) > 1 || Math.abs(v.y) > 1;
+      tag.hidden = outside && layer !== "search";
       if (tag.hidden) continue;
+      tag.textContent = outside ? `${text}: outside the view` : text;
+      if (outside) v.multiplyScalar((v.z >= 1 ? -0.8 : 0.8) / Math.max(Math.abs(v.x), Math.abs(v.y)));
       const half = tag.offsetWidth / 2, x = Math.max(half + 4, Math.min(width - half - 4, (v.x + 1) / 2 * width));
-      let y = (1 - v.y) / 2 * height - 10;
+      const drawn = 0.7 * this.size * height / (2 * Math.tan(this.camera.fov * Math.PI / 360) * place.distanceTo(this.camera.position));
+      let y = (1 - v.y) / 2 * height - (outside ? 0 : 10 + Math.min(drawn, 0.2 * height));
       while (taken.some((other) => Math.abs(other.y - y) < 18 && Math.abs(other.x - x) < other.half + half)) y -= 18;
       taken.push({ x, y, half });
       tag.style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
     }
   }
 
+  // Whether photos are drawn faintly, so that the map behind them can be compared.
+  faint(on) {
+    this.pictureOpacity = on ? 0.5 : 0.85;
+    this.layers.answer.traverse((each) => { if (each.name === "picture") each.material.opacity = this.pictureOpacity; });
+    this.changed();
+  }
+
   // Look from a pose, with the field of view of its image.
   from(pose, shape) {
     this.touched = true;
+    this.faint(true);
     const before = this.where(), m = pose;
     const up = new THREE.Vector3(-m[1], -m[5], -m[9]), forward = new THREE.Vector3(m[2], m[6], m[10]);
     const place = new THREE.Vector3(m[3], m[7], m[11]);
@@ -230,6 +243,7 @@ export class Space {
   // Look at a pose from behind and above, near enough to see what surrounds it.
   near(pose, distance = 6 * this.size) {
     this.touched = true;
+    this.faint(false);
     const before = this.where(), up = new THREE.Vector3(...this.map.up).normalize();
     const place = new THREE.Vector3(pose[3], pose[7], pose[11]);
     const back = new THREE.Vector3(-pose[2], -pose[6], -pose[10]);
@@ -299,9 +313,24 @@ export class Space {
       const made = this.points(name, geometry, SPREAD * part.radius, least);
       if (name === "surface") this.surface = made;
     }
+    this.size = Math.min(this.size, 0.25 * this.usualDepth());
     const places = [];
     for (const { pose, shape } of this.map.cameras) places.push(...this.moved3(pyramid(shape, 0.35 * this.size).lines, pose));
-    if (places.length) this.lines("cameras", places, "#8a939c", { opacity: 0.8 });
+    const drawn = places.length ? this.lines("cameras", places, colourOf("--soft"), { opacity: 0.8 }) : null;
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { drawn?.material.color.set(colourOf("--soft")); this.changed(); });
+  }
+
+  // How deep the points lie in the map's images, the median over points and images.
+  usualDepth() {
+    const { cameras } = this.map, v = new THREE.Vector3(), depths = [];
+    for (let i = 0; i < cameras.length; i += Math.ceil(cameras.length / 40)) {
+      const { pose, shape: s } = cameras[i], toCamera = matrixOf(pose).invert();
+      for (const point of this.sample) {
+        const { x, y, z } = v.copy(point).applyMatrix4(toCamera);
+        if (z > 0 && x > s.left * z && x < s.right * z && y > s.top * z && y < s.bottom * z) depths.push(z);
+      }
+    }
+    return depths.length ? depths.sort((a, b) => a - b)[depths.length >> 1] : Infinity;
   }
 
   moved3(lines, pose) {
@@ -322,8 +351,10 @@ export class Space {
     texture.colorSpace = THREE.SRGBColorSpace;
     image.onload = () => { texture.image = image; texture.needsUpdate = true; this.changed(); };
     image.src = picture;
-    const material = new THREE.MeshBasicMaterial({ map: texture, side: THREE.DoubleSide, transparent: true, opacity: 0.85 });
-    this.layers[layer].add(new THREE.Mesh(geometry, material));
+    const material = new THREE.MeshBasicMaterial({ map: texture, side: THREE.DoubleSide, transparent: true, opacity: this.pictureOpacity ?? 0.85 });
+    const made = new THREE.Mesh(geometry, material);
+    made.name = "picture";
+    this.layers[layer].add(made);
   }
 
   axes(layer, pose, length) {
@@ -353,15 +384,17 @@ export class Space {
   hypotheses(step, shape) {
     this.clear("search");
     const rows = numbers(step.poses), count = rows.length / 12, kept = [], others = [], tints = [], grey = [];
+    const best = new THREE.Color(colourOf("--best")), worst = new THREE.Color(colourOf("--worst"));
     const known = step.scores.filter((s) => s !== null), low = Math.min(...known), high = Math.max(...known, low + 1e-9);
     for (let i = count - 1; i >= 0; i--) {
       const pose = [...rows.subarray(12 * i, 12 * i + 12), 0, 0, 0, 1];
       const places = this.moved3(pyramid(shape, this.size * (i === 0 ? 0.8 : 0.4)).lines, pose);
-      const score = step.scores[i] ?? high, tint = scaleColour(1 - (score - low) / (high - low));
+      const score = step.scores[i] ?? high, tint = best.clone().lerp(worst, (score - low) / (high - low)).toArray();
       if (i < step.kept) { kept.push(...places); tints.push(...places.map(() => tint)); } else { others.push(...places); grey.push(...places.map(() => tint)); }
     }
-    if (others.length) this.lines("search", others, null, { colours: grey, opacity: 0.4 });
+    if (others.length) this.lines("search", others, null, { colours: grey, opacity: 0.5 });
     if (kept.length) this.lines("search", kept, null, { colours: tints });
+    this.label("search", [rows[3], rows[7], rows[11]], count > 1 ? "best of this step" : "this step", colourOf("--best"));
   }
 
   // The number of the map's camera that is drawn nearest to a place on the canvas, or -1 if none is near.
