@@ -190,7 +190,8 @@ def _compared_with_landmarks(
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
         supported = found.converged and (answer.confidence or 0.0) >= LEAST_SUPPORT
-        answer = replace(answer, verdict=verdict) if supported else answer
+        if supported and not answer.verdict.accepted:
+            return _Proposal(found, near.pose)  # they confirm the pose, but are too few to move it
         refined = localization_by_landmarks(problem, answer, began)
         return _Proposal(replace(refined, reason=f"found on the surface; {refined.reason}"), near.pose)
     if found.converged and near.contradicts:
