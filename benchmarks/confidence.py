@@ -1,12 +1,11 @@
-r"""Learn the confidence of method ``auto`` from answers to images with and without faults, and test it on others.
+r"""Learn the confidence of method ``auto`` in poses by landmarks from answers to images with and without faults, and test it on others.
 
     python benchmarks/faults.py MAP:DATA ... --tuning-frames --name NAME
     python benchmarks/confidence.py benchmarks/results/NAME.rows.jsonl [...] [--write]
 
-Each row of ``benchmarks/faults.py`` that holds diagnostics is an example, unless the query's mirror image ruled it out; it is
-right within 5 degrees and 0.05 units. Logistic regressions with a small ridge penalty are fitted, one for poses by landmarks
-and one for poses by the surface. Their quality is measured by leaving out one scene at a time: the model is fitted to the
-other scenes and tested on the one left out (expected calibration error in ten bins, wrong answers among the accepted, right
+Each row of ``benchmarks/faults.py`` with a pose by landmarks is an example, unless the query's mirror image ruled it out; it is
+right within 5 degrees and 0.05 units. A logistic regression with a small ridge penalty is fitted. Its quality is measured by
+leaving out one scene at a time: the model is fitted to the other scenes and tested on the one left out (expected calibration error in ten bins, wrong answers among the accepted, right
 ones among the rejected). A harder test also leaves out one half of the faults, so that the model is tested on kinds of failure
 that it was not fitted to. ``--write`` fits to all examples and stores the weights in the package.
 """
@@ -25,16 +24,13 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from bidnerf_core.localization import Outcome, confidence
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 
 STORED = Path(confidence.__file__).with_suffix(".json")
 RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
-GOOD = (
-    "inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers", "runner_up_margin",
-    "rendered_inliers",
-)  # fmt: skip
-BAD = ("noise_ratio", "precision", "miscalibration", "free_space_violations")
+GOOD = ("inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers")
+BAD = ("noise_ratio", "precision", "miscalibration")
 """Features whose larger values can only raise (GOOD) or only lower (BAD) the confidence: examples are too few to show each."""
 BINS = 10
 WITHOUT_CONFIDENCE = (Outcome.MIRRORED, Outcome.AMBIGUOUS)
@@ -47,7 +43,6 @@ FEWEST = 30
 class Example:
     """A row's features, whether its pose is right, and where it comes from."""
 
-    kind: str  # "landmarks" or "surface"
     features: dict[str, float]
     right: bool
     scene: str
@@ -55,16 +50,13 @@ class Example:
 
 
 def examples(paths: Sequence[Path]) -> list[Example]:
-    """Read the rows whose answers state a confidence. Answers to images of another scene are all wrong."""
+    """Read the rows of poses by landmarks that state a confidence. Answers to images of another scene are all wrong."""
     found = []
     for path in paths:
         for text in path.read_text().splitlines():
             row = json.loads(text)
             row = row.get("row", row)
-            said = row.get("diagnostics") or {
-                "explained": None
-            }  # the support of a pose by colour needs no model
-            if "explained" not in said and row["outcome"] not in WITHOUT_CONFIDENCE:
+            if "inliers" in (row.get("diagnostics") or {}) and row["outcome"] not in WITHOUT_CONFIDENCE:
                 found.append(example(row))
     return found
 
@@ -72,11 +64,8 @@ def examples(paths: Sequence[Path]) -> list[Example]:
 def example(row: dict[str, Any]) -> Example:
     said, error = row["diagnostics"], row["translation"]
     right = error is not None and error < 0.05 and row["rotation_deg"] < 5
-    if "inliers" in said:
-        features = confidence.landmark_features(LandmarkDiagnostics(**said))
-        return Example("landmarks", features, right, row["scene"], row["fault"])
-    features = confidence.surface_features(SurfaceDiagnostics(**said))
-    return Example("surface", features, right, row["scene"], row["fault"])
+    features = confidence.landmark_features(LandmarkDiagnostics(**said))
+    return Example(features, right, row["scene"], row["fault"])
 
 
 def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.LogisticModel:
@@ -170,28 +159,25 @@ def main() -> None:
     parser.add_argument("rows", nargs="+", type=Path)
     parser.add_argument("--write", action="store_true", help="store the weights in the package")
     given = parser.parse_args()
-    everything, results, stored = examples(given.rows), {}, {}
-    for kind in ("landmarks", "surface"):
-        some = [e for e in everything if e.kind == kind]
-        if min(sum(e.right for e in some), sum(not e.right for e in some)) < FEWEST:
-            print(f"{kind}: {len(some)} examples, expected {FEWEST} right and {FEWEST} wrong ones; no model")
-            continue
-        model = fitted(some)
-        results[kind] = {
-            "other scenes": cross_validated(some, by_fault=False),
-            "other scenes and faults": cross_validated(some, by_fault=True),
-            "the examples themselves": assessed(
-                [model.probability(e.features) for e in some], [e.right for e in some]
-            ),
-        }
-        stored[kind] = {"features": model.features, "weights": model.weights, "bias": model.bias}
-        for name, found in results[kind].items():
-            print(f"{kind}, tested on {name}: {line(found.get('all', found))}")
-        for name, weight in zip(model.features, model.weights, strict=True):
-            print(f"  {name:22} {weight:+.2f}")
-    record = _lab.record(given.name, {"examples": len(everything), "held_out": results})
+    everything = examples(given.rows)
+    if min(sum(e.right for e in everything), sum(not e.right for e in everything)) < FEWEST:
+        raise SystemExit(f"{len(everything)} examples, expected {FEWEST} right and {FEWEST} wrong ones")
+    model = fitted(everything)
+    results = {
+        "other scenes": cross_validated(everything, by_fault=False),
+        "other scenes and faults": cross_validated(everything, by_fault=True),
+        "the examples themselves": assessed(
+            [model.probability(e.features) for e in everything], [e.right for e in everything]
+        ),
+    }
+    for name, found in results.items():
+        print(f"tested on {name}: {line(found.get('all', found))}")
+    for name, weight in zip(model.features, model.weights, strict=True):
+        print(f"  {name:22} {weight:+.2f}")
+    stored = {"features": model.features, "weights": model.weights, "bias": model.bias}
+    record = _lab.record(given.name, {"examples": len(everything), "held_out": {"landmarks": results}})
     if given.write:
-        text = json.dumps({"source": record.name, "models": stored}, indent=1)
+        text = json.dumps({"source": record.name, "models": {"landmarks": stored}}, indent=1)
         STORED.write_text(text + "\n")
         print(STORED)
 

@@ -153,7 +153,8 @@ def test_fresh_rays_lead_to_an_outcome(found: RefinementResult, expected: Outcom
 def test_the_loss_of_a_descent_leads_to_an_outcome(loss: float, finite: bool, expected: Outcome) -> None:
     verdict = descent_verdict(loss, 0.02, finite, "reached 5 steps", SUPPORTED, 0.5)
     why = "" if expected is Outcome.DIVERGED else f"; mean loss {loss:.3g}, must be below 0.02"
-    assert verdict == Verdict(expected, f"reached 5 steps{why}")
+    confidence = SUPPORTED.confidence if expected is Outcome.CONVERGED else None
+    assert verdict == Verdict(expected, f"reached 5 steps{why}", confidence)
 
 
 @pytest.mark.parametrize(("least", "expected"), [(0.4, Outcome.CONVERGED), (0.6, Outcome.RENDERING_MISMATCH)])

@@ -299,7 +299,7 @@ def test_an_accepted_pose_is_settled_unless_landmarks_are_doubtful_beside_measur
 def test_landmarks_keep_the_scale_that_they_give_a_depth_sensor() -> None:
     """On the sensor's own scale, the points would be off the surface."""
     scene, view = textured_map(surface=True), partly_hidden(1.05)
-    found = replace(answer(view, map=scene), confidence=0.6)
+    found = answer(view, map=scene)
     problem = rig(scene, [view], None)
     assert scene.surface is not None
     on_surface = []

@@ -12,6 +12,7 @@ import pytest
 
 from bidnerf_core.localization import Outcome, Verdict, confidence
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.beyond_chance import Support
 
 GOOD = LandmarkDiagnostics(
     inliers=300, matches=400, agreeing=350, log10_nfa=-300.0, chance=4.0, visible=900, keypoints=1500, spread=0.7,
@@ -30,9 +31,9 @@ def learning() -> ModuleType:
 def test_a_good_pose_by_landmarks_is_accepted_and_a_poor_one_is_not() -> None:
     poor = replace(GOOD, inliers=16, agreeing=8, chance=5.0, noise_ratio=4.0, precision=0.02, spread=0.1)
     good, bad = (confidence.judged(FINE, d) for d in (GOOD, poor))
-    assert good.verdict is FINE
-    assert bad.verdict.outcome is Outcome.UNCERTAIN
-    assert "likely to be right" in bad.verdict.reason
+    assert good == replace(FINE, confidence=good.confidence)
+    assert bad.outcome is Outcome.UNCERTAIN
+    assert "likely to be right" in bad.reason
     assert good.confidence is not None
     assert bad.confidence is not None
     assert 0 <= bad.confidence < confidence.ACCEPTED <= good.confidence <= 1
@@ -40,26 +41,30 @@ def test_a_good_pose_by_landmarks_is_accepted_and_a_poor_one_is_not() -> None:
 
 def test_a_rejection_stays_what_it_is() -> None:
     no = Verdict(Outcome.TOO_FEW_MATCHES, "no")
-    assert confidence.judged(no, GOOD).verdict is no
+    found = confidence.judged(no, GOOD)
+    assert found == replace(no, confidence=found.confidence)
+
+
+def test_a_rejection_for_a_reason_that_the_confidence_ignores_states_none() -> None:
+    sure = SurfaceDiagnostics(0.9, 0.5, 0.0, 0.3, support=Support(1.0, 9.0, 9.0, 9.0))
+    assert sure.verdict().confidence == sure.support.confidence > confidence.ACCEPTED
+    assert replace(sure, on_surface=0.5).verdict() == Verdict(
+        Outcome.OFF_SURFACE, "only 50% of the measured points lie on the surface"
+    )
+    rivalled = replace(sure, support=Support(1.0, 9.0, 9.0, 0.0)).verdict()
+    assert rivalled.outcome is Outcome.AMBIGUOUS
+    assert rivalled.confidence == pytest.approx(0.5, abs=1e-3)
+    assert Support(0.1, 9.0, 9.0, 9.0).rejection().confidence is None
 
 
 def test_every_stored_weight_belongs_to_a_feature() -> None:
-    surface = SurfaceDiagnostics(0.9, 0.5, 0.0, 0.3)
-    known = {
-        "landmarks": confidence.landmark_features(GOOD),
-        "surface": confidence.surface_features(surface),
-    }
-    assert "landmarks" in confidence.models()
-    for name, model in confidence.models().items():
-        assert set(model.features) == set(known[name])
-        assert np.isfinite(model.weights).all()
+    assert set(confidence.model().features) == set(confidence.landmark_features(GOOD))
+    assert np.isfinite(confidence.model().weights).all()
 
 
 def test_features_are_finite_at_the_extremes() -> None:
     nothing = LandmarkDiagnostics(0, 0, 0, 0.0, 0.0, 0, 0, 0.0, 0.0, 1.0, float("inf"), False, False)
     assert np.isfinite(list(confidence.landmark_features(nothing).values())).all()
-    surface = SurfaceDiagnostics(0.0, 0.0, 1.0, float("inf"), 0.0)
-    assert np.isfinite(list(confidence.surface_features(surface).values())).all()
 
 
 def test_probability_is_the_logistic_function() -> None:
@@ -76,7 +81,7 @@ def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
     for number in range(4000):
         features = dict(zip("ab", random.normal(size=2).tolist(), strict=True))
         right = bool(random.random() < true.probability(features))
-        given.append(learning.Example("landmarks", features, right, str(number % 2), str(number % 4)))
+        given.append(learning.Example(features, right, str(number % 2), str(number % 4)))
     found = learning.fitted(given, ridge=1e-5)
     for values in ({"a": 1.0, "b": 0.0}, {"a": -1.0, "b": 1.0}):
         assert found.probability(values) == pytest.approx(true.probability(values), abs=0.06)
@@ -86,7 +91,7 @@ def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
 
 def test_no_feature_counts_against_its_meaning() -> None:
     """Fitted without bounds, the weights of related features had either sign, and more inliers lowered the confidence."""
-    model = confidence.models()["landmarks"]
+    model = confidence.model()
     weight = dict(zip(model.features, model.weights, strict=True))
     for name in ("inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers"):
         assert weight[name] >= 0

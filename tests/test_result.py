@@ -52,6 +52,14 @@ def test_the_file_holds_the_answer_to_the_last_digit(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "pose.json"]  # no file is left behind
 
 
+def test_a_later_rejection_comes_with_its_own_confidence() -> None:
+    sure = replace(FOUND, confidence=0.99)
+    mirrored = sure.rejected(Verdict(Outcome.MIRRORED, "the mirror image fits better"))
+    assert (mirrored.outcome, mirrored.confidence) == (Outcome.MIRRORED, None)
+    assert mirrored.reason == "the mirror image fits better; all is well"
+    assert sure.rejected(Verdict(Outcome.UNCERTAIN, "too risky", 0.99)).plain()["confidence"] == 0.99
+
+
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
     path = tmp_path / "pose.json"
     path.write_text("x" * 10**5)

@@ -76,7 +76,8 @@ class SurfaceDiagnostics:
 
     def verdict(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict:
         share = f"{self.colour_inliers:.0%} of the measured points match the surface in position and colour"
-        return self.rejection(thresholds) or Verdict(Outcome.CONVERGED, share)
+        confidence = None if self.support is None else self.support.confidence
+        return self.rejection(thresholds) or Verdict(Outcome.CONVERGED, share, confidence)
 
 
 def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDiagnostics:
@@ -227,7 +228,7 @@ def rendered_verdict(found: RefinementResult, thresholds: RenderedThresholds) ->
         return Verdict(
             Outcome.NOT_SETTLED, f"newly drawn rays give a further step of {found.step:.3g}, {most}"
         )
-    return found.support.rejection() or Verdict(Outcome.CONVERGED, share)
+    return found.support.rejection() or Verdict(Outcome.CONVERGED, share, found.support.confidence)
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,7 @@ def descent_verdict(
         return Verdict(Outcome.HIGH_LOSS, reason)
     rejection = found.rejection(least_explained)
     return (
-        Verdict(Outcome.CONVERGED, reason)
+        Verdict(Outcome.CONVERGED, reason, found.confidence)
         if rejection is None
         else replace(rejection, reason=f"{reason}, but {rejection.reason}")
     )
@@ -286,11 +287,11 @@ def without_ambiguous_intrinsics(found: Localization, problem: Problem) -> Local
         return found
     if problem.focal_is_approximate and not _is_by_lidar(found, problem):
         why = "the focal length is approximate, and only landmarks can separate it from the distance"
-        return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")
+        return found.rejected(Verdict(Outcome.IMPRECISE, why))
     if problem.has_depth or not may_be_miscalibrated(problem):
         return found
     why = "the given intrinsics are close to those of the map's images, and only landmarks can show which are right"
-    return replace(found, outcome=Outcome.MISCALIBRATED, reason=f"{why}; {found.reason}")
+    return found.rejected(Verdict(Outcome.MISCALIBRATED, why))
 
 
 def _is_by_lidar(found: Localization, problem: Problem) -> bool:

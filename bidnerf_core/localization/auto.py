@@ -101,7 +101,7 @@ def _localized(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     decided = proposal.decided and before.converged
     if found.converged and config.landmarks and not decided:
         why = decide(problem, found.T_world_camera, proposal.near, rays, seed).rejection
-        found = found if why is None else _rejected(found, why)
+        found = found if why is None else found.rejected(why)
     return replace(found, seconds=time.perf_counter() - began)
 
 
@@ -166,11 +166,6 @@ def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
     return outcome is Outcome.CONVERGED or outcome in FINAL
 
 
-def _rejected(found: Localization, why: Verdict) -> Localization:
-    """Reject a localization, and drop its confidence, which only measures how well the pose fits."""
-    return replace(found, outcome=why.outcome, reason=f"{why.reason}; {found.reason}", confidence=None)
-
-
 def _compared_with_landmarks(
     found: Localization,
     problem: Problem,
@@ -189,16 +184,16 @@ def _compared_with_landmarks(
     )
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
-        supported = found.converged and (answer.confidence or 0.0) >= LEAST_SUPPORT
+        supported = found.converged and (answer.verdict.confidence or 0.0) >= LEAST_SUPPORT
         if supported and not answer.verdict.accepted:
             return _Proposal(found, near.pose)  # they confirm the pose, but are too few to move it
         refined = localization_by_landmarks(problem, answer, began)
         return _Proposal(replace(refined, reason=f"found on the surface; {refined.reason}"), near.pose)
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
-        found = replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
+        found = found.rejected(Verdict(Outcome.TOO_FEW_MATCHES, why))
     elif found.converged and verdict is not None and _is_misled(verdict, problem):
-        found = _rejected(found, replace(verdict, outcome=Outcome.MISCALIBRATED))
+        found = found.rejected(verdict)
     return _Proposal(found, near.pose)
 
 

@@ -58,13 +58,14 @@ class Support:
 
     def rejection(self, least_explained: float = LEAST_EXPLAINED) -> Verdict | None:
         """Return the reason why the measurements do not support the pose, or None."""
-        if self.confidence < ACCEPTED:
+        p = self.confidence
+        if p < ACCEPTED:
             if self.plain <= min(self.displaced, self.other):
-                return Verdict(Outcome.UNDETERMINED, "a single-colour image fits about as well")
+                return Verdict(Outcome.UNDETERMINED, "a single-colour image fits about as well", p)
             if self.other < self.displaced:
-                return Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
+                return Verdict(Outcome.AMBIGUOUS, "another pose fits about as well", p)
             share = f"{DISPLACEMENT:.0%} of the distance to the scene"
-            return Verdict(Outcome.UNDETERMINED, f"poses displaced by {share} fit about as well")
+            return Verdict(Outcome.UNDETERMINED, f"poses displaced by {share} fit about as well", p)
         if not self.explained >= least_explained:
             share = f"{max(self.explained, 0):.0%} of the contrast of the image"
             return Verdict(Outcome.RENDERING_MISMATCH, f"the pose explains only {share}")

@@ -93,7 +93,7 @@ def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
         T_world_camera=T,
         outcome=verdict.outcome,
         reason=verdict.reason,
-        confidence=apart.confidence,
+        confidence=verdict.confidence,
         diagnostics=apart,
         covariance=covariance if bool(covariance.isfinite().all()) else None,
         loss=cost_at_end,
@@ -151,4 +151,4 @@ def _verdict(found: Support, precision: float) -> Verdict:
     if not precision <= PRECISE:
         why = f"the image is blurred, so the position is uncertain by {precision:.1%} of the distance to the scene"
         return Verdict(Outcome.IMPRECISE, f"{why}, expected at most {PRECISE:.0%}")
-    return Verdict(Outcome.CONVERGED, share)
+    return Verdict(Outcome.CONVERGED, share, found.confidence)

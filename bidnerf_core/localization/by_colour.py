@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Generator
@@ -82,7 +82,7 @@ def localization_of(
         poses=SE3.stack(path),
         losses=torch.cat([search.losses, refined.losses]),
         covariance=covariance if bool(covariance.isfinite().all()) else None,
-        confidence=refined.support.confidence,
+        confidence=answer.verdict.confidence,
         diagnostics=refined.support,
     )
 
@@ -98,4 +98,4 @@ def without_the_imprecise(found: Localization, typical: float) -> Localization:
     if deviation <= TYPICAL_ERRORS * typical:
         return found
     why = f"the position is uncertain by {deviation:.3g}, against {typical:.3g} for the map's own images"
-    return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")
+    return found.rejected(Verdict(Outcome.IMPRECISE, why))

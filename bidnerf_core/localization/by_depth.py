@@ -13,7 +13,6 @@ from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.beyond_chance import support
-from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.covariance import finest_cost, surface_covariance
@@ -52,7 +51,7 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
         finest = finest_cost(search.surface, search.cloud)
         apart = support(finest.point_costs, found.T[0], search.cloud.middle.double().cpu())
         diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers, support=apart)
-        judgement = judged(diagnostics.verdict(), diagnostics)
+        verdict = diagnostics.verdict()
         path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
         losses = search.judge(COMPARED_POINTS).cost(path)
         covariance = surface_covariance(
@@ -60,8 +59,8 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
         )
     return Localization(
         T_world_camera=found.T[0].normalized(),
-        outcome=judgement.verdict.outcome,
-        reason=judgement.verdict.reason,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
         steps=len(losses) - 1,
         seconds=time.perf_counter() - began,
         loss=float(found.scores[0]),
@@ -69,7 +68,7 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
         poses=path,
         losses=losses[:-1],
         covariance=covariance,
-        confidence=judgement.confidence,
+        confidence=verdict.confidence,
         diagnostics=diagnostics,
     )
 

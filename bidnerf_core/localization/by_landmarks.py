@@ -75,7 +75,6 @@ class LandmarkAnswer:
     diagnostics: LandmarkDiagnostics
     terms: tuple[str, ...] = ()  # the measurements fused with the landmarks
     left_out: str = ""  # measurements not fused because they contradict the landmarks
-    confidence: float | None = None  # probability that the pose is right
     has_rival: bool = False  # whether it is rejected because an alternative explanation may be right
 
     @property
@@ -111,7 +110,7 @@ def answer_by_landmarks(
     if there is not None and landmark_verdict(there).accepted:
         return fused_answer(problem, there, landmark_verdict(there), fused_rays, seed)
     answer = fused_answer(problem, found, decision.rejection, 0, seed)
-    return replace(answer, confidence=None, has_rival=True)
+    return replace(answer, verdict=decision.rejection, has_rival=True)  # its fit is no evidence
 
 
 def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> LandmarkPose:
@@ -148,21 +147,16 @@ def fused_answer(
     if not may_be_fused or found.estimates_calibration:
         if problem.has_depth and found.estimates_calibration:
             answer = replace(answer, left_out="depth, which needs known intrinsics")
-        return _with_confidence(answer)  # rendering would need intrinsics as exact as the landmarks' too
+        # Rendering would need intrinsics as exact as the landmarks' too.
+        return replace(answer, verdict=judged(verdict, diagnostics))
     problem = corrected(problem, found)
     points = None
     if problem.surface is not None and problem.has_depth:
         points = _cost_of_points(problem, problem.surface, Generator().manual_seed(seed))
         diagnostics = landmark_diagnostics(found, searched, points, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
-    answer = _with_confidence(answer)
+    answer = replace(answer, verdict=judged(verdict, diagnostics))
     return _fused(problem, answer, points, rays, seed)
-
-
-def _with_confidence(answer: LandmarkAnswer) -> LandmarkAnswer:
-    """Return the answer with its confidence, which can turn its verdict into a rejection."""
-    judgement = judged(answer.verdict, answer.diagnostics)
-    return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 
 def is_sharp(problem: Problem) -> bool:
@@ -247,7 +241,7 @@ def _measurements(
 
 def _is_likelier(problem: Problem, T: SE3, answer: LandmarkAnswer, seed: int) -> bool:
     """Return whether a pose is more likely than that by landmarks, given renderings and the confidence in the landmarks."""
-    sure = min(max(answer.confidence or 0.5, 1e-12), 1 - 1e-12)
+    sure = min(max(answer.verdict.confidence or 0.5, 1e-12), 1 - 1e-12)
     odds = log_odds_by_rendering(replace(problem, start=T), replace(problem, start=answer.T), seed, steps=0)
     return odds > log_odds_of(sure)
 
@@ -258,7 +252,7 @@ def _elsewhere(
     """Return the answer at the pose of the other measurements, which contradict the landmarks."""
     verdict = Verdict(Outcome.UNCERTAIN, f"{enumeration(names)} contradict the landmarks")
     covariance = other.covariance + answer.found.shared_covariance
-    return replace(answer, T=other.T, covariance=covariance, verdict=verdict, confidence=None, terms=names)
+    return replace(answer, T=other.T, covariance=covariance, verdict=verdict, terms=names)
 
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
@@ -286,6 +280,6 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         covariance=answer.full_covariance,
         focal_factor=found.focal_factor,
         intrinsics=found.intrinsics_of(problem.views[-1].frame.intrinsics),
-        confidence=answer.confidence,
+        confidence=answer.verdict.confidence,
         diagnostics=answer.diagnostics,
     )

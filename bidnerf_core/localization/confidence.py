@@ -1,32 +1,24 @@
-"""Confidence: the probability that a pose is right, by a logistic model of its diagnostics.
+"""Confidence in a pose by landmarks: the probability that it is right, by a logistic model of its diagnostics.
 
 The weights were learned by ``benchmarks/confidence.py`` from answers to images with and without faults; ``confidence.json``
-holds them. There is one model for poses by landmarks and one for poses by measured points on the surface.
+holds them. Poses found by other means are compared with rivals instead: ``Support.confidence``.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import files
 
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.localization.beyond_chance import ACCEPTED
 from bidnerf_core.localization.landmarks.chance import probability_of
 from bidnerf_core.localization.result import Outcome, Verdict
 
 TRUSTED = 0.95
 """Minimum confidence at which a pose by landmarks is trusted without further measurements."""
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """A verdict with the probability that the pose is right; None if unknown."""
-
-    verdict: Verdict
-    confidence: float | None
 
 
 @dataclass(frozen=True)
@@ -43,39 +35,20 @@ class LogisticModel:
         return probability_of(self.bias + sum(terms))
 
 
-def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> Judgement:
+def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics) -> Verdict:
     """Return the verdict with the confidence in the pose, which can turn it into a rejection."""
-    value = confidence(diagnostics)
-    if value is not None and verdict.accepted and value < ACCEPTED:
+    value = model().probability(landmark_features(diagnostics))
+    if verdict.accepted and value < ACCEPTED:
         percent = math.floor(100 * value)
         verdict = Verdict(Outcome.UNCERTAIN, f"only {percent}% likely to be right; {verdict.reason}")
-    return Judgement(verdict, value)
-
-
-def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float | None:
-    """Return the probability that a pose with these diagnostics is right.
-
-    Without a learned model, it is the probability of the pose among its rivals; None if it was not compared with any.
-    """
-    if isinstance(diagnostics, LandmarkDiagnostics):
-        name, features = "landmarks", landmark_features(diagnostics)
-    else:
-        name, features = "surface", surface_features(diagnostics)
-    model = models().get(name)
-    if model is not None:
-        return model.probability(features)
-    support = diagnostics.support if isinstance(diagnostics, SurfaceDiagnostics) else None
-    return None if support is None else support.confidence
+    return replace(verdict, confidence=value)
 
 
 @lru_cache(maxsize=1)
-def models() -> dict[str, LogisticModel]:
-    """Return the models by the way in which a pose was found."""
-    stored = json.loads((files(__package__) / "confidence.json").read_text())["models"]
-    return {
-        name: LogisticModel(tuple(model["features"]), tuple(model["weights"]), model["bias"])
-        for name, model in stored.items()
-    }
+def model() -> LogisticModel:
+    """Return the stored model."""
+    stored = json.loads((files(__package__) / "confidence.json").read_text())["models"]["landmarks"]
+    return LogisticModel(tuple(stored["features"]), tuple(stored["weights"]), stored["bias"])
 
 
 def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
@@ -95,15 +68,4 @@ def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
         # Without measured points, the surface neither supports nor contradicts a pose.
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
         "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
-    }
-
-
-def surface_features(found: SurfaceDiagnostics) -> dict[str, float]:
-    """Return the features of a pose by measured points on the surface."""
-    return {
-        "on_surface": found.on_surface,
-        "colour_inliers": found.colour_inliers,
-        "free_space_violations": found.free_space_violations,
-        "runner_up_margin": min(found.runner_up_margin, 1.0),
-        "rendered_inliers": found.rendered_inliers,
     }

@@ -74,7 +74,7 @@ def descended(
         method=method,
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),
-        confidence=found.confidence,
+        confidence=verdict.confidence,
         diagnostics=DescentDiagnostics(mean, adam.converged_loss, found),
     )
 

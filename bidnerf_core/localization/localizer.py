@@ -31,7 +31,7 @@ from bidnerf_core.localization.methods import (
     settings_of,
 )
 from bidnerf_core.localization.problem import Problem, SceneMap, landmark_cameras, on_device, rig, unit_of
-from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import ByColourConfig
 
 WARM_UP_RAYS = 64
@@ -249,10 +249,5 @@ NO_DISTANCES = "the map's photos are from one place and show no distances"
 def direction_only(found: Localization) -> Localization:
     """Reject an answer, as its position is unknown: as imprecise, or for its own reason if it was already rejected."""
     outcome = Outcome.IMPRECISE if found.converged else found.outcome
-    return replace(
-        found,
-        outcome=outcome,
-        reason=f"{NO_DISTANCES}, so the position is unknown and only the direction may be right; {found.reason}",
-        covariance=None,
-        confidence=None,
-    )
+    why = f"{NO_DISTANCES}, so the position is unknown and only the direction may be right"
+    return replace(found.rejected(Verdict(outcome, why)), covariance=None)

@@ -54,10 +54,13 @@ class Diagnostics(Protocol):
 
 @dataclass(frozen=True)
 class Verdict:
-    """An outcome and the sentence that explains it."""
+    """An outcome, the sentence that explains it, and the probability that the pose is right."""
 
     outcome: Outcome
     reason: str
+    confidence: float | None = (
+        None  # None if unknown, or if it ignores the reason for which the pose is rejected
+    )
 
     @property
     def accepted(self) -> bool:
@@ -80,7 +83,8 @@ class Localization:
     # Covariance of a right update at the camera: translation (``unit``) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
     focal_factor: float = 1.0  # ratio of the estimated to the given focal length; 1 if it was not corrected
-    # Probability that the pose is right: by a learned model of the diagnostics, else by comparison with rivals. None if unknown.
+    # Probability that the pose is right: by landmarks, from a learned model of the diagnostics, otherwise by comparison with
+    # rivals. None if unknown, and if the pose is rejected for a reason that the model or the comparison ignores.
     confidence: float | None = None
     diagnostics: Diagnostics | None = None  # the measures by which the pose was accepted or rejected
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
@@ -99,6 +103,11 @@ class Localization:
     def converged(self) -> bool:
         """Whether the method accepts its own answer."""
         return self.outcome is Outcome.CONVERGED
+
+    def rejected(self, why: Verdict) -> Localization:
+        """Return the answer with another verdict, whose reason comes before that of this one."""
+        reason = f"{why.reason}; {self.reason}"
+        return replace(self, outcome=why.outcome, reason=reason, confidence=why.confidence)
 
     def frame_as_taken(self, frame: Frame) -> Frame:
         """Return the last image's frame with the intrinsics of the pose: the given or the corrected ones."""

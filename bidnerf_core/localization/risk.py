@@ -8,12 +8,11 @@ guarantee holds only for answers found in the same way as those of the calibrati
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import files
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.settings import Range
 
 
@@ -43,5 +42,5 @@ def within_risk(found: Localization, risk: float) -> Localization:
     if not found.converged or (found.confidence is not None and found.confidence >= least):
         return found
     said = "unknown" if found.confidence is None else f"{found.confidence:.3f}"
-    reason = f"the confidence is {said}, a risk of {risk:g} requires {least:.3f}; {found.reason}"
-    return replace(found, outcome=Outcome.UNCERTAIN, reason=reason)
+    why = f"the confidence is {said}, a risk of {risk:g} requires {least:.3f}"
+    return found.rejected(Verdict(Outcome.UNCERTAIN, why, found.confidence))

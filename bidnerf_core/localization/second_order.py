@@ -87,7 +87,7 @@ def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization
         poses=found.poses,
         losses=found.losses,
         covariance=found.covariance if bool(found.covariance.isfinite().all()) else None,
-        confidence=found.support.confidence,
+        confidence=verdict.confidence,
         diagnostics=found.support,
     )
 
