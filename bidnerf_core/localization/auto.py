@@ -36,7 +36,7 @@ from bidnerf_core.localization.first_order import BidConfig, bid
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm
-from bidnerf_core.localization.methods import Method
+from bidnerf_core.localization.methods import Method, SharedSettings
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -220,10 +220,8 @@ AUTO = Method(
     AutoConfig,
     needs_start=False,
     uses_landmarks=True,
-    matches_landmarks=lambda config: config.landmarks,
-    depth_sensor=lambda config: config.depth_sensor,
-    by_colour=lambda config: config.by_colour,
-    rays=lambda config: config.fused_rays,
-    risk=lambda config: config.risk,
+    shared=lambda config: SharedSettings(
+        config.landmarks, config.depth_sensor, config.by_colour, config.fused_rays, config.risk
+    ),
     summary="landmarks, then search on the baked surface by depth or colour; no start needed",
 )

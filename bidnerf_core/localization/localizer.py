@@ -32,7 +32,6 @@ from bidnerf_core.localization.methods import (
 )
 from bidnerf_core.localization.problem import Problem, SceneMap, landmark_cameras, on_device, rig, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.settings import ByColourConfig
 
 WARM_UP_RAYS = 64
 
@@ -68,6 +67,7 @@ class Localizer:
         self.scene: SceneMap = scene if device is None else on_device(scene, device)
         self._method = find_method(method)
         self.config = _checked_config(self._method, method, config, preset)
+        self.shared = self._method.shared(self.config)
         landmarks = self.scene.landmarks if self._method.uses_landmarks else None
         self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
         if warm_up:
@@ -115,27 +115,7 @@ class Localizer:
     @property
     def depth_sensor(self) -> DepthSensorModel:
         """The noise model of the depth sensor; the generic one if the method has no such setting."""
-        return find_depth_sensor(self.depth_sensor_name)
-
-    @property
-    def depth_sensor_name(self) -> str:
-        """The name of the depth sensor in the settings."""
-        return self._method.depth_sensor(self.config)
-
-    @property
-    def risk(self) -> float | None:
-        """The tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance."""
-        return self._method.risk(self.config)
-
-    @property
-    def by_colour(self) -> ByColourConfig:
-        """The settings of refinement by colour alone; the defaults for methods without such settings."""
-        return self._method.by_colour(self.config)
-
-    @property
-    def rays(self) -> int:
-        """The number of rays that may be rendered to compare explanations of an image; 0 if nothing is rendered."""
-        return self._method.rays(self.config)
+        return find_depth_sensor(self.shared.depth_sensor)
 
     @property
     def assumed_cameras(self) -> tuple[Intrinsics, ...]:
@@ -145,7 +125,7 @@ class Localizer:
     @property
     def matches_landmarks(self) -> bool:
         """Whether the map has landmarks and the method, with its settings, matches them."""
-        return self.matcher is not None and self._method.matches_landmarks(self.config)
+        return self.matcher is not None and self.shared.matches_landmarks
 
     @torch.no_grad()
     def _warm_up(self) -> None:

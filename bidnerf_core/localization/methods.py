@@ -16,32 +16,24 @@ from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import from_flat
 
 
-def _always(config: Any) -> bool:
-    return True
+@dataclass(frozen=True)
+class SharedSettings:
+    """Settings of a method that trackers, collections of maps and the command line take into account as well."""
 
-
-def _unknown_sensor(config: Any) -> str:
-    return UNKNOWN_SENSOR
-
-
-def _none_rendered(config: Any) -> int:
-    return 0
-
-
-def _no_risk(config: Any) -> None:
-    return None
-
-
-def _usual_colour(config: Any) -> ByColourConfig:
-    return ByColourConfig()
+    matches_landmarks: bool = True  # whether images are matched with the map's landmarks
+    depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
+    by_colour: ByColourConfig = ByColourConfig()  # how a tracker refines poses by colour alone
+    rays: int = (
+        0  # number of rays that may be rendered to compare explanations of an image; 0: nothing is rendered
+    )
+    risk: float | None = (
+        None  # tolerated fraction of wrong answers among the accepted ones; None: the usual acceptance
+    )
 
 
 @dataclass(frozen=True)
 class Method:
-    """A localization method: how it finds poses, its settings, what it needs and what it offers.
-
-    The functions of a config return settings that are needed outside the method.
-    """
+    """A localization method: how it finds poses, its settings, what it needs and what it offers."""
 
     solve: Callable[[Problem, Any, int], Localization]
     """Solves a problem with settings of ``config_type``; all random choices are drawn from the seed."""
@@ -50,14 +42,9 @@ class Method:
     uses_depth: bool = True  # whether it uses measured depth
     presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
-    matches_landmarks: Callable[[Any], bool] = _always  # whether its settings make it match images with them
-    depth_sensor: Callable[[Any], str] = _unknown_sensor  # the name of the sensor that measured the depth
-    by_colour: Callable[[Any], ByColourConfig] = _usual_colour  # how a tracker refines poses by colour alone
-    rays: Callable[[Any], int] = (
-        _none_rendered  # how many may be rendered to compare explanations of an image
-    )
-    # the tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance
-    risk: Callable[[Any], float | None] = _no_risk
+    shared: Callable[[Any], SharedSettings] = lambda config: (
+        SharedSettings()
+    )  # its settings that matter elsewhere too
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:
@@ -117,7 +104,7 @@ def _names_of(wanted: Callable[[Method], bool]) -> str:
 def matches_landmarks(method: str, config: Any) -> bool:
     """Return whether a method, with these settings, matches images with a map's landmarks."""
     chosen = find_method(method)
-    return chosen.uses_landmarks and chosen.matches_landmarks(config)
+    return chosen.uses_landmarks and chosen.shared(config).matches_landmarks
 
 
 def settings_of(method: str, values: dict[str, Any], where: str = "config", preset: str | None = None) -> Any:

@@ -223,7 +223,7 @@ class Tracker:
         elif image is None:
             return None
         else:
-            found = by_colour(self.localizer.scene, frame, state, predicted, self.localizer.by_colour)
+            found = by_colour(self.localizer.scene, frame, state, predicted, self.localizer.shared.by_colour)
         covariance = predicted.corrected(found.pose).covariance
         return replace(found, verdict=determined(found.verdict, covariance, self._extent))
 

@@ -180,7 +180,9 @@ class MapCollection:
             if not localizer.matches_landmarks or localizer.matcher is None:
                 return localizer(frame, seed=seed)
             began, problem = time.perf_counter(), localizer.problem(frame)
-            answer = answer_by_landmarks(problem, problem.matcher or localizer.matcher, localizer.rays, seed)
+            answer = answer_by_landmarks(
+                problem, problem.matcher or localizer.matcher, localizer.shared.rays, seed
+            )
         except InputError as error:  # such as a map without a surface
             return _unrecognised(str(error), self.method)
         if answer is None:

@@ -291,7 +291,7 @@ def answer_each(
 
 def _log_depth_noise(query: Query, localizer: Localizer) -> None:
     """Compare the noise of a query's depth with that of the sensor named in the settings."""
-    frame, sensor = query.frame, localizer.depth_sensor_name
+    frame, sensor = query.frame, localizer.shared.depth_sensor
     if sensor != "unknown" and frame.depth is not None and frame.has_depth:
         remark = noise_remark(frame.depth, frame.intrinsics, sensor)
         if remark is not None:

@@ -50,9 +50,9 @@ def relocalized(
     if localizer.matches_landmarks:
         problem = localizer.problem(frame)
         near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
-        found = _recognised(problem, near, localizer.rays, seed)
-        if found is not None and localizer.risk is not None:
-            found = within_risk(found, localizer.risk)
+        found = _recognised(problem, near, localizer.shared.rays, seed)
+        if found is not None and localizer.shared.risk is not None:
+            found = within_risk(found, localizer.shared.risk)
         if (found is not None and found.converged) or not _searched(localizer, frame, lost):
             return found
         return localizer.solved(replace(problem, start=predicted), seed)
