@@ -10,7 +10,7 @@ from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm, propose
 from bidnerf_core.localization.localizer import Localizer
-from bidnerf_core.localization.methods import METHODS, Method, find_method, settings_of
+from bidnerf_core.localization.methods import METHODS, Method, SharedSettings, find_method, settings_of
 from bidnerf_core.localization.normal_equations import Cost, GaussianPrior, NormalEquations, Scaled, Sum
 from bidnerf_core.localization.problem import Problem, SceneMap, rig, window
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -67,6 +67,7 @@ __all__ = [
     "SampledLoss",
     "Scaled",
     "SceneMap",
+    "SharedSettings",
     "Sum",
     "SurfaceCost",
     "Tracker",

@@ -127,26 +127,27 @@ def _image_pixels(pixels: Float[Tensor, "m 2"], image: ImageKeypoints) -> Float[
 def _visible(
     image: ImageKeypoints, landmarks: LandmarkMap, T_world_camera: SE3, focal: float, margin: float
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
-    """Return the landmarks in front of the camera, inside its image, and seen roughly from a mapped direction.
+    """Return the landmarks inside the image of a camera, seen roughly from a mapped direction, and where its frame has them.
 
-    Those much smaller than the smallest keypoint are excluded, since there may be many beyond a wall. The positions are in the
-    camera's frame.
+    Those much smaller than the smallest keypoint are excluded, since there may be many beyond a wall.
     """
-    camera = image.intrinsics
-    half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
-    # Distortion moves the edges of the image. A generous margin is harmless: landmarks outside match no keypoints.
-    slopes = (1.3 * half + margin) / focal
     found = image.keypoints.sizes
     size = float(found.min()) / (2**OCTAVES * focal) if len(found) else 0.0
-    index = landmarks.seen_from(T_world_camera, slopes, OBLIQUE, size)
-    local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions[index])
-    inside = (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1) & (local[:, 2] > 0)
-    inside &= landmarks.sizes[index] >= size * local[:, 2]
-    index, local = index[inside], local[inside]
-    seen = landmarks.facing(T_world_camera.translation, OBLIQUE, index)
-    if image.hidden is not None:
-        seen &= ~_hidden(image.hidden, local, camera)
+    slopes = slopes_in_view(image.intrinsics, focal, margin)
+    index, local = landmarks.in_view(T_world_camera, slopes, OBLIQUE, size)
+    if image.hidden is None:
+        return index, local
+    seen = ~_hidden(image.hidden, local, image.intrinsics)
     return index[seen], local[seen]
+
+
+def slopes_in_view(camera: Intrinsics, focal: float, margin: float = 0.0) -> Float[Tensor, "2"]:
+    """Return the largest slopes |x / z| and |y / z| of points in view, up to ``margin`` pixels beyond the edges of the image.
+
+    Distortion moves the edges. Too large slopes are harmless: landmarks outside match no keypoints.
+    """
+    half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
+    return (1.3 * half + margin) / focal
 
 
 def _hidden(

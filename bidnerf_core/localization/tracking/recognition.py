@@ -26,7 +26,12 @@ from bidnerf_core.localization.landmarks.evidence import (
     probability_within,
     share_of_cells,
 )
-from bidnerf_core.localization.landmarks.guided import OBLIQUE, guided_matches, projected_landmarks
+from bidnerf_core.localization.landmarks.guided import (
+    OBLIQUE,
+    guided_matches,
+    projected_landmarks,
+    slopes_in_view,
+)
 from bidnerf_core.localization.landmarks.matching import EXHAUSTIVE, LandmarkMatcher, unguided_matches
 from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery, pixel_threshold
@@ -135,11 +140,8 @@ class LandmarkDetector:
     def _near(self, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "n"]:
         """Return up to ``EXHAUSTIVE`` numbers of landmarks in view, mapped from roughly this direction, those in most images."""
         landmarks = self.landmarks
-        local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
-        half = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
-        middle = torch.tensor([0.5 - camera.cx / camera.width, 0.5 - camera.cy / camera.height]) * 2 * half
-        inside = ((local[:, :2] - middle * local[:, 2:]).abs() <= 1.3 * half * local[:, 2:]).all(-1)
-        index = (inside & landmarks.facing(T_world_camera.translation, OBLIQUE)).nonzero()[:, 0]
+        slopes = slopes_in_view(camera, (camera.fx * camera.fy) ** 0.5)
+        index, _ = landmarks.in_view(T_world_camera, slopes, OBLIQUE)
         if len(index) <= EXHAUSTIVE:
             return index
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:EXHAUSTIVE].sort().values]

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
@@ -103,25 +103,27 @@ class LandmarkMap:
             else None
         )
 
-    def seen_from(
+    def in_view(
         self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float, size: float = 0.0
-    ) -> Int[Tensor, "m"]:
-        """Return the indices of a superset of the landmarks visible in an image; see ``LandmarkCells.seen_from``."""
-        if self.cells is None:
-            return torch.arange(len(self))
-        return self.cells.seen_from(T_world_camera, slopes, oblique, size)
+    ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
+        """Return the numbers of the landmarks visible in an image, ignoring occlusion, and their positions in the camera's frame.
 
-    def facing(
-        self, position: Float[Tensor, "3"], margin: float, index: Int[Tensor, "m"] | None = None
-    ) -> Bool[Tensor, "m"]:
-        """Return which landmarks were seen from the direction of a ``position``, or from at most ``margin`` radians beyond.
-
-        ``index``: the numbers of the landmarks in question, by default all.
+        The conditions and the arguments are those of ``LandmarkCells.seen_from``.
         """
-        chosen = slice(None) if index is None else index
-        towards = position.float() - self.positions[chosen]
-        cosine = (towards * self.directions[chosen]).sum(-1) / towards.norm(dim=-1).clamp(min=1e-12)
-        return cosine >= (self.cones[chosen] + margin).clamp(max=torch.pi).cos()
+        cells = self.cells
+        index = (
+            torch.arange(len(self))
+            if cells is None
+            else cells.seen_from(T_world_camera, slopes, oblique, size)
+        )
+        local = T_world_camera.inverse().to(torch.float32).apply(self.positions[index])
+        inside = (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1) & (local[:, 2] > 0)
+        inside &= self.sizes[index] >= size * local[:, 2]
+        index, local = index[inside], local[inside]
+        towards = T_world_camera.translation.float() - self.positions[index]
+        cosine = (towards * self.directions[index]).sum(-1) / towards.norm(dim=-1).clamp(min=1e-12)
+        facing = cosine >= (self.cones[index] + oblique).clamp(max=torch.pi).cos()
+        return index[facing], local[facing]
 
     @property
     def megabytes(self) -> float:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -93,14 +93,12 @@ def pooled_views(
     found = []
     for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / VIEWPOINTS))]:
         seen = visible(landmarks, camera, pose)
-        if int(seen.sum()) >= FEWEST:
+        if len(seen) >= FEWEST:
             found.append(vocabulary.pooled(landmarks.descriptors[seen], word[seen]))
     return torch.stack([*found, vocabulary.pooled(landmarks.descriptors, word)])
 
 
-def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Bool[Tensor, "n"]:
-    """Return a mask of the landmarks visible to a camera, ignoring occlusion."""
-    pose = T_world_camera.to(torch.float32)
-    x, y, z = pose.inverse().apply(landmarks.positions).unbind(-1)
-    inside = (x.abs() * camera.fx <= z * camera.width / 2) & (y.abs() * camera.fy <= z * camera.height / 2)
-    return inside & (z > 0) & landmarks.facing(pose.translation, math.radians(VISIBLE_BEYOND_DEG))
+def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "m"]:
+    """Return the numbers of the landmarks visible to a camera, ignoring occlusion."""
+    slopes = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
+    return landmarks.in_view(T_world_camera, slopes, math.radians(VISIBLE_BEYOND_DEG))[0]
