@@ -63,7 +63,7 @@ def test_every_stored_weight_belongs_to_a_feature() -> None:
 
 
 def test_features_are_finite_at_the_extremes() -> None:
-    nothing = LandmarkDiagnostics(0, 0, 0, 0.0, 0.0, 0, 0, 0.0, 0.0, 1.0, float("inf"), False, False)
+    nothing = LandmarkDiagnostics(0, 0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0, 1.0, float("inf"), False, False)
     assert np.isfinite(list(confidence.landmark_features(nothing).values())).all()
 
 

@@ -17,7 +17,7 @@ from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.landmarks.map_camera import OTHER_CAMERA, MapCamera, map_cameras
-from bidnerf_core.localization.landmarks.pose import LandmarkPose
+from bidnerf_core.localization.landmarks.pose import LandmarkPose, MatchEvidence
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -94,16 +94,10 @@ def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDia
 
 
 @dataclass(frozen=True)
-class LandmarkDiagnostics:
+class LandmarkDiagnostics(MatchEvidence):
     """Measures of how well a pose explains the features of an image; none depends on the unit of length."""
 
     inliers: int  # correspondences within three standard deviations
-    matches: int  # by descriptors alone
-    agreeing: int  # inliers among these matches
-    log10_nfa: float  # logarithm of the number of false alarms of this agreement
-    chance: float  # correspondences expected at a wrong pose
-    visible: int  # landmarks that should be visible
-    keypoints: int  # in the images
     spread: float  # fraction of the image's cells that contain a correspondence
     noise_ratio: float  # ratio of the reprojection noise to that of the map's own images
     miscalibration: float  # probability that the given intrinsics are wrong
@@ -124,9 +118,10 @@ def landmark_diagnostics(
         near_points, alike = judge.inliers(judge.correspondences(T[None]))
         near, both = float(near_points.mean()), float((near_points * alike).mean())
     return LandmarkDiagnostics(
-        found.inliers, found.matches, found.agreeing, found.log10_nfa, found.chance, found.visible,
-        found.keypoints, found.spread, found.noise_ratio, found.doubt.wrong, found.position_deviation / found.distance,
-        found.estimates_calibration, searched, near, both, found.has_motion,
+        **vars(found.evidence), inliers=found.inliers, spread=found.spread, noise_ratio=found.noise_ratio,
+        miscalibration=found.doubt.wrong, precision=found.position_deviation / found.distance,
+        estimated_calibration=found.estimates_calibration, searched=searched, on_surface=near, colour_inliers=both,
+        rolling_shutter=found.has_motion,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -13,10 +14,13 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.chance import log10_nfa
 from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.hypotheses import Whose
-from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose, MatchEvidence
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.localization.landmarks.refinement import GuidedPose
+from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 CELLS = 8
 """Number of rows and columns of cells by which the spread of correspondences over an image is measured."""
@@ -25,7 +29,6 @@ CELLS = 8
 def described(answer: GuidedPose) -> LandmarkPose:
     """Return a refined pose with the evidence for it."""
     query, matches, fit, best = answer.query, answer.matches, answer.fit, answer.best
-    landmarks = query.landmarks
     seen = answer.seen
     data, by_descriptors = (
         seen.observed(found).without_motion(fit.T_world_rig, fit.motion).corrected(fit.calibration)
@@ -34,34 +37,45 @@ def described(answer: GuidedPose) -> LandmarkPose:
     off = by_descriptors.residuals(fit.T_world_rig)
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
     visible, chance = answer.visible_and_by_chance()
-    doubt_of_motion = answer.posterior.doubt_of_motion
-    is_estimated = best.hypothesis.whose is Whose.ESTIMATED
+    evidence = MatchEvidence(
+        len(matches), agreeing, log10_agreement(query, matches, agreeing), chance, visible,
+        sum(len(image.keypoints) for image in query.images),
+    )  # fmt: skip
+    pose = landmark_pose(
+        fit, data, query.landmarks, evidence, answer.correspondences, query.pixels(answer.correspondences),
+        _spread(query, answer.correspondences), answer.posterior.doubt_of_motion, CameraDoubt.of(answer.posterior),
+    )  # fmt: skip
+    calibration = fit.calibration if best.hypothesis.whose is Whose.ESTIMATED else best.taken
+    return replace(pose, calibration=calibration, intrinsics=best.hypothesis.camera, guided=answer)
+
+
+def landmark_pose(
+    fit: ReprojectionFit, data: ObservedPoints, landmarks: LandmarkMap, evidence: MatchEvidence,
+    correspondences: LandmarkMatches, pixels: Float[Tensor, "m 2"], spread: float,
+    doubt_of_motion: Float[Tensor, "6 6"], doubt: CameraDoubt,
+) -> LandmarkPose:  # fmt: skip
+    """Return a pose by landmarks with the given intrinsics; ``data`` are its correspondences without the camera's motion."""
+    T = fit.T_world_rig
     return LandmarkPose(
-        T_world_camera=fit.T_world_rig,
+        **vars(evidence),
+        T_world_camera=T,
         covariance=fit.covariance + doubt_of_motion + landmarks.pose_covariance,
         map_covariance=landmarks.pose_covariance,
         noise=fit.noise,
-        correspondences=answer.correspondences,
-        residuals=data.residuals(fit.T_world_rig),
-        normalized_residuals=data.normalized_residuals(fit.T_world_rig, fit.noise),
-        pixels=query.pixels(answer.correspondences),
-        matches=len(matches),
-        agreeing=agreeing,
-        log10_nfa=log10_agreement(query, matches, agreeing),
-        chance=chance,
-        visible=visible,
-        keypoints=sum(len(image.keypoints) for image in query.images),
+        correspondences=correspondences,
+        residuals=data.residuals(T),
+        normalized_residuals=data.normalized_residuals(T, fit.noise),
+        pixels=pixels,
+        spread=spread,
         noise_ratio=fit.noise / landmarks.noise,
-        spread=_spread(query, answer.correspondences),
-        distance=median_distance(data, fit.T_world_rig),
-        calibration=fit.calibration if is_estimated else best.taken,
-        intrinsics=best.hypothesis.camera,
+        distance=median_distance(data, T),
+        calibration=GIVEN,
         calibration_deviations=fit.calibration_deviations,
         motion=fit.motion,
         motion_covariance=fit.covariance_by_motion + doubt_of_motion,
-        doubt=CameraDoubt.of(answer.posterior),
-        depth_scale=depth_scale(data, fit.T_world_rig),
-        guided=answer,
+        doubt=doubt,
+        intrinsics=None,
+        depth_scale=depth_scale(data, T),
     )
 
 

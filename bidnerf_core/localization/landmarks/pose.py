@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import torch
 from jaxtyping import Float
@@ -58,8 +58,20 @@ class CameraDoubt:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class MatchEvidence:
+    """How many keypoints match landmarks at a pose, compared with chance."""
+
+    matches: int  # by descriptors alone, before there was a pose
+    agreeing: int  # inliers among these matches
+    log10_nfa: float  # logarithm of the number of false alarms of this agreement (Moisan and Stival 2004)
+    chance: float  # correspondences that guided matching would find at a wrong pose
+    visible: int  # landmarks that should be visible from the pose
+    keypoints: int  # in the images
+
+
 @dataclass(frozen=True, eq=False)
-class LandmarkPose:
+class LandmarkPose(MatchEvidence):
     """A pose by landmarks, its covariance, and the evidence for it."""
 
     T_world_camera: SE3  # of the last view, float64
@@ -74,13 +86,6 @@ class LandmarkPose:
         Tensor, "m 2"
     ]  # the same in standard deviations, including the landmarks' errors
     pixels: Float[Tensor, "m 2"]  # keypoints of the correspondences, in pixels of their images
-    matches: int  # by descriptors alone, before there was a pose
-    agreeing: int  # inliers among these matches
-    # log10 of the number of false alarms (Moisan and Stival 2004)
-    log10_nfa: float
-    chance: float  # correspondences that guided matching would find at a wrong pose
-    visible: int  # landmarks that should be visible from the pose
-    keypoints: int  # in the images
     spread: float  # 0 to 1: fraction of the image's cells that contain correspondences
     noise_ratio: float  # ratio of ``noise`` to that of the map's own images
     distance: float  # metres: median distance of the correspondences' landmarks
@@ -100,6 +105,11 @@ class LandmarkPose:
     guided: GuidedPose | None = (
         None  # state to which evidence about the camera can be added; None for tracked landmarks
     )
+
+    @property
+    def evidence(self) -> MatchEvidence:
+        """The evidence alone."""
+        return MatchEvidence(*(getattr(self, field.name) for field in fields(MatchEvidence)))
 
     @property
     def focal_factor(self) -> float:

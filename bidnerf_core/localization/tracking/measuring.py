@@ -19,7 +19,7 @@ from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_ve
 from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, refine_by_colour
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale
-from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose, MatchEvidence
 from bidnerf_core.localization.landmarks.query import pixel_threshold
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
@@ -36,10 +36,9 @@ from bidnerf_core.localization.tracking.points import (
     with_motion,
 )
 from bidnerf_core.localization.tracking.recognition import (
-    Evidence,
     LandmarkDetector,
     flow_evidence,
-    landmark_pose,
+    tracked_pose,
     well_spread,
 )
 from bidnerf_core.localization.tracking.state import TrackerState
@@ -131,10 +130,10 @@ class ByLandmarks:
         frame: Frame,
         points: FollowedPoints,
         found: PointFit,
-        evidence: Evidence,
+        evidence: MatchEvidence,
         doubt: CameraDoubt,
     ) -> tuple[LandmarkPose, Verdict]:
-        pose = landmark_pose(points, found, evidence, self.detector.landmarks, doubt, frame.intrinsics)
+        pose = tracked_pose(points, found, evidence, self.detector.landmarks, doubt, frame.intrinsics)
         # The precision is checked after fusion with depth and the prediction.
         return pose, landmark_verdict(pose, LandmarkThresholds(precision=math.inf))
 

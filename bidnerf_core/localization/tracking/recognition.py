@@ -21,8 +21,7 @@ from bidnerf_core.localization.landmarks.chance import log10_nfa
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.evidence import (
     cell_numbers,
-    depth_scale,
-    median_distance,
+    landmark_pose,
     probability_within,
     share_of_cells,
 )
@@ -33,7 +32,7 @@ from bidnerf_core.localization.landmarks.guided import (
     slopes_in_view,
 )
 from bidnerf_core.localization.landmarks.matching import EXHAUSTIVE, LandmarkMatcher, unguided_matches
-from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose, MatchEvidence
 from bidnerf_core.localization.landmarks.query import LandmarkQuery, pixel_threshold
 from bidnerf_core.localization.landmarks.refinement import RADII, matches_by_chance
 from bidnerf_core.localization.tracking.flow import Grey, corners
@@ -53,24 +52,12 @@ LEAST_CHANCE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """The evidence for a pose by landmarks; see ``LandmarkPose``."""
-
-    matches: int
-    agreeing: int
-    log10_nfa: float
-    chance: float
-    visible: int
-    keypoints: int
-
-
-@dataclass(frozen=True, eq=False)
 class Recognized:
     """Landmarks found in an image by their descriptors, and the pose that they determine."""
 
     points: FollowedPoints
     found: PointFit
-    evidence: Evidence
+    evidence: MatchEvidence
     doubt: CameraDoubt  # about the intrinsics
 
 
@@ -147,17 +134,17 @@ class LandmarkDetector:
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:EXHAUSTIVE].sort().values]
 
 
-def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float) -> Evidence:
+def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float) -> MatchEvidence:
     """Return the evidence from comparing the number of matches with that around shifted projections, which is due to chance."""
     agreeing, keypoints = int(found.inliers.sum()), len(query.images[0].keypoints)
     projections = projected_landmarks(query.images, query.landmarks, found.T_world_camera, GIVEN, radius)
     chance = matches_by_chance(projections, radius, query.max_distance)
     probability = min(0.5, max(LEAST_CHANCE, chance) / max(1, keypoints))
     nfa = log10_nfa(keypoints, agreeing, probability)
-    return Evidence(keypoints, agreeing, nfa, chance, sum(map(len, projections)), keypoints)
+    return MatchEvidence(keypoints, agreeing, nfa, chance, sum(map(len, projections)), keypoints)
 
 
-def flow_evidence(found: PointFit, camera: Intrinsics) -> Evidence:
+def flow_evidence(found: PointFit, camera: Intrinsics) -> MatchEvidence:
     """Return the evidence of landmarks tracked by optical flow from an earlier image.
 
     Each is one match, which would be anywhere in the image if the flow were wrong.
@@ -165,47 +152,20 @@ def flow_evidence(found: PointFit, camera: Intrinsics) -> Evidence:
     threshold, count = pixel_threshold(camera), len(found.inliers)
     agreeing = found.within(threshold)
     nfa = log10_nfa(count, agreeing, probability_within(threshold, camera))
-    return Evidence(count, agreeing, nfa, 0.0, count, count)
+    return MatchEvidence(count, agreeing, nfa, 0.0, count, count)
 
 
-def landmark_pose(
-    points: FollowedPoints,
-    found: PointFit,
-    evidence: Evidence,
-    landmarks: LandmarkMap,
-    doubt: CameraDoubt,
+def tracked_pose(
+    points: FollowedPoints, found: PointFit, evidence: MatchEvidence, landmarks: LandmarkMap, doubt: CameraDoubt,
     camera: Intrinsics,
-) -> LandmarkPose:
+) -> LandmarkPose:  # fmt: skip
     """Return a pose by landmarks in the form that ``landmark_verdict`` needs."""
-    fit, data, every = found.fit, found.still_data, torch.arange(len(points))
-    return LandmarkPose(
-        T_world_camera=fit.T_world_rig,
-        covariance=fit.covariance + found.doubt_of_motion + landmarks.pose_covariance,
-        map_covariance=landmarks.pose_covariance,
-        noise=fit.noise,
-        correspondences=LandmarkMatches(
-            torch.zeros_like(every), every, points.landmark, torch.zeros(len(every))
-        ),
-        residuals=data.residuals(fit.T_world_rig),
-        normalized_residuals=data.normalized_residuals(fit.T_world_rig, fit.noise),
-        pixels=points.pixels,
-        matches=evidence.matches,
-        agreeing=evidence.agreeing,
-        log10_nfa=evidence.log10_nfa,
-        chance=evidence.chance,
-        visible=evidence.visible,
-        keypoints=evidence.keypoints,
-        spread=share_of_cells(points.pixels[found.inliers], camera),
-        noise_ratio=fit.noise / landmarks.noise,
-        distance=median_distance(data, fit.T_world_rig),
-        calibration=GIVEN,
-        calibration_deviations=fit.calibration_deviations,
-        motion=fit.motion,
-        motion_covariance=fit.covariance_by_motion + found.doubt_of_motion,
-        doubt=doubt,
-        intrinsics=None,
-        depth_scale=depth_scale(data, fit.T_world_rig),
-    )
+    every = torch.arange(len(points))
+    matches = LandmarkMatches(torch.zeros_like(every), every, points.landmark, torch.zeros(len(every)))
+    return landmark_pose(
+        found.fit, found.still_data, landmarks, evidence, matches, points.pixels,
+        share_of_cells(points.pixels[found.inliers], camera), found.doubt_of_motion, doubt,
+    )  # fmt: skip
 
 
 def well_spread(pixels: Float[Tensor, "m 2"], camera: Intrinsics, most: int) -> Int[Tensor, "k"]:
