@@ -29,7 +29,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_verdict, surface_diagnostics
 from bidnerf_core.localization.by_landmarks import (
     SHARPEST,
-    corrected,
+    at_pose,
     fused_answer,
     localization_by_landmarks,
 )
@@ -303,7 +303,7 @@ def test_landmarks_keep_the_scale_that_they_give_a_depth_sensor() -> None:
     problem = rig(scene, [view], None)
     assert scene.surface is not None
     on_surface = []
-    for scaled in (problem, corrected(problem, found.found)):
+    for scaled in (problem, at_pose(problem, found.found)):
         cloud = PointCloud.measured(scaled.views, None, 1000, torch.Generator().manual_seed(0))
         on_surface.append(surface_diagnostics(finest_cost(scene.surface, cloud), found.T, 1.0).on_surface)
     assert on_surface[1] > on_surface[0] + 0.05

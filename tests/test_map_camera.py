@@ -188,10 +188,10 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
     assert other is not None
     shift = found.guided.posterior.shift(other)
     assert float(shift[:3].norm()) > 0.02
-    assert found.expected_shift > LandmarkThresholds().expected_shift
+    assert found.relative_shift > LandmarkThresholds().relative_shift
     # The covariance contains the pose with the other intrinsics.
     assert float(shift @ torch.linalg.solve(found.full_covariance, shift)) < 16.8
-    indifferent = LandmarkThresholds(expected_shift=1.0)
+    indifferent = LandmarkThresholds(relative_shift=1.0)
     assert landmark_verdict(found, indifferent).outcome is not Outcome.MISCALIBRATED
 
 

@@ -179,6 +179,8 @@ def folder_camera(
 def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intrinsics]) -> FoundCamera:
     """Return the camera from EXIF, or one of the ``assumed`` ones."""
     if exif.has_focal_length and assumed and exif.size and _is_cropped(raster, exif.size):
+        # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are ``assumed``
+        # cameras only where landmarks are matched.
         return _camera_of_crop(where, raster, exif, exif.size)
     assumable = None if exif.has_focal_length else _assumed(raster, assumed)
     return assumable or camera_from_exif(where, raster, exif)

@@ -136,7 +136,7 @@ class LandmarkThresholds:
     spread: float = 0.06  # minimum fraction of the image's cells that contain a correspondence
     # maximum expected shift of the position under other intrinsics (probability times shift), relative to the landmarks'
     # distance: the larger the possible error, the less probable it must be
-    expected_shift: float = 0.0025
+    relative_shift: float = 0.0025
     precision: float = 0.03  # maximum standard deviation of the position, relative to that distance
 
 
@@ -152,15 +152,17 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(Outcome.UNDETERMINED, f"{share}, all in {found.spread:.0%} of the image")
     if not bool(found.covariance.isfinite().all()):
         return Verdict(Outcome.UNDETERMINED, f"{share}, but they do not determine the pose")
-    if found.expected_shift > thresholds.expected_shift:
+    if found.relative_shift > thresholds.relative_shift:
         return Verdict(Outcome.MISCALIBRATED, f"{share}{_doubted(found)}")
     if found.better_camera is not None:
         return Verdict(
-            Outcome.MISCALIBRATED, f"{share}, but far more with {found.better_camera.compared(found.stated)}"
+            Outcome.MISCALIBRATED,
+            f"{share}, but far more with {found.better_camera.compared(found.given_or_assumed)}",
         )
     if found.calibration.is_stretched and not found.takes_map_camera:
         return Verdict(
-            Outcome.MISCALIBRATED, f"{share}, but only with {found.calibration.compared(found.stated)}"
+            Outcome.MISCALIBRATED,
+            f"{share}, but only with {found.calibration.compared(found.given_or_assumed)}",
         )
     deviation = position_deviation(found.stated_covariance + found.doubt.covariance)
     if not deviation <= thresholds.precision * found.distance:
@@ -173,7 +175,7 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     if found.takes_map_camera or found.estimates_calibration:
         whose = "the map's" if found.takes_map_camera else "estimated"
         with_others = f", with {whose} intrinsics" + (
-            f": {found.calibration.compared(found.stated)}" if found.changes_camera else ""
+            f": {found.calibration.compared(found.given_or_assumed)}" if found.changes_camera else ""
         )
     moving = ", with the motion of a rolling shutter" if found.has_motion else ""
     return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{moving}{with_others}")
@@ -183,14 +185,14 @@ def _doubted(found: LandmarkPose) -> str:
     """Return the part of the reason that explains why other intrinsics may be right."""
     taken = " with the map's intrinsics" if found.takes_map_camera else ""
     taken = " with estimated intrinsics" if found.estimates_calibration else taken
-    with_taken = f"{taken} ({found.calibration.compared(found.stated)})" if taken else ""
+    with_taken = f"{taken} ({found.calibration.compared(found.given_or_assumed)})" if taken else ""
     if not found.doubt.other_is_known:
-        return f"{with_taken}, but they suggest {found.doubt.other.compared(found.stated)}"
+        return f"{with_taken}, but they suggest {found.doubt.other.compared(found.given_or_assumed)}"
     if found.estimates_calibration:
-        return f"{with_taken}, but they do not show whether the {found.stated} ones are right"
+        return f"{with_taken}, but they do not show whether the {found.given_or_assumed} ones are right"
     other = found.calibration if found.takes_map_camera else found.doubt.other
-    choice = f"the {found.stated} intrinsics or those of the map's images"
-    return f", but they do not show whether {choice} are right: {other.compared(found.stated)}"
+    choice = f"the {found.given_or_assumed} intrinsics or those of the map's images"
+    return f", but they do not show whether {choice} are right: {other.compared(found.given_or_assumed)}"
 
 
 def is_blank(frame: Frame) -> bool:

@@ -23,7 +23,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.depth_scale import corrected
+from bidnerf_core.localization.depth_scale import at_pose
 from bidnerf_core.localization.landmarks.chance import CONVINCING, DECISIVE, log_odds_of_share, probability_of
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
 from bidnerf_core.localization.landmarks.correspondences import query_images
@@ -77,7 +77,7 @@ def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed
     ``found`` is the pose by the landmarks that match there, if any. The start of ``problem`` is prior knowledge. If these do not
     decide, renderings of both explanations are compared, unless ``rays`` is 0.
     """
-    here = replace(problem if found is None else corrected(problem, found), start=T)
+    here = replace(problem if found is None else at_pose(problem, found), start=T)
     for other in _alternatives(problem, here, found, seed):
         odds = other.log_odds
         there = other.problem() if rays and abs(odds) < DECISIVE else None
@@ -149,7 +149,7 @@ def _mirror(problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: 
 
     def mirrored() -> Problem | None:
         found = propose(matcher, [view], seed=seed)
-        return None if found is None else corrected(replace(problem, views=(view,)), found)
+        return None if found is None else at_pose(replace(problem, views=(view,)), found)
 
     # A few chance matches of the mirror image are no evidence against an image with even fewer.
     odds = log_odds_of_share(mirror_nfa / min(log10_nfa, CONVINCING))

@@ -129,7 +129,7 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
         found = without_the_imprecise(found, typical)
     if matcher is None:
-        return _Proposal(found if problem.matcher is not None else _without_landmarks(found))
+        return _Proposal(found if problem.matcher is not None else _with_hint_at_landmarks(found))
     proposal = _compared_with_landmarks(found, problem, matcher, config, seed, began)
     is_unsure = answer is not None and answer.verdict.outcome in (Outcome.IMPRECISE, Outcome.UNCERTAIN)
     if by_landmarks is not None and is_unsure and proposal.found.outcome is Outcome.TOO_FEW_MATCHES:
@@ -137,7 +137,7 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
     return proposal
 
 
-def _without_landmarks(found: Localization) -> Localization:
+def _with_hint_at_landmarks(found: Localization) -> Localization:
     """Add a hint to a rejected answer that the map has no landmarks, if they might have given a pose."""
     if found.converged or found.outcome is Outcome.UNDETERMINED:
         return found

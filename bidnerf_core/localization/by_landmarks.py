@@ -22,7 +22,7 @@ from bidnerf_core.localization.alternatives import decide, log_odds_by_rendering
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.covariance import finest_cost, position_deviation
-from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints, corrected
+from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints, at_pose
 from bidnerf_core.localization.fusion import (
     FusedPose,
     Measurements,
@@ -115,13 +115,13 @@ def answer_by_landmarks(
 
 def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> LandmarkPose:
     """Add evidence from renderings to a pose if landmarks do not decide which intrinsics are right."""
-    if found.guided is None or found.expected_shift <= LandmarkThresholds().expected_shift:
+    if found.guided is None or found.relative_shift <= LandmarkThresholds().relative_shift:
         return found
     posterior = found.guided.posterior
     other = posterior.riskiest
     if other is None:
         return found
-    here = corrected(problem, found)
+    here = at_pose(problem, found)
     views = tuple(
         replace(view, frame=replace(view.frame, intrinsics=other.intrinsics(given.frame.intrinsics)))
         for view, given in zip(here.views, problem.views, strict=True)
@@ -149,7 +149,7 @@ def fused_answer(
             answer = replace(answer, left_out="depth, which needs known intrinsics")
         # Rendering would need intrinsics as exact as the landmarks' too.
         return replace(answer, verdict=judged(verdict, diagnostics))
-    problem = corrected(problem, found)
+    problem = at_pose(problem, found)
     points = None
     if problem.surface is not None and problem.has_depth:
         points = _cost_of_points(problem, problem.surface, Generator().manual_seed(seed))

@@ -60,7 +60,7 @@ class DepthScale:
         return 1 + weight * (self.by_landmarks - 1)
 
 
-def corrected(problem: Problem, found: LandmarkPose) -> Problem:
+def at_pose(problem: Problem, found: LandmarkPose) -> Problem:
     """Return the problem with a pose as its start, the pose's intrinsics and motion, and depth corrected to the map's scale."""
     scale, views = DepthScale.of(found, problem.sensor).estimate, []
     for view in problem.views:

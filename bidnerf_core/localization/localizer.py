@@ -67,7 +67,7 @@ class Localizer:
         self.scene: SceneMap = scene if device is None else on_device(scene, device)
         self._method = find_method(method)
         self.config = _checked_config(self._method, method, config, preset)
-        self.shared = self._method.shared(self.config)
+        self.shared = self._method.shared(self.config)  # the settings that matter outside of the method
         landmarks = self.scene.landmarks if self._method.uses_landmarks else None
         self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
         if warm_up:

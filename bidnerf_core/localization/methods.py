@@ -23,12 +23,8 @@ class SharedSettings:
     matches_landmarks: bool = True  # whether images are matched with the map's landmarks
     depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
     by_colour: ByColourConfig = ByColourConfig()  # how a tracker refines poses by colour alone
-    rays: int = (
-        0  # number of rays that may be rendered to compare explanations of an image; 0: nothing is rendered
-    )
-    risk: float | None = (
-        None  # tolerated fraction of wrong answers among the accepted ones; None: the usual acceptance
-    )
+    rays: int = 0  # number of rays that may be rendered to compare explanations of an image
+    risk: float | None = None  # tolerated fraction of wrong answers among the accepted ones
 
 
 @dataclass(frozen=True)
@@ -42,9 +38,8 @@ class Method:
     uses_depth: bool = True  # whether it uses measured depth
     presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
-    shared: Callable[[Any], SharedSettings] = lambda config: (
-        SharedSettings()
-    )  # its settings that matter elsewhere too
+    # returns those of its settings that matter elsewhere too
+    shared: Callable[[Any], SharedSettings] = lambda config: SharedSettings()
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:

@@ -58,9 +58,7 @@ class Verdict:
 
     outcome: Outcome
     reason: str
-    confidence: float | None = (
-        None  # None if unknown, or if it ignores the reason for which the pose is rejected
-    )
+    confidence: float | None = None  # None if unknown, or if it ignores the reason of a rejection
 
     @property
     def accepted(self) -> bool:

@@ -143,8 +143,8 @@ def _of_landmarks(said: LandmarkDiagnostics, pose: LandmarkPose | None) -> Itera
     )  # fmt: skip
     if pose is not None:
         yield _most(
-            "shift by a wrong camera", pose.expected_shift, bounds.expected_shift, f"{pose.expected_shift:.2%}",
-            f"{bounds.expected_shift:.2%}", "how far doubts about the camera move the position, as a share of that distance",
+            "shift by a wrong camera", pose.relative_shift, bounds.relative_shift, f"{pose.relative_shift:.2%}",
+            f"{bounds.relative_shift:.2%}", "how far doubts about the camera move the position, as a share of that distance",
         )  # fmt: skip
     yield Figure(
         "reprojection errors", f"{said.noise_ratio:.1f} times", "", None, None,

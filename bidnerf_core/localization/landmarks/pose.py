@@ -12,8 +12,8 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
+from bidnerf_core.localization.landmarks.guided_pose import GuidedPose
 from bidnerf_core.localization.landmarks.hypotheses import Posterior, Whose
-from bidnerf_core.localization.landmarks.refinement import GuidedPose
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration
 
 ESTIMATED_INFLATION = 3.0
@@ -123,7 +123,7 @@ class LandmarkPose(MatchEvidence):
         return None if self.calibration == GIVEN else self.calibration.applied(given)
 
     @property
-    def stated(self) -> str:
+    def given_or_assumed(self) -> str:
         """How the query's intrinsics are known: "given", or "assumed" if their focal length is approximate."""
         return "given" if self.guided is None or self.guided.query.prior == FIXED else "assumed"
 
@@ -158,7 +158,7 @@ class LandmarkPose(MatchEvidence):
         return (ESTIMATED_INFLATION if self.estimates_calibration else 1.0) * self.covariance
 
     @property
-    def expected_shift(self) -> float:
+    def relative_shift(self) -> float:
         """Expected shift of the position under other intrinsics, as a fraction of the landmarks' distance."""
         return self.doubt.expected_shift / self.distance
 

@@ -15,15 +15,15 @@ from bidnerf_core.localization.landmarks.consensus import Candidate, focal_conse
 from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches, query_images
 from bidnerf_core.localization.landmarks.evidence import described, log10_agreement
 from bidnerf_core.localization.landmarks.far_cameras import better_camera, with_far_camera
-from bidnerf_core.localization.landmarks.matching import STRONGEST, LandmarkMatcher, unguided_matches
-from bidnerf_core.localization.landmarks.pose import LandmarkPose
-from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.localization.landmarks.refinement import (
+from bidnerf_core.localization.landmarks.guided_pose import (
     agreeing_with,
     confirmed,
     refined_pose,
     visible_and_matching,
 )
+from bidnerf_core.localization.landmarks.matching import STRONGEST, LandmarkMatcher, unguided_matches
+from bidnerf_core.localization.landmarks.pose import LandmarkPose
+from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.localization.landmarks.twins import second_of_plane, twin_of
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior

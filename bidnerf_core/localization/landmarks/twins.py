@@ -20,10 +20,10 @@ from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_sha
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
 from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.evidence import described
+from bidnerf_core.localization.landmarks.guided_pose import RADII, confirmed
 from bidnerf_core.localization.landmarks.matching import LOOKED_UP, LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.localization.landmarks.refinement import RADII, confirmed
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_likelihood_ratio, resect

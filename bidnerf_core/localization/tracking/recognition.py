@@ -31,10 +31,10 @@ from bidnerf_core.localization.landmarks.guided import (
     projected_landmarks,
     slopes_in_view,
 )
+from bidnerf_core.localization.landmarks.guided_pose import RADII, matches_by_chance
 from bidnerf_core.localization.landmarks.matching import EXHAUSTIVE, LandmarkMatcher, unguided_matches
 from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose, MatchEvidence
 from bidnerf_core.localization.landmarks.query import LandmarkQuery, pixel_threshold
-from bidnerf_core.localization.landmarks.refinement import RADII, matches_by_chance
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
