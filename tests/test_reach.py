@@ -172,7 +172,7 @@ def test_a_preset_can_be_changed_and_is_checked() -> None:
         METHODS["auto"].settings("paper")
     world = FieldMap(FIELD, BOX)
     assert Localizer(world, "bid", preset="paper", warm_up=False).config == METHODS["bid"].settings("paper")
-    with pytest.raises(InputError, match="and a config; give one"):
+    with pytest.raises(InputError, match="preset 'paper' and a BidConfig, expected one"):
         Localizer(world, "bid", METHODS["bid"].settings(), preset="paper")
 
 
