@@ -142,7 +142,10 @@ def list_plugins(group: str) -> list[PluginInfo]:
 
 
 def plugin_names(group: str, first: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names in a group: ``first``, then the other bundled ones, then the others, each sorted."""
+    """Return the names of a group's plugins: those in ``first``, in that order, then the remaining bundled ones, then all others.
+
+    The last two parts are sorted alphabetically. Names in ``first`` that no plugin has are omitted.
+    """
     _check_group(group)
     known = {info.name: info.is_bundled for info in _declared(group) if info.name != UNREADABLE}
     known |= {name: known.get(name, False) for of, name in list(registered) if of == group}

@@ -44,8 +44,9 @@ def colmap_parameters(model: str) -> int:
 
 
 def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Camera:
-    """Build a camera from one of ``MODELS`` and its parameters. Raises ``InputError``, whose message begins
-    with ``where``.
+    """Build a camera from its COLMAP model (one of ``MODELS``), its size (pixels) and its parameters in COLMAP's order.
+
+    Raises ``InputError`` if the number of parameters is wrong or a value is invalid; the message begins with ``where``.
     """
     if len(parameters) != colmap_parameters(model):
         raise InputError(

@@ -23,12 +23,12 @@ def open_images(
     background: Background | None = None,
     depth_unit: float | None = None,
 ) -> FileSequence:
-    """Return the images of a folder, by time if all names are times (``12.345.png``), else in natural name
-    order.
+    """Return the images of a folder, ordered by timestamp if every name is one (``12.345.png``), else in natural name order.
 
-    ``NAME.depth.png`` next to ``NAME.png`` is its depth, as written by ``bidnerf render``, in units of
-    ``depth_unit`` (by default millimetres). Images have the given camera, or the one in their EXIF, as in
-    ``Frame.open``; depth is registered from ``sensor``, if given. Raises ``InputError`` if there is no image.
+    The depth of ``NAME.png``, if any, is ``NAME.depth.png``, as written by ``bidnerf render``, in steps of ``depth_unit``
+    metres (default 0.001). The camera of an image is ``camera`` or, failing that, comes from its EXIF data, as in
+    ``Frame.open``. If ``sensor`` is given, depth is registered from that camera to the image. Images with an alpha channel
+    are composited over ``background`` (default black). Raises ``InputError`` if the folder contains no images.
     """
     photos, _ = photos_in(folder)
     if not photos:

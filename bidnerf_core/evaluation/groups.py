@@ -77,7 +77,10 @@ class Group:
 
 
 def grouped(results: Sequence[TrialResult]) -> list[Group]:
-    """Return all groups in order of appearance; groups that pool all sizes come after those of single sizes."""
+    """Group trial results by situation and condition, and add a pooled group for each condition tried at several sizes.
+
+    Groups are sorted as in ``sorted_by_situation``.
+    """
     found: dict[tuple[Situation, Condition], list[TrialResult]] = {}
     for result in results:
         found.setdefault((situation_of(result), condition_of(result)), []).append(result)

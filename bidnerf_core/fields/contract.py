@@ -125,7 +125,7 @@ class Splats:
 
 @runtime_checkable
 class SplatField(Protocol):
-    """Optional part of a field that consists of pieces, which viewers show."""
+    """Optional part of the interface, for fields made of discrete primitives (splats, triangles, discs) that viewers can draw."""
 
     def splats(self) -> Splats:
         """Return all pieces, in any order."""

@@ -38,7 +38,7 @@ class RaySpacing:
     radius: float  # metres: half the side of the uncontracted cube; infinite without contraction
 
     def rows(self, numbers: Int[Tensor, "m"]) -> RaySpacing:
-        """Return the spacing of the rays with these indices, for rays (r) along one axis."""
+        """Return the spacing of the rays with these indices. ``exit`` must have a single dimension, (r,)."""
         return RaySpacing(self.exit.index_select(0, numbers), self.radius)
 
     def place(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:

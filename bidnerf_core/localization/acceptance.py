@@ -127,7 +127,10 @@ def landmark_diagnostics(
 
 @dataclass(frozen=True)
 class LandmarkThresholds:
-    """Thresholds for accepting a pose by landmarks. They are dimensionless, so they suit every scene and image."""
+    """Thresholds for accepting a pose estimated from landmarks.
+
+    All are dimensionless, so they apply to any scene and image size.
+    """
 
     log10_nfa: float = -12.0  # maximum logarithm of the number of false alarms
     # minimum number of correspondences within three standard deviations; proportionally more if intrinsics are estimated

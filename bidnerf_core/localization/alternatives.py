@@ -72,10 +72,11 @@ class Decision:
 
 
 def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed: int) -> Decision:
-    """Decide between the pose ``T`` of a problem and all alternative explanations.
+    """Decide whether to keep the pose ``T`` (T_world_K, see ``Problem``) or reject it in favour of an alternative explanation.
 
-    ``found`` is the pose by the landmarks that match there, if any. The start of ``problem`` is prior knowledge. If these do not
-    decide, renderings of both explanations are compared, unless ``rays`` is 0.
+    ``found`` is the pose estimated from landmarks, or None. The log odds of each alternative come first from the numbers of
+    landmark inliers and from ``problem.start``, which serves as a prior. If they are inconclusive, renderings at both poses
+    are compared, unless ``rays`` is 0.
     """
     here = replace(problem if found is None else at_pose(problem, found), start=T)
     for other in _alternatives(problem, here, found, seed):

@@ -55,7 +55,10 @@ class Answer:
         frame: Frame, number: int, found: Localization, *, truth: SE3 | None = None, time: float | None = None,
         file: Path | None = None,
     ) -> Answer:  # fmt: skip
-        """Build the answer for a frame, without the intermediate poses, which take much memory in long sequences."""
+        """Build the answer for a frame.
+
+        Only the final pose is kept: intermediate ones take up a lot of memory in long sequences.
+        """
         intrinsics = found.frame_as_taken(frame).intrinsics
         found = replace(found, poses=found.poses[-1:])
         return Answer(frame.name, number, intrinsics, found, truth, time, file)

@@ -90,7 +90,10 @@ class WorkerProcess:
         return self._reader.at_eof() or self._writer.is_closing()
 
     async def ask(self, job: Job) -> dict[str, Any]:
-        """Return a worker's answer. Raises ``EOFError`` or ``OSError`` if the worker ends before answering."""
+        """Send a job to the worker and return its answer.
+
+        Raises ``EOFError`` or ``OSError`` if the worker exits before answering.
+        """
         for part in wire.packed(job.head, job.blocks):
             self._writer.write(part)
             await self._writer.drain()

@@ -59,7 +59,10 @@ class LandmarkMatcher:
 
     @property
     def features(self) -> Features:
-        """The detector of the landmarks. Raises ``PluginError`` (an ``InputError``) if it is not installed."""
+        """The keypoint detector and descriptor that the landmarks were built with.
+
+        Raises ``PluginError`` (an ``InputError``) if its plugin is not installed.
+        """
         return self._found_once or find_features(
             self.landmarks.features, "the detector of the map's landmarks"
         )

@@ -74,8 +74,8 @@ class LandmarkMap:
     def to(self, device: torch.device | str) -> LandmarkMap:
         """Return the landmarks on another device; ``self`` if they are already there.
 
-        Only descriptor matching runs there. Keypoint detection, RANSAC and resection run on the CPU, by OpenCV, poselib and
-        scipy, for which ``LandmarkMatcher`` keeps a copy of the other tensors.
+        Only descriptor matching runs on that device. Keypoint detection, RANSAC and resection run on the CPU (OpenCV, poselib,
+        scipy), so ``LandmarkMatcher`` also keeps the landmarks in CPU memory.
         """
         return moved(self, working_device(device))
 

@@ -139,10 +139,14 @@ def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
 
 
 def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
-    """Join matches (image, image, keypoints) into tracks and return the track of each keypoint, numbered across all images.
+    """Link pairwise matches into tracks and return the track label of each keypoint.
 
-    The least ambiguous matches are joined first. A match that would put two keypoints of one image into the same track is
-    dropped, because a single wrong match would spoil two good tracks. ``sizes`` are the numbers of keypoints per image.
+    ``matches`` holds, for each matched pair, the indices of its two images and the matches between their keypoints; ``sizes``
+    holds the number of keypoints in each image. The m keypoints of all images are concatenated in image order. Labels are
+    indices of keypoints, hence not consecutive; an unmatched keypoint is a track of its own.
+
+    Matches are linked in order of increasing ambiguity. One that would put two keypoints of the same image into one track is
+    dropped, because a single wrong match would otherwise merge two correct tracks.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
     ends = np.concatenate(

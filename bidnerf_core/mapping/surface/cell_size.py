@@ -66,7 +66,11 @@ def depth_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
 
 
 def comparison_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return ``depth_noise`` for the comparison in ``agreed``, with the nearest pixels of subsampled images."""
+    """Return the standard deviation (metres) of the depth differences on which ``agreed`` sets its tolerance, per image.
+
+    Like ``depth_noise``, but depth is read from the nearest pixel instead of interpolated, as ``agreed`` does, so the result
+    includes the discretization error of the subsampled images.
+    """
     return _spread(images, opacity, PosedDepthImage.beyond)
 
 
