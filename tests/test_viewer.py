@@ -345,10 +345,13 @@ def test_view_saves_a_page_of_photos(bidnerf: Run, tmp_path: Path) -> None:
     assert answer["accepted"], answer["reason"]
     assert bidnerf("view", folder, photo, "--save", tmp_path / "page.txt").status != 0
     assert bidnerf("view", folder, photo, "--save", photo).status != 0
-    assert (
-        bidnerf("view", folder, tmp_path / "none.png", "--save", page).status == 0
-    )  # the page says what is wrong
-    (answer,) = viewed.state_of(page.read_text())["answers"]
+    nothing = bidnerf("view", folder, tmp_path / "none.png", "--save", page)
+    assert nothing.status == 1
+    assert "none.png" in nothing.err
+    some = bidnerf("view", folder, photo, tmp_path / "none.png", "--save", page)
+    assert some.status == 0
+    assert "none.png" in some.err
+    (_, answer) = viewed.state_of(page.read_text())["answers"]  # the page says what is wrong, too
     assert not answer["accepted"]
     assert "none.png" in answer["reason"]
 

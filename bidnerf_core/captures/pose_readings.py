@@ -79,7 +79,6 @@ def _of_inverses() -> Iterator[Reading]:
         )  # fmt: skip
 
 
-ROTATIONS = {"R": "their rotations", "R^T": "the transposes of their rotations"}
 PARTS = (
     ("R^T", "", 1, "their rotations are transposed, while their positions are right", "transpose the upper left 3x3 of each"),
     ("R", "", -1, "their positions are negated", "multiply the first three numbers of the fourth column of each by -1"),

@@ -38,6 +38,7 @@ from bidnerf_core.localization import Localizer, Tracker, TrackerConfig, setting
 from bidnerf_core.localization.methods import USUAL_METHOD
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results import tracked_path as library
+from bidnerf_core.results.answers import BAD_INPUT
 from bidnerf_core.results.plot_style import require_matplotlib
 from bidnerf_core.results.pose_files import read_pose
 from bidnerf_core.results.tracked_path import TrackedPath, opened_for
@@ -228,7 +229,7 @@ def _follow(
             print_json(path.plain(answer))
         except InputError as error:
             print_json(
-                {"frame": _name_of(request), "converged": False, "outcome": "bad input", "reason": str(error)}
+                {"frame": _name_of(request), "converged": False, "outcome": BAD_INPUT, "reason": str(error)}
             )
         sys.stdout.flush()
 

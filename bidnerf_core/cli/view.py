@@ -18,6 +18,7 @@ from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
 from bidnerf_core.datasets.dataset import in_other_split
 from bidnerf_core.datasets.queries import DatasetFrames, Query, QuerySource
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
+from bidnerf_core.results.answers import BAD_INPUT
 from bidnerf_core.viewer import server
 
 if TYPE_CHECKING:
@@ -96,6 +97,11 @@ def view(
         source = Chosen(source, places_of(source.names, names, most if save else len(source.names), splits))
     if save is not None:
         answers = () if source is None else _localized(localizer, source)
+        unread = [answer for answer in answers if answer.outcome == BAD_INPUT]
+        if unread and len(unread) == len(answers):
+            raise InputError(unread[0].reason)
+        for answer in unread:
+            say(f"{answer.name}: {answer.reason}")
         with console.status("drawing the map"):
             page_of(scene, answers, path, rows).save(save)
         show(f"look at {save}")

@@ -26,11 +26,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.progress import check_stopped
 
 PICTURE_CONTRAST = 0.12
-"""Difference of neighbours (of colours and opacity; of distances, as a share) beyond which pictures are rendered pixel by pixel.
-
-Nine pictures of a desk, a corridor and Lego, 320 pixels wide, had a PSNR of 45 to 52 dB to the whole image, and took 0.6, 0.5 and
-0.9 of its time (medians).
-"""
+"""Difference of neighbours (of colours and opacity; of distances, as a share) beyond which pictures are rendered pixel by pixel."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -174,7 +174,10 @@ def _compared_with_landmarks(
     seed: int,
     began: float,
 ) -> _Proposal:
-    """Refine a pose found on the surface by the landmarks that match there, or reject it if too few of the visible ones match."""
+    """Refine a pose found on the surface by the landmarks that match there, or reject it if too few of the visible ones match.
+
+    Landmarks whose own pose is not accepted only confirm an accepted pose, and do not move it.
+    """
     near = confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True)
     if near.pose is not None and (record := current_record()) is not None:
         record.landmarks.append(near.pose)

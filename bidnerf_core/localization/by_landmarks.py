@@ -195,7 +195,7 @@ def _fused(
     if not float(measurements.prior(fused.T[None]).cost[0]) <= CONTRADICTORY:
         other = fused_pose(measurements.without_landmarks(fused.T), STEPS, fused) if rays else None
         if other is not None and _is_likelier(problem, other.T, answer, seed):
-            return _elsewhere(problem, answer, other, names)
+            return _elsewhere(answer, other, names)
         without = replace(answer, left_out=f"{names[0]}, which contradicts the landmarks")
         rest = rays if points is not None else 0
         return _fused(problem.without_depth(), without, None, rest, seed)
@@ -246,9 +246,7 @@ def _is_likelier(problem: Problem, T: SE3, answer: LandmarkAnswer, seed: int) ->
     return odds > log_odds_of(sure)
 
 
-def _elsewhere(
-    problem: Problem, answer: LandmarkAnswer, other: FusedPose, names: tuple[str, ...]
-) -> LandmarkAnswer:
+def _elsewhere(answer: LandmarkAnswer, other: FusedPose, names: tuple[str, ...]) -> LandmarkAnswer:
     """Return the answer at the pose of the other measurements, which contradict the landmarks."""
     verdict = Verdict(Outcome.UNCERTAIN, f"{enumeration(names)} contradict the landmarks")
     covariance = other.covariance + answer.found.shared_covariance

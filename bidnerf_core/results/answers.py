@@ -37,6 +37,9 @@ RECOGNISED = {
 SEVERAL = 3
 """Minimum number of images, all of them rejected, at which the user is asked whether the map is the right one."""
 
+BAD_INPUT = "bad input"
+"""Outcome of an image that could not be read."""
+
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -105,7 +108,7 @@ class Failure:
     def plain(self, backend: str, unit: LengthUnit = "units") -> dict[str, Any]:
         """Return an object with the keys of ``Answer.plain``, whose outcome is "bad input"."""
         return {
-            "frame": self.name, "T_world_camera": None, "converged": False, "outcome": "bad input",
+            "frame": self.name, "T_world_camera": None, "converged": False, "outcome": BAD_INPUT,
             "reason": self.reason, "steps": 0, "seconds": 0.0, "covariance": None, "loss": None, "method": self.method,
             "focal_factor": 1.0, "intrinsics": None, "confidence": None, "unit": unit, "backend": backend, "error": None,
         }  # fmt: skip

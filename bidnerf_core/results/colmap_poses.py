@@ -21,8 +21,6 @@ from bidnerf_core.io.files import write_file
 from bidnerf_core.results.pose_files import PosedImage, as_stored, frame_of, require_finite
 
 HEAD = "# written by bidnerf"
-RADIAL_TERMS = 4
-"""Coefficients k1 k2 p1 p2 of COLMAP's model OPENCV; FULL_OPENCV has k3 to k6 as well."""
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:

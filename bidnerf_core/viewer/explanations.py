@@ -127,7 +127,7 @@ def _against(found: Localization, other: ComparedExplanation) -> Contest:
     return Contest(question, (ShownExplanation(HERE, p), rival), KEPT if keeps else other.reason)
 
 
-def _of_camera(posterior: Posterior, earlier: str) -> Contest:
+def _of_camera(posterior: Posterior, place: str) -> Contest:
     answers = sorted(
         (
             ShownExplanation(_name(each), p)
@@ -136,7 +136,7 @@ def _of_camera(posterior: Posterior, earlier: str) -> Contest:
         ),
         key=lambda shown: -shown.probability,
     )
-    remark = f"Weighed at {earlier}." if earlier else ""
+    remark = f"Weighed at {place}." if place else ""
     return Contest("Whose camera took it?", tuple(answers), remark, of_pose=False)
 
 

@@ -15,6 +15,7 @@ from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import Localizer
 from bidnerf_core.localization.recording import SearchRecord
 from bidnerf_core.progress import stopped_by
+from bidnerf_core.results.answers import BAD_INPUT
 from bidnerf_core.viewer.answer import ShownAnswer
 from bidnerf_core.viewer.view import localized
 
@@ -96,7 +97,7 @@ class Jobs:
         except Cancelled:
             job.answer = ShownAnswer(job.name, "stopped", False, "the viewer was closed")
         except InputError as error:
-            job.answer = ShownAnswer(job.name, "bad input", False, str(error))
+            job.answer = ShownAnswer(job.name, BAD_INPUT, False, str(error))
         except Exception as error:  # third-party code may raise anything, which the page has to report
             job.answer = ShownAnswer(job.name, "fault", False, f"{type(error).__name__}: {error}")
             raise

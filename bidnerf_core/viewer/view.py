@@ -14,6 +14,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localization, Localizer
 from bidnerf_core.localization.recording import SearchRecord, recorded
 from bidnerf_core.maps.map import Map
+from bidnerf_core.results.answers import BAD_INPUT
 from bidnerf_core.viewer.answer import PICTURE_SIDE, ShownAnswer, shown_answer
 from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.saving import page_html, save_page
@@ -97,7 +98,7 @@ def localized(
                 begun(record)
             found = localizer(query.views, depth_rays=query.depth_rays)
     except InputError as error:
-        return ShownAnswer(query.name, "bad input", False, str(error))
+        return ShownAnswer(query.name, BAD_INPUT, False, str(error))
     if found_pose is not None:
         found_pose(
             shown_answer(
@@ -112,7 +113,7 @@ def read_and_localized(localizer: Localizer, source: QuerySource, place: int) ->
     try:
         query = source.read(place)
     except InputError as error:
-        return ShownAnswer(source.names[place], "bad input", False, str(error))
+        return ShownAnswer(source.names[place], BAD_INPUT, False, str(error))
     return localized(localizer, query)
 
 

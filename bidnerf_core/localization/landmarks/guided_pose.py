@@ -111,9 +111,8 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
         start = best.calibration if best.hypothesis.whose is Whose.ESTIMATED else GIVEN
         T = pose.posterior.pose(best)
         inliers = pose.matches[agreeing_with(seen, pose.matches, T, start)]
-        if len(inliers) <= len(
-            pose.correspondences
-        ):  # otherwise, the new camera differs much from the previous one
+        # More agree with it by descriptors only if the new camera differs much from the previous one.
+        if len(inliers) <= len(pose.correspondences):
             inliers = pose.correspondences
         data, correlation = seen.observed(inliers), _correlation(seen, inliers)
         fit = resect(data, T, pose.posterior.noise, prior, start, correlation, motion)

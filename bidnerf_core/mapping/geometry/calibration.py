@@ -57,7 +57,7 @@ class Calibration:
         shift = torch.tensor([self.shift_u, self.shift_v], dtype=flat.dtype)
         return (bent * self.across_and_down.to(flat.dtype) + shift) * focal
 
-    def undistorted(self, image: Float[Tensor, "m 2"], focal: Float[Tensor, "m"]) -> Float[Tensor, "m 2"]:
+    def undistorted(self, image: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
         """Convert observations on the plane z = 1 from the given intrinsics to the corrected ones."""
         shift = torch.tensor([self.shift_u, self.shift_v], dtype=image.dtype)
         seen = (image - shift) / self.across_and_down.to(image.dtype)

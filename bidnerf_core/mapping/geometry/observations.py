@@ -38,7 +38,7 @@ class ObservedPoints:
 
     def corrected(self, calibration: Calibration) -> ObservedPoints:
         """Return the observations with the cameras' calibration corrected."""
-        undistorted = calibration.undistorted(self.image, self.focal)
+        undistorted = calibration.undistorted(self.image)
         return replace(self, image=undistorted, focal=self.focal * calibration.focal_factor)
 
     def without_motion(self, T_world_rig: SE3, motion: Float[Tensor, "6"]) -> ObservedPoints:

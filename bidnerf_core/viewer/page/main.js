@@ -57,7 +57,7 @@ class Page {
     const outcomes = new Map(this.answers.filter((a) => a.meaning).map((a) => [a.outcome, a.meaning]));
     const methods = new Map(this.answers.filter((a) => a.method_summary).map((a) => [`method ${a.method}`, a.method_summary]));
     const rows = (pairs, made) => pairs.flatMap(([name, what]) => [element("dt", {}, made(name)), element("dd", {}, ...withCode(what))]);
-    find("words").replaceChildren(...rows([...outcomes, ...methods, ...WORDS.filter(([, , use]) => any(use))], (name) => name));
+    find("words").replaceChildren(...rows([...outcomes, ...methods, ...WORDS.filter(([, , use]) => use.length === 0 || any(use))], (name) => name));
     find("keys").replaceChildren(...rows(keys.filter(([use]) => use).map(([, key, what]) => [key, what]), (key) => element("kbd", {}, key)));
   }
 

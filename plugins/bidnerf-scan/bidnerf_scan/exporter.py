@@ -26,6 +26,7 @@ T_WORLD_FILE = "T_world_file.json"
 def export_ply(scene: Map, out: Path) -> list[Path]:
     """The surface as a coloured mesh in PLY, in the frame of the map."""
     mesh, file = _mesh(scene), out / "mesh.ply"
+    _remove_others(out)
     columns = {"x y z": mesh.points, "nx ny nz": mesh.normals, "red green blue": mesh.rgb}
     tensors = {names: torch.from_numpy(column) for names, column in columns.items()}
     write_file(file, ply(tensors, head(scene, [], _content(mesh)), mesh.faces))
@@ -50,6 +51,12 @@ def _mesh(scene: Map) -> Mesh:
     return mesh_of_surface(scene.surface)
 
 
+def _remove_others(out: Path) -> None:
+    """Remove earlier meshes from the folder, since the cameras beside a mesh are turned as it is."""
+    for name in ("mesh.ply", "mesh.glb", "mesh.obj", T_WORLD_FILE):
+        (out / name).unlink(missing_ok=True)
+
+
 def _content(mesh: Mesh) -> str:
     return f"{amount(len(mesh.faces), 'triangle')}, on a grid with cells of {mesh.cell:.3g}"
 
@@ -59,6 +66,7 @@ def _export_upright(scene: Map, out: Path, ending: str) -> list[Path]:
     import trimesh
 
     mesh, turn = _mesh(scene), _y_upwards(scene)
+    _remove_others(out)
     content = head(scene, [], _content(mesh))
     if scene.up is not None:
         content.append(f"turned so that y is upwards; {T_WORLD_FILE} turns it back to the frame of the map")
@@ -70,7 +78,7 @@ def _export_upright(scene: Map, out: Path, ending: str) -> list[Path]:
         process=False,
     )
     turned.metadata["comments"] = content
-    options = {"header": "\n".join(content)} if ending == "obj" else {}
+    options = {"header": "\n# ".join(content)} if ending == "obj" else {}
     file, pose = out / f"mesh.{ending}", out / T_WORLD_FILE
     written = turned.export(file_type=ending, **options)
     write_file(file, written.encode() if isinstance(written, str) else written)

@@ -56,13 +56,13 @@ class Mesh:
     cell: float  # side of the cells of the grid
 
 
-def mesh_of_surface(surface: SurfaceMap, cell: float | None = None) -> Mesh:
-    """Return a mesh of a surface on a grid whose cells are as large as the surfels are apart, or ``cell`` (metres).
+def mesh_of_surface(surface: SurfaceMap) -> Mesh:
+    """Return a mesh of a surface on a grid whose cells are as large as the surfels are apart.
 
     It ends where the surfels end. Raises ``InputError`` for a surface of too few surfels, and for one without keyframes.
     """
     distance = SignedDistance.of(surface)
-    return _marched(distance, distance.spacing if cell is None else cell)
+    return _marched(distance, distance.spacing)
 
 
 @dataclass(frozen=True, eq=False)

@@ -106,6 +106,8 @@ def test_the_importer_reads_the_mesh_in_the_frame_and_unit_of_the_map(
     content = files[f"mesh.{ending}"].read_bytes()
     assert b"triangles, on a grid with cells of" in content
     assert b"lengths in metres" in content
+    if ending == "obj":
+        assert all(line[:2] in (b"# ", b"v ", b"vn", b"f ") for line in content.splitlines() if line)
     assert (b"turned so that y is upwards" in content) == (pose is not None)
     if pose is not None:  # these formats have y upwards
         assert T.rotation[:, 1].tolist() == pytest.approx([0, 0.6, 0.8])
@@ -113,6 +115,12 @@ def test_the_importer_reads_the_mesh_in_the_frame_and_unit_of_the_map(
     for own, other in zip(scene.info.cameras, found.info.cameras, strict=True):
         assert own.name == other.name
         assert torch.allclose(own.pose.matrix(), other.pose.matrix(), atol=1e-9)
+
+
+def test_a_new_mesh_replaces_those_whose_cameras_are_turned_otherwise(scene: Map, tmp_path: Path) -> None:
+    export_map(scene, tmp_path, "mesh.glb", overwrite=True)
+    export_map(scene, tmp_path, "mesh.ply", overwrite=True)
+    assert {file.name for file in tmp_path.iterdir()} == {"mesh.ply", "cameras.json"}
 
 
 def test_what_gives_no_mesh(scene: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,6 @@ CELL = 8
 """Pixels along the side of a cell: the network gives each pixel of a cell its probability of being the cell's keypoint."""
 DIVISOR = 32
 """The network halves an image five times, so its sides are multiples of this number of pixels."""
-CHANNELS = 64
 SIZE = 24.0
 """Diameter (pixels) of the region that a keypoint is assumed to describe: three cells, since XFeat gives no
 size. Descriptors are interpolated between cells, so those of closer keypoints are very similar.

@@ -21,7 +21,6 @@ NAMES = {
 """The names used here for the parameters of both."""
 PREFIX = "_model.gauss_params."
 """Prefix of the names of splatfacto's parameters."""
-ZIP = b"PK\x03\x04"
 
 
 def recognises(path: Path) -> bool:

@@ -25,7 +25,7 @@ class Format:
 FORMATS = (
     Format("PLY", "+z", "as in most scans; PLY specifies none", ply.recognises, ply.read),
     Format("OBJ", "+y", "as written by most programs; OBJ specifies none", obj.recognises, obj.read),
-    Format("glTF", "+y", "as glTF prescribes, in metres", gltf.recognises, gltf.read),
+    Format("glTF", "+y", "as glTF prescribes", gltf.recognises, gltf.read),
     Format("PCD", "+z", "as in most scans; PCD specifies none", pcd.recognises, pcd.read),
     Format("LAS", "+z", "as LAS prescribes", survey.recognises_las, survey.read_las),
     Format("E57", "+z", "as E57 prescribes, in metres", survey.recognises_e57, survey.read_e57),
