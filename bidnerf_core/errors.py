@@ -54,8 +54,8 @@ class Cancelled(Exception):
 
 def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
     """Return the error for a name that is not among ``known``; it suggests the closest known spelling."""
-    listed = f", expected one of {', '.join(known)}"
-    return InputError(f"no {what} {name!r}{spelling_hint(name, known, listed)}")
+    hint = spelling_hint(name, known)
+    return InputError(f"no {what} {name!r}{hint}", expected=None if hint else f"one of {', '.join(known)}")
 
 
 def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str:
@@ -71,7 +71,7 @@ def refuse_text(what: str, given: object) -> None:
     of letters.
     """
     if isinstance(given, str):
-        raise InputError(f"{what} is {given!r}, expected a list, such as [{given!r}]")
+        raise InputError(f"{what} is {given!r}", expected=f"a list, such as [{given!r}]")
 
 
 def amount(count: int, noun: str) -> str:

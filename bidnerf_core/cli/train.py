@@ -112,7 +112,7 @@ def run(arguments: list[str]) -> None:
         require("--checkpoint-every", checkpoint_every, 0)
         if resume and overwrite:
             raise UsageError(
-                "--resume continues a map, --overwrite starts a new one; expected only one of them"
+                "--resume continues a map, --overwrite starts a new one;", expected="only one of them"
             )
         if largest is not None:
             require("--largest", largest, 1)
@@ -125,11 +125,11 @@ def run(arguments: list[str]) -> None:
         photos = lacks_poses(data)
         if photos and (depth_unit is not None or register_depth is not None):
             raise UsageError(
-                f"{data}: photos without poses have no depth; leave out --depth-unit and --register-depth"
+                "photos without poses have no depth; leave out --depth-unit and --register-depth", where=data
             )
         if photos and masks is not None:
             raise UsageError(
-                f"{data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
+                "photos without poses; find them with 'bidnerf poses', then train with --masks", where=data
             )
         if photos and not (out / DESCRIPTION).exists():
             resume = False  # it was interrupted during pose estimation, which resumes by itself
@@ -139,12 +139,15 @@ def run(arguments: list[str]) -> None:
             _check_refinement(out, info, refine_poses)
             if largest is not None and largest != longest_side(info):
                 raise UsageError(
-                    f"{out}: was started with images of {longest_side(info)} px, got --largest {largest}; leave"
-                    " it out"
+                    f"was started with images of {longest_side(info)} px, got --largest {largest}; leave it"
+                    " out",
+                    where=out,
                 )
             if landmark_features not in (USUAL_FEATURES, info.landmark_features):
                 began = f"--landmark-features {info.landmark_features}"
-                raise UsageError(f"{out}: was started with {began}, got {landmark_features}; leave it out")
+                raise UsageError(
+                    f"was started with {began}, got {landmark_features}; leave it out", where=out
+                )
             begun = info.bounds.background if background is None else background
         images: Images = data
         if not photos:
@@ -175,7 +178,7 @@ def run(arguments: list[str]) -> None:
             try:
                 training.resume(out, images, **same)
             except training.OtherSettings as error:
-                raise UsageError(str(error)) from error
+                raise UsageError(error) from error
 
     parse("train", train, arguments, default)
 
@@ -196,14 +199,15 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
     be ignored.
     """
     if backend not in (None, info.backend):
-        raise UsageError(f"{out}: uses backend {info.backend!r}, cannot resume it with {backend!r}")
+        raise UsageError(f"uses backend {info.backend!r}, cannot resume it with {backend!r}", where=out)
     began = from_plain(type(config), info.config, f"{out}: config")
     stored, given, usual = (to_flat(settings) for settings in (began, config, default))
     for key, value in given.items():
         if value not in (usual[key], stored[key]):
             raise UsageError(
-                f"{out}: was started with {key} {stored[key]}, got {value}; --resume keeps settings,"
-                " --overwrite starts again"
+                f"was started with {key} {stored[key]}, got {value}; --resume keeps settings, --overwrite"
+                " starts again",
+                where=out,
             )
 
 
@@ -215,5 +219,6 @@ def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) ->
     if refinement == ("never" if refined else "always"):
         has = "refined" if refined else "given"
         raise UsageError(
-            f"{out}: was started with {has} poses, got --refine-poses {refinement}; --resume keeps the poses"
+            f"was started with {has} poses, got --refine-poses {refinement}; --resume keeps the poses",
+            where=out,
         )
