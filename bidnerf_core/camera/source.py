@@ -143,7 +143,16 @@ class CameraSource:
         if isinstance(camera, Intrinsics | Lens):
             return _fitted(str(where), raster, camera, "camera as given")
         if not isinstance(camera, str | Path):
-            raise InputError(f"camera is {_of_kind(camera)}", where=where)
+            raise InputError(
+                f"camera is a {type(camera).__name__}",
+                where=where,
+                expected="Intrinsics or the path of a camera file"
+                + (
+                    "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix"
+                    if getattr(camera, "shape", None) == (3, 3)
+                    else ""
+                ),
+            )
         return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
     def at(self, image: Path) -> Callable[[int, int], Camera]:
@@ -192,15 +201,6 @@ def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intr
 
 def _described(camera: Intrinsics, origin: str) -> FoundCamera:
     return FoundCamera(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
-
-
-def _of_kind(camera: object) -> str:
-    """Describe what was given as a camera, and what is expected."""
-    matrix = getattr(camera, "shape", None) == (3, 3)
-    hint = (
-        "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix" if matrix else ""
-    )
-    return f"a {type(camera).__name__}, expected Intrinsics or the path of a camera file{hint}"
 
 
 def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCamera:

@@ -95,9 +95,9 @@ def open_dataset(
         raise InputError("no such folder", where=folder)
     reader = _reader_of(folder, readers)
     if reader is None and not folder.is_dir():
-        raise InputError(_not_a_dataset(folder), where=folder)
+        raise _not_a_dataset(folder)
     if reader is None:
-        raise InputError(_without_dataset(folder, readers), where=folder)
+        raise _without_dataset(folder, readers)
     options = _options(reader, folder, CameraSource(camera), background, register_depth, depth_unit)
     found = opened(reader, folder, options)
     return found if masks is None else MaskedDataset(found, mask_folder(masks))
@@ -139,8 +139,7 @@ def open_sequence(
     reader = _reader_of(place, readers)
     if reader is None and not place.is_dir():
         if not is_video(place):
-            video = f", or a video ({', '.join(VIDEO_SUFFIXES)})"
-            raise InputError(f"{_not_a_dataset(place)}{video}", where=place)
+            raise _not_a_dataset(place, f", or a video ({', '.join(VIDEO_SUFFIXES)})")
         if register_depth is not None:
             raise InputError("is a video, which has no depth to register", where=place)
         return open_video(place, given)
@@ -180,31 +179,33 @@ def _options(
     )
 
 
-def _not_a_dataset(file: Path) -> str:
-    """Return why a file is not a dataset."""
+def _not_a_dataset(file: Path, or_else: str = "") -> InputError:
+    """Return the error for a file in place of a dataset; ``or_else`` names what else could be given."""
     if (instead := file_of_dataset(file)) is not None:
-        return instead
+        return InputError(f"{instead}{or_else}", where=file)
     packed = file.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
-    return f"is a file, expected the folder of a dataset{'; unpack the archive first' if packed else ''}"
+    unpack = "; unpack the archive first" if packed else ""
+    return InputError("is a file", where=file, expected=f"the folder of a dataset{unpack}{or_else}")
 
 
-def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:
-    """Return why a folder is not a dataset, and what to do."""
+def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> InputError:
+    """Return the error for a folder that is no dataset, and what to do."""
     inside = [
         child.name for child in sorted(folder.iterdir()) if child.is_dir() and _reader_of(child, readers)
     ]
     if inside:
-        return f"no dataset found, expected one of the folders in it, such as {inside[0]}"
+        expected = f"one of the folders in it, such as {inside[0]}"
+        return InputError("no dataset found", where=folder, expected=expected)
     photos, _ = photos_in(folder)
     if not photos and readers is None:
         return no_dataset(folder)
-    expected = expected_formats(readers)
-    if not photos:
-        return f"no dataset found, {expected}"
-    return (
-        f"no dataset found: {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give"
-        f" those of an AR framework or a robot; {expected}"
-    )
+    found = "no dataset found"
+    if photos:
+        found += (
+            f": {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give those of an AR"
+            " framework or a robot;"
+        )
+    return InputError(found, where=folder, expected=expected_formats(readers))
 
 
 def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:

@@ -83,8 +83,9 @@ def positions(
     index = {name: place for place, name in enumerate(names)}
     for name in asked:
         if name not in index:
-            elsewhere = in_other_split(name, splits or {})
-            raise InputError(elsewhere or _not_there(name, names, stems), where=where)
+            if (elsewhere := in_other_split(name, splits or {})) is not None:
+                raise InputError(elsewhere, where=where)
+            raise _not_there(where, name, names, stems)
     return [index[name] for name in asked]
 
 
@@ -116,10 +117,13 @@ def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None
     return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
 
 
-def _not_there(name: str, names: Sequence[str], stems: Sequence[str]) -> str:
+def _not_there(where: str, name: str, names: Sequence[str], stems: Sequence[str]) -> InputError:
     meant = [other for other, stem in zip(names, stems, strict=True) if stem == name]
     if meant:
         listed = ", ".join(meant[:4]) + (", ..." if len(meant) > 4 else "")
-        return f"frame {name!r} is ambiguous, expected one of {listed}"
-    hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}" if names else "")
-    return f"no frame {name!r} among its {len(names)} frames{hint}"
+        return InputError(f"frame {name!r} is ambiguous", where=where, expected=f"one of {listed}")
+    hint = spelling_hint(name, names)
+    expected = f"a name such as {names[0]!r}" if names and not hint else None
+    return InputError(
+        f"no frame {name!r} among its {len(names)} frames{hint}", where=where, expected=expected
+    )

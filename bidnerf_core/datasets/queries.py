@@ -211,7 +211,7 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
         found, others = photos_in(path)
         others = [file for file in others if file not in depth]
         if not found:
-            raise InputError(no_dataset(path), where=path)
+            raise no_dataset(path)
         if others:
             named = ", ".join(file.name for file in others[:NAMED])
             more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""

@@ -179,17 +179,17 @@ def file_of_dataset(path: Path) -> str | None:
     )
 
 
-def no_dataset(folder: Path) -> str:
-    """Return an error message for a folder with neither photos nor a dataset, which refers to the list of formats."""
+def no_dataset(folder: Path) -> InputError:
+    """Return the error for a folder with neither photos nor a dataset, which refers to the list of formats."""
     found = "contains no photos and is no dataset" if any(folder.iterdir()) else "the folder is empty"
-    return f"{found}; {expected_formats()}"
+    return InputError(f"{found};", where=folder, expected=expected_formats())
 
 
 def expected_formats(readers: Sequence[Reader] | None = None) -> str:
     """Return the formats that can be read, for messages: all by name, or the files that some readers expect."""
     if readers is not None:
-        return "expected " + "; or ".join(reader.expected for reader in readers)
-    return f"expected photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
+        return "; or ".join(reader.expected for reader in readers)
+    return f"photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
 
 
 def _others() -> Iterator[tuple[str, Reader]]:

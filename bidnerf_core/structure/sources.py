@@ -55,7 +55,7 @@ def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
         )
     files = _listed(folder, out)
     if not files:
-        raise InputError(no_dataset(folder), where=folder)
+        raise no_dataset(folder)
     names = unique_names([(*file.relative_to(folder).parts[:-1], file.stem) for file in files])
     return [SourceImage(name, file) for name, file in zip(names, files, strict=True)]
 
