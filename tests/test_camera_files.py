@@ -142,11 +142,11 @@ def test_camera_files_of_other_programs_give_their_camera_back(
 
 def test_a_matrix_of_opencv_gives_the_camera_with_the_half_pixel() -> None:
     tensor = torch.tensor(D, dtype=torch.float64)
-    lenses: list[Any] = [D, list(D), np.array(D), np.array(D)[None], np.array(D)[:, None], tensor]
-    for lens in lenses:
-        assert Intrinsics(500.0, 510.0, 311.0, 240.75, *SIZE, lens) == CAMERA
+    lenses: list[Any] = [D, np.array(D), np.array(D)[None], np.array(D)[:, None], tensor]
+    for lens in (*lenses, list(D)):
         for each in (K, K.tolist(), torch.from_numpy(K), K.ravel(), K.astype(np.float32)):
             assert Intrinsics.from_opencv(each, lens, SIZE) == CAMERA
+    assert all(Intrinsics(500.0, 510.0, 311.0, 240.75, *SIZE, lens) == CAMERA for lens in lenses)
     assert Intrinsics.from_opencv(K, np.zeros((5, 1)), np.array(SIZE)) == IDEAL
     assert Intrinsics.from_opencv(K, size=SIZE) == IDEAL
     points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
