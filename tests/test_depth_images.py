@@ -12,7 +12,8 @@ import torch
 from PIL import Image
 
 from bidnerf_core.depth.images import DepthReader, depth_image, read_depth_image
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputWarning
+from refusals import refused
 
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
@@ -82,7 +83,7 @@ def test_depth_without_any_measurement_has_no_median() -> None:
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("unit", [0.0, -1.0, np.nan, np.inf, "mm"])
 def test_units_that_are_none(unit: Any) -> None:
-    with pytest.raises(InputError, match=r"depth: depth_unit is .*, expected a positive number of metres"):
+    with refused(where="depth", found=f"depth_unit is {unit!r}", expected="a positive number of metres"):
         depth_image(np.ones((2, 2)), unit, "depth")
 
 
@@ -90,7 +91,7 @@ def test_units_that_are_none(unit: Any) -> None:
     "raw", [np.ones((2, 2, 3)), np.ones(3), np.ones((2, 2), bool), np.ones((2, 2), "U1")]
 )
 def test_arrays_that_are_no_depth(raw: np.ndarray) -> None:
-    with pytest.raises(InputError, match="expected one channel of integer or floating-point numbers"):
+    with refused(found="depth is", expected="one channel of integer or floating-point numbers"):
         depth_image(raw, 1.0, "depth")
 
 

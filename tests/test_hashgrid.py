@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 import tiny
-from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.sampling import Concentrated, Resampled, SplittingSampler
@@ -19,6 +18,7 @@ from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
 from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
+from refusals import refused
 from voxels import cell_centres, cells_of
 
 BOUNDS = SceneBounds((-1.2, -0.4, 0.1), (0.8, 0.7, 1.3), 0.1, 8.0, (0.3, 0.6, 0.9))
@@ -88,22 +88,6 @@ def test_skipping_blocks_loses_no_sample(share: float, steps_per_cell: int, jitt
     )
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("jitter", [False, True])
-def test_samples_are_sorted_disjoint_and_within_the_limits(jitter: bool, dtype: torch.dtype) -> None:
-    rays = random_rays()
-    rays = Rays(*(part.to(dtype) for part in (rays.origins, rays.directions, rays.near, rays.far)))
-    samples = grid_of(random_cells(0.3, seed=0))(rays, torch.Generator().manual_seed(0) if jitter else None)
-    assert samples.starts.dtype == samples.ends.dtype == dtype
-    assert bool((samples.valid.long().diff(dim=-1) <= 0).all())  # valid ones first
-    tolerance = 8 * torch.finfo(dtype).eps * 8.0
-    both = samples.valid[:, 1:]
-    assert bool((samples.ends >= samples.starts)[samples.valid].all())
-    assert bool((samples.starts[:, 1:] >= samples.ends[:, :-1] - tolerance)[both].all())
-    assert bool((samples.starts >= rays.near[:, None])[samples.valid].all())
-    assert bool((samples.ends <= rays.far[:, None])[samples.valid].all())
-
-
 @pytest.mark.parametrize(
     "bounds", [BOUNDS, replace(BOUNDS, far=90.0, contracted=True)], ids=["box", "contracted"]
 )
@@ -130,56 +114,6 @@ def test_rays_with_many_samples_are_concentrated_as_without_splitting(
     assert torch.equal(found[0].valid, valid)
     for name in ("starts", "ends"):
         assert torch.equal(*(getattr(samples, name)[valid] for samples in found))
-
-
-def test_samples_are_in_occupied_cells() -> None:
-    """But for those that the limits cut short: their middles move by up to a quarter of a step."""
-    grid, rays = grid_of(random_cells(0.2, seed=1)), random_rays()
-    samples = grid(rays)
-    whole = samples.valid & (samples.ends - samples.starts > grid.step * 0.999)
-    assert whole.sum() > 0.9 * samples.valid.sum()
-    assert bool(grid.occupied[cells_of(grid.grid, rays.at(samples.middles)[whole])].all())
-
-
-def test_samples_repeat_without_jitter_and_with_the_same_one() -> None:
-    grid, rays = grid_of(random_cells(0.2, seed=1)), random_rays()
-    for first, second in (
-        (grid(rays), grid(rays)),
-        (grid(rays, torch.Generator().manual_seed(5)), grid(rays, torch.Generator().manual_seed(5))),
-    ):
-        assert torch.equal(first.starts, second.starts)
-        assert torch.equal(first.valid, second.valid)
-    other = grid(rays, torch.Generator().manual_seed(6))
-    assert other.starts.shape != grid(rays).starts.shape or not torch.equal(other.starts, grid(rays).starts)
-
-
-@pytest.mark.parametrize("shape", [(0,), (2, 0), (0, 3)])
-def test_no_rays_have_no_samples(shape: tuple[int, ...]) -> None:
-    rays = BOUNDS.rays(torch.zeros((*shape, 3)), torch.zeros((*shape, 3)))
-    samples = grid_of(random_cells(0.2, seed=1))(rays)
-    assert samples.valid.shape == (*shape, 0)
-
-
-def test_rays_that_miss_have_no_samples() -> None:
-    rays = random_rays()
-    missing = rays.far <= rays.near
-    samples = grid_of(random_cells(1.0, seed=0))(rays)
-    assert torch.equal(samples.valid.any(-1), ~missing)
-    alone = grid_of(random_cells(1.0, seed=0))(
-        Rays(rays.origins[missing], rays.directions[missing], rays.near[missing], rays.far[missing])
-    )
-    assert alone.valid.shape == (int(missing.sum()), 0)
-
-
-def test_leading_axes_of_rays_do_not_matter() -> None:
-    grid, rays = grid_of(random_cells(0.2, seed=1)), random_rays()
-    folded = Rays(
-        rays.origins.reshape(3, 20, 5, 3), rays.directions.reshape(3, 20, 5, 3), rays.near.reshape(3, 20, 5),
-        rays.far.reshape(3, 20, 5),
-    )  # fmt: skip
-    found, expected = grid(folded), grid(rays)
-    assert torch.equal(found.starts.reshape(300, -1), expected.starts)
-    assert torch.equal(found.valid.reshape(300, -1), expected.valid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,11 +218,9 @@ def test_what_is_derived_from_the_occupancy_is_brought_up_to_date_on_loading() -
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(
-        InputError, match=r"coarse_levels is 99, expected 10 \(levels of the encoding\) or less"
-    ):
+    with refused(found="coarse_levels is 99", expected="10 (levels of the encoding) or less"):
         HashGridConfig(coarse_levels=99)
-    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
+    with refused(found="learning_rate is 0", expected="more than 0"):
         HashGridConfig(learning_rate=0)
 
 
@@ -321,22 +253,6 @@ def test_levels_are_coarse_and_fine(field: HashGridField) -> None:
     assert coarse.sampler.grid.shape[0] * 2 == field.occupancy.grid.shape[0]
 
 
-@pytest.mark.parametrize("level", [0, 1])
-@pytest.mark.parametrize("shape", [(), (5,), (2, 3, 4), (0,), (3, 0)], ids=str)
-def test_values_have_the_shape_of_the_points_and_are_in_range(
-    shape: tuple[int, ...], level: int, field: HashGridField
-) -> None:
-    positions, directions = random_points(shape)
-    values = field.levels[level].query(positions, directions)
-    assert values.density.shape == shape
-    assert values.rgb.shape == (*shape, 3)
-    assert bool((values.density >= 0).all())
-    assert bool(((values.rgb >= 0) & (values.rgb <= 1)).all())
-    flat = field.levels[level].query(positions.reshape(-1, 3), directions.reshape(-1, 3))
-    torch.testing.assert_close(values.density.reshape(-1), flat.density)
-    torch.testing.assert_close(values.rgb.reshape(-1, 3), flat.rgb)
-
-
 def test_density_is_finite_whatever_the_network_says(field: HashGridField) -> None:
     wild = copy.deepcopy(field)
     with torch.no_grad():
@@ -349,28 +265,15 @@ def test_density_is_finite_whatever_the_network_says(field: HashGridField) -> No
 
 @pytest.mark.parametrize("level", [0, 1])
 def test_derivatives_by_position_and_direction_are_the_slopes(level: int, field: HashGridField) -> None:
-    positions, directions = random_points((40,), seed=1)
-    weights = torch.linspace(0.5, 1.5, 40, dtype=torch.float64)
+    mix = torch.tensor([1.0, 2.0, -1.5], dtype=torch.float64)
 
-    def value(moved: Tensor, turned: Tensor) -> Tensor:
-        values = field.levels[level].query(moved, turned)
-        return weights * (torch.log1p(values.density) + values.rgb @ torch.tensor([1.0, 2.0, -1.5]).double())
+    def value(positions: Tensor, directions: Tensor) -> Tensor:
+        found = field.levels[level].query(positions, directions)
+        return torch.log1p(found.density) + found.rgb @ mix
 
-    for which, point in enumerate((positions, directions)):
-        point = point.clone().requires_grad_()
-        arguments = [positions, directions]
-        arguments[which] = point
-        (found,) = torch.autograd.grad(value(*arguments).sum(), point)
-        assert float(found.abs().mean()) > 1e-2
-        for axis in range(3):
-            step = torch.zeros(3, dtype=torch.float64)
-            step[axis] = 1e-7
-            sides = []
-            for sign in (1, -1):
-                arguments[which] = point.detach() + sign * step
-                sides.append(value(*arguments).detach())
-            slope = (sides[0] - sides[1]) / 2e-7
-            torch.testing.assert_close(found[:, axis], slope, atol=1e-5, rtol=1e-5)
+    points = [part.requires_grad_() for part in random_points((40,), seed=1)]
+    assert torch.autograd.gradcheck(value, points, eps=1e-7, atol=1e-5, rtol=1e-5)
+    assert all(float(x.abs().mean()) > 1e-2 for x in torch.autograd.grad(value(*points).sum(), points))
 
 
 def test_the_coarse_level_does_not_see_the_fine_tables(field: HashGridField) -> None:
