@@ -9,7 +9,14 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.fields.contract import FieldValues, Rays, RaySampler, RaySamples, SceneBounds
+from bidnerf_core.fields.contract import (
+    FieldValues,
+    RadianceField,
+    Rays,
+    RaySampler,
+    RaySamples,
+    SceneBounds,
+)
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.sampling import AroundDepth, Concentrated, Importance, Resampled, Stratified
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
@@ -63,11 +70,27 @@ def finer(sampler: RaySampler) -> Importance:
     return Importance(Resampled(GaussianBlobs.random(), sampler), COUNT)
 
 
+def fewer(sampler: RaySampler, count: int = COUNT) -> Concentrated:
+    return Concentrated(Resampled(GaussianBlobs.random(), sampler), count)
+
+
+@pytest.mark.parametrize("made", [lambda sampler: sampler, finer, fewer], ids=["rough", "finer", "fewer"])
 @pytest.mark.parametrize("name", SAMPLERS)
-def test_the_contracts_laws_hold(name: str) -> None:
-    field = Resampled(GaussianBlobs.random(), finer(SAMPLERS[name]()))
+def test_the_contracts_laws_hold(name: str, made: Callable[[RaySampler], RaySampler]) -> None:
+    field = Resampled(GaussianBlobs.random(), made(SAMPLERS[name]()))
     for law in (laws.check_intervals, laws.check_repeatable, laws.check_rays_alone, laws.check_background):
         law(field)
+
+
+@pytest.mark.parametrize("jittered", [False, True])
+def test_stratified_intervals_tile_the_ray(jittered: bool) -> None:
+    where = rays(50)
+    hits = where.far > where.near
+    samples = Stratified(16)(where, Generator().manual_seed(0) if jittered else None)
+    assert torch.equal(samples.valid, hits[:, None].expand(50, 16))
+    assert torch.equal(samples.starts[:, 1:], samples.ends[:, :-1])
+    torch.testing.assert_close(samples.starts[:, 0], where.near)
+    torch.testing.assert_close(samples.ends[:, -1], where.far)
 
 
 @pytest.mark.parametrize("jittered", [False, True])
@@ -113,21 +136,33 @@ def test_borders_of_a_contiguous_sampler_are_sorted_together() -> None:
     assert bool(torch.isin(rough.starts[hits], borders).all())
 
 
-def test_a_surface_in_a_grid_is_seen_where_it_is() -> None:
-    """Rough intervals that leave much out are no reason to put the surface elsewhere."""
-    ball = HomogeneousBall(0.8, 40.0)
-    where = rays(300)
-    exact = render(Resampled(ball, Stratified(4000)), where)
+def shell_cells() -> OccupancyGrid:
+    """The cells about a sphere of 0.8 m, and gaps inside and out."""
     cells = OccupancyGrid(BOUNDS, 8)
-    cells.restrict(
-        (cell_centres(cells.grid).norm(dim=-1) - 0.8).abs() < 0.3
-    )  # the shell, and gaps inside and out
-    rough = render(Resampled(ball, cells), where)
-    cut = render(Resampled(ball, Importance(Resampled(ball, cells), 64)), where)
+    cells.restrict((cell_centres(cells.grid).norm(dim=-1) - 0.8).abs() < 0.3)
+    return cells
+
+
+SURFACES: dict[str, tuple[RaySampler, Callable[[RadianceField], RaySampler], float]] = {
+    "importance": (Stratified(48), lambda ball: Importance(Resampled(ball, Stratified(16)), 32), 0.7),
+    "in a grid": (shell_cells(), lambda ball: Importance(Resampled(ball, shell_cells()), 64), 0.5),
+    "concentrated": (Stratified(12), lambda ball: Concentrated(Resampled(ball, Stratified(256)), 12), 0.25),
+}
+"""Even samples, those put where a ball's surface is, and how much smaller the error of its distance then is."""
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_a_surface_is_seen_where_it_is(name: str) -> None:
+    """On smooth blobs, even spacing is as good as it gets."""
+    ball, where = HomogeneousBall(0.8, 40.0), rays(300)
+    even, put, share = SURFACES[name]
+    exact = render(Resampled(ball, Stratified(4000)), where)
     hit = exact.opacity > 0.99
-    errors = [(found.distance - exact.distance).abs()[hit].median() for found in (cut, rough)]
     assert int(hit.sum()) > 50
-    assert float(errors[0]) < 0.5 * float(errors[1])
+    seen = [render(Resampled(ball, sampler), where) for sampler in (put(ball), even)]
+    errors = [float((found.distance - exact.distance).abs()[hit].median()) for found in seen]
+    assert errors[0] < share * errors[1]
+    assert float((seen[0].opacity - exact.opacity).abs().mean()) < 0.05
 
 
 def test_around_a_measured_depth_there_is_all_that_a_ray_meets() -> None:
@@ -157,17 +192,6 @@ def test_a_window_that_misses_the_scene_has_no_samples() -> None:
 # Concentration.
 
 
-def fewer(sampler: RaySampler, count: int = COUNT) -> Concentrated:
-    return Concentrated(Resampled(GaussianBlobs.random(), sampler), count)
-
-
-@pytest.mark.parametrize("name", SAMPLERS)
-def test_the_contracts_laws_hold_of_concentrated_samples(name: str) -> None:
-    field = Resampled(GaussianBlobs.random(), fewer(SAMPLERS[name]()))
-    for law in (laws.check_intervals, laws.check_repeatable, laws.check_rays_alone, laws.check_background):
-        law(field)
-
-
 @pytest.mark.parametrize("jittered", [False, True])
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_concentrated_samples_are_few_and_as_long_as_those_they_replace(name: str, jittered: bool) -> None:
@@ -191,19 +215,6 @@ def test_few_samples_are_kept_as_they_are() -> None:
     assert all(
         torch.equal(getattr(kept, part), getattr(rough(where), part)) for part in ("starts", "ends", "valid")
     )
-
-
-def test_a_surface_is_seen_where_it_is_with_few_samples() -> None:
-    ball = HomogeneousBall(0.6, 60.0, rgb=(0.9, 0.5, 0.2))
-    where = rays()
-    exact = render(Resampled(ball, Stratified(4000)), where)
-    even, near = (
-        render(Resampled(ball, sampler), where)
-        for sampler in (Stratified(12), Concentrated(Resampled(ball, Stratified(256)), 12))
-    )
-    errors = [float((found.distance - exact.distance).abs().mean()) for found in (even, near)]
-    assert errors[1] < 0.25 * errors[0]
-    assert float((near.opacity - exact.opacity).abs().mean()) < 0.05
 
 
 class TwoWalls:
