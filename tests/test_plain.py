@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.json import LARGEST_INTEGER, from_plain, to_plain
+from refusals import refused
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Inner:
 
     def __post_init__(self) -> None:
         if "!" in self.name:
-            raise InputError(f"name is {self.name}, expected no exclamation")
+            raise InputError(f"name is {self.name}", expected="no exclamation")
 
 
 @dataclass(frozen=True)
@@ -72,39 +73,39 @@ def test_missing_keys_take_their_defaults_and_whole_numbers_serve_as_floats() ->
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("given", "where", "found", "expected"),
     [
-        ({}, "here: 'need' missing, expected all fields of Outer"),
-        ([], "here: found [], expected an object with the fields of Outer"),
-        ({"need": 1, "raet": 2}, "here: Outer has no field 'raet', did you mean 'rate'?"),
-        ({"need": 1, "derived": 2}, "here: Outer has no field 'derived', expected any of need, rate"),
-        ({"need": 1.5}, "here: need: found 1.5, expected int"),
-        ({"need": True}, "here: need: found True, expected int"),
-        ({"need": 2**63}, "here: need: found 9223372036854775808, expected an integer of at most 64 bits"),
-        ({"need": -(10**400)}, "expected an integer of at most 64 bits"),
-        ({"need": None}, "here: need: found None, expected int"),
-        ({"need": 1, "rate": "2"}, "here: rate: found '2', expected float"),
-        ({"need": 1, "rate": True}, "here: rate: found True, expected float"),
-        ({"need": 1, "rate": math.nan}, "here: rate: found nan, expected float"),
-        ({"need": 1, "rate": 10**400}, "expected float"),
-        ({"need": 1, "flag": 1}, "here: flag: found 1, expected bool"),
-        ({"need": 1, "kind": "c"}, "here: kind: found 'c', expected 'a' or 'b'"),
-        ({"need": 1, "maybe": "x"}, "here: maybe: found 'x', expected int or null"),
-        ({"need": 1, "pair": [1.0]}, "here: pair: found [1.0], expected tuple[float, str]"),
-        ({"need": 1, "pair": [1.0, 2]}, "here: pair: found 2, expected str"),
-        ({"need": 1, "inner": 3}, "here: inner: found 3, expected an object with the fields of Inner"),
-        ({"need": 1, "inner": {"name": "!"}}, "here: inner: name is !, expected no exclamation"),
-        ({"need": 1, "many": [{"sizes": ["x"]}]}, "here: many: sizes: found 'x', expected int"),
-        ({"need": 1, "table": {"k": [1.5]}}, "here: table.k: found 1.5, expected int"),
-        ({"need": "z" * 999}, "zzz..., expected int"),
+        ({}, "here", "'need' missing", "all fields of Outer"),
+        ([], "here", "found []", "an object with the fields of Outer"),
+        ({"need": 1, "raet": 2}, "here", "Outer has no field 'raet', did you mean 'rate'?", None),
+        ({"need": 1, "derived": 2}, "here", "Outer has no field 'derived'", "any of need, rate"),
+        ({"need": 1.5}, "here: need", "found 1.5", "int"),
+        ({"need": True}, "here: need", "found True", "int"),
+        ({"need": 2**63}, "here: need", 2**63, "an integer of at most 64 bits"),
+        ({"need": -(10**400)}, "here: need", None, "an integer of at most 64 bits"),
+        ({"need": None}, "here: need", "found None", "int"),
+        ({"need": "z" * 999}, "here: need", "...", "int"),
+        ({"need": 1, "rate": "2"}, "here: rate", "found '2'", "float"),
+        ({"need": 1, "rate": True}, "here: rate", "found True", "float"),
+        ({"need": 1, "rate": math.nan}, "here: rate", "found nan", "float"),
+        ({"need": 1, "rate": 10**400}, "here: rate", None, "float"),
+        ({"need": 1, "flag": 1}, "here: flag", "found 1", "bool"),
+        ({"need": 1, "kind": "c"}, "here: kind", "found 'c'", "'a' or 'b'"),
+        ({"need": 1, "maybe": "x"}, "here: maybe", "found 'x'", "int or null"),
+        ({"need": 1, "pair": [1.0]}, "here: pair", "found [1.0]", "tuple[float, str]"),
+        ({"need": 1, "pair": [1.0, 2]}, "here: pair", "found 2", "str"),
+        ({"need": 1, "inner": 3}, "here: inner", "found 3", "an object with the fields of Inner"),
+        ({"need": 1, "inner": {"name": "!"}}, "here: inner", "name is !", "no exclamation"),
+        ({"need": 1, "many": [{"sizes": ["x"]}]}, "here: many: sizes", "found 'x'", "int"),
+        ({"need": 1, "table": {"k": [1.5]}}, "here: table.k", "found 1.5", "int"),
     ],
     ids=lambda value: None if isinstance(value, str) else str(value)[:40],
 )
-def test_every_mistake_is_named(given: Any, message: str) -> None:
-    with pytest.raises(InputError) as error:
+def test_every_mistake_is_named(given: Any, where: str, found: object, expected: str | None) -> None:
+    with refused(where=where, found=found, expected=expected) as caught:
         from_plain(Outer, given, "here")
-    assert message in str(error.value)
-    assert len(str(error.value)) < 250
+    assert caught.error.where == where
+    assert len(str(caught.error)) < 250
 
 
 class Colour(Enum):
@@ -112,17 +113,16 @@ class Colour(Enum):
 
 
 @pytest.mark.parametrize(
-    ("value", "message"),
+    ("value", "found", "expected"),
     [
-        (Outer(1, math.inf), "rate is inf, expected a finite number"),
-        (Outer(1, rows=[[0.0], [0.0, math.nan]]), "rows[1][1] is nan, expected a finite number"),
-        (Outer(1, anything=Path()), "anything is a PosixPath, expected a JSON-serializable value"),
-        (Outer(1, anything={"k": Colour.RED}), "anything.k is a Colour, expected a JSON-serializable value"),
-        (Outer(1, anything={1: 2}), "anything has the key 1, expected text"),
+        (Outer(1, math.inf), "rate is inf", "a finite number"),
+        (Outer(1, rows=[[0.0], [0.0, math.nan]]), "rows[1][1] is nan", "a finite number"),
+        (Outer(1, anything=Path()), "anything is a PosixPath", "a JSON-serializable value"),
+        (Outer(1, anything={"k": Colour.RED}), "anything.k is a Colour", "a JSON-serializable value"),
+        (Outer(1, anything={1: 2}), "anything has the key 1", "text"),
     ],
     ids=lambda value: None if isinstance(value, str) else "",
 )
-def test_what_json_cannot_hold_is_refused(value: Outer, message: str) -> None:
-    with pytest.raises(InputError) as error:
+def test_what_json_cannot_hold_is_refused(value: Outer, found: str, expected: str) -> None:
+    with refused(found=found, expected=expected):
         to_plain(value)
-    assert str(error.value) == message
