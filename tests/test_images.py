@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import struct
 import subprocess
@@ -39,22 +38,25 @@ from bidnerf_core.io.images import (
     resampled,
 )
 from photo_files import noise
+from refusals import refused
 
 READERS = pytest.mark.parametrize("read", [read_image, read_header], ids=["image", "header"])
 
 
-def empty_png(path: Path, width: int, height: int) -> Path:
-    """Write the PNG of a black image without making the image: a few kilobytes, whatever the size."""
+def empty_png(path: Path, width: int, height: int, declared: tuple[int, int] | None = None) -> Path:
+    """Write the PNG of a black image without making the image: a few kilobytes, whatever the size.
+
+    Its header may declare another size.
+    """
 
     def chunk(name: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", *(declared or (width, height)), 8, 0, 0, 0, 0)
     packer = zlib.compressobj()
     rows = b"".join(packer.compress(bytes(width + 1)) for _ in range(height)) + packer.flush()
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-    )
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", rows), chunk(b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
     return path
 
 
@@ -63,15 +65,9 @@ def empty_png(path: Path, width: int, height: int) -> Path:
 def test_images_of_too_many_pixels_take_no_memory(
     tmp_path: Path, read: Callable[[Path], object], size: tuple[int, int]
 ) -> None:
-    path = empty_png(tmp_path / "bomb.png", size[0], 1)
-    content = bytearray(path.read_bytes())
-    content[16:24] = struct.pack(">II", *size)
-    content[29:33] = struct.pack(">I", zlib.crc32(bytes(content[12:29])))
-    path.write_bytes(content)
+    path = empty_png(tmp_path / "bomb.png", size[0], 1, size)
     tracemalloc.start()
-    with pytest.raises(
-        InputError, match=r"bomb\.png: image is .*megapixels, expected at most 178 megapixels"
-    ):
+    with refused(where=path, found="megapixels", expected="at most 178 megapixels"):
         read(path)
     assert tracemalloc.get_traced_memory()[1] < 5e6
     tracemalloc.stop()
@@ -156,22 +152,19 @@ def test_the_first_bytes_count_not_the_name(tmp_path: Path) -> None:
 
 
 @READERS
-def test_pipes_and_devices_are_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
     pipe = tmp_path / "pipe.png"
     os.mkfifo(pipe)
-    for path, kind in ((pipe, "a named pipe"), (tmp_path, "a folder"), (Path("/dev/null"), "a device")):
-        with pytest.raises(InputError, match=f"^{path}: is {kind}, expected an image file$"):
+    for path, found in (
+        (pipe, "is a named pipe"),
+        (tmp_path, "is a folder"),
+        (Path("/dev/null"), "is a device"),
+        (tmp_path / "none.png", "no such file"),
+        (tmp_path / "a\0b.png", "cannot be opened"),
+        (tmp_path / ("a" * 300), "cannot be opened"),
+    ):
+        with refused(where=path, found=found, expected="an image file"):
             read(path)
-
-
-@READERS
-def test_missing_files_and_odd_names(tmp_path: Path, read: Callable[[Path], object]) -> None:
-    with pytest.raises(InputError, match=r"none\.png: no such file, expected an image file"):
-        read(tmp_path / "none.png")
-    with pytest.raises(InputError, match="cannot be opened"):
-        read(tmp_path / "a\0b.png")
-    with pytest.raises(InputError, match="cannot be opened"):
-        read(tmp_path / ("a" * 300))
 
 
 def test_permission_that_is_denied_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,17 +177,15 @@ def test_permission_that_is_denied_is_named(tmp_path: Path, monkeypatch: pytest.
     path.chmod(0)
     if os.access(path, os.R_OK):  # nothing is denied to root
         monkeypatch.setattr(files.Path, "open", refuse)
-    with pytest.raises(
-        InputError, match=r"a\.png: permission denied, expected a readable file: an image file"
-    ):
+    with refused(where=path, found="permission denied", expected="a readable file: an image file"):
         read_image(path)
 
 
 def test_heic_without_its_package_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
     path = tmp_path / "IMG_1.jpg"  # the content counts, not the name
     path.write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
-    with pytest.raises(InputError, match=r"IMG_1\.jpg: is HEIC, which needs the package pillow-heif \(pip"):
+    with refused(where=path, found="pip install pillow-heif"):
         read_image(path)
 
 
@@ -219,7 +210,7 @@ def test_only_formats_of_images_are_decoded_and_no_program_is_started(
         path = tmp_path / f"{kind}{suffix}"
         path.write_bytes(content)
         for read in (read_image, read_header, decode):
-            with pytest.raises(InputError, match="is in none of the formats PNG, JPEG, TIFF"):
+            with refused(where=path, found="is in none of the formats PNG, JPEG, TIFF"):
                 read(path)
     assert not started.exists()
 
@@ -239,23 +230,16 @@ def test_strips_give_what_the_whole_image_gives(
     image = Image.fromarray(noise(50, 41, 4))
     (image.convert("RGB").quantize(16) if mode == "P" else image.convert(mode)).save(path)
     background = (0.2, 0.5, 0.9)
-    whole = [
-        read_image(path, background),
-        read_image(path, background, (13, 16)),
-        (torch.tensor(decode(path)),),
-    ]
+
+    def parts() -> list[torch.Tensor | None]:
+        whole, small = read_image(path, background), read_image(path, background, (13, 16))
+        return [*whole, *small, torch.tensor(decode(path))]
+
+    before = parts()
     monkeypatch.setattr("bidnerf_core.io.images.STRIP", 41 * 7)
-    strips = [
-        read_image(path, background),
-        read_image(path, background, (13, 16)),
-        (torch.tensor(decode(path)),),
-    ]
-    for before, after in zip(itertools.chain(*whole), itertools.chain(*strips), strict=True):
-        assert (before is None) == (after is None)
-        if before is not None and after is not None:
-            assert before.equal(after)
-    small, large = whole[1][0], whole[0][0]
-    torch.testing.assert_close(small, reduced(large, 13, 16))
+    for one, other in zip(before, parts(), strict=True):
+        assert one is other is None or torch.equal(one, other)  # type: ignore[arg-type]
+    torch.testing.assert_close(before[2], reduced(before[0], 13, 16))  # type: ignore[arg-type]
 
 
 def test_a_large_image_that_is_reduced_takes_little_memory(tmp_path: Path) -> None:
@@ -274,10 +258,8 @@ def test_every_cut_of_a_file_is_one_line(tmp_path: Path, suffix: str) -> None:
     whole = path.read_bytes()
     for count in (0, 1, 10, len(whole) // 4, len(whole) // 2, len(whole) * 3 // 4):
         path.write_bytes(whole[:count])
-        with pytest.raises(InputError) as caught:
+        with refused(where=path):
             read_image(path)
-        assert str(caught.value).startswith(f"{path}: ")
-        assert "\n" not in str(caught.value)
 
 
 def test_an_error_within_the_context_keeps_its_words(tmp_path: Path) -> None:
@@ -305,24 +287,27 @@ def test_what_leaves_the_range_by_rounding_is_clamped() -> None:
     assert found.flatten().tolist() == [0, 1]
 
 
+CHANNELS = "(height, width) or (height, width, 1 to 4)"
+
+
 @pytest.mark.parametrize(
-    ("array", "said"),
+    ("array", "found", "expected"),
     [
-        (np.full((2, 2), np.nan), "rgb has 4 values that are NaN or infinite"),
-        (np.full((2, 2, 3), np.inf), "rgb has 12 values that are NaN or infinite"),
-        (np.linspace(0, 255, 12).reshape(2, 2, 3), r"floats from 0 to 255, expected \[0, 1\]; divide by 255"),
-        (np.linspace(-1, 1, 12).reshape(2, 2, 3), r"rgb has floats from -1 to 1, expected \[0, 1\]$"),
-        (np.zeros((2, 2, 3), dtype=np.int64), r"rgb has dtype int64, expected uint8 in \[0, 255\]"),
-        (np.zeros((2, 2, 3), dtype=complex), "rgb has dtype complex128"),
-        (np.zeros((2, 2), dtype=object), "rgb has dtype object"),
-        (np.zeros((3, 20, 30)), r"has shape \(3, 20, 30\).*move the channels last"),
-        (np.zeros((20, 30, 5)), r"rgb has shape \(20, 30, 5\), expected .*1 to 4\)$"),
-        (np.zeros((20, 0, 3)), "rgb has shape"),
-        (np.zeros(20), "rgb has shape"),
+        (np.full((2, 2), np.nan), "rgb has 4 values that are NaN or infinite", "[0, 1]"),
+        (np.full((2, 2, 3), np.inf), "rgb has 12 values that are NaN or infinite", "[0, 1]"),
+        (np.linspace(0, 255, 12).reshape(2, 2, 3), "floats from 0 to 255", "[0, 1]; divide by 255"),
+        (np.linspace(-1, 1, 12).reshape(2, 2, 3), "rgb has floats from -1 to 1", "[0, 1]"),
+        (np.zeros((2, 2, 3), dtype=np.int64), "rgb has dtype int64", "uint8 in [0, 255]"),
+        (np.zeros((2, 2, 3), dtype=complex), "rgb has dtype complex128", "uint8"),
+        (np.zeros((2, 2), dtype=object), "rgb has dtype object", "uint8"),
+        (np.zeros((3, 20, 30)), "rgb has shape (3, 20, 30)", "move the channels last"),
+        (np.zeros((20, 30, 5)), "rgb has shape (20, 30, 5)", CHANNELS),
+        (np.zeros((20, 0, 3)), "rgb has shape (20, 0, 3)", CHANNELS),
+        (np.zeros(20), "rgb has shape (20,)", CHANNELS),
     ],
 )
-def test_arrays_that_are_no_images(array: np.ndarray, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_arrays_that_are_no_images(array: np.ndarray, found: str, expected: str) -> None:
+    with refused(found=found, expected=expected):
         pixel_array(array, "rgb")
 
 
@@ -339,7 +324,6 @@ def test_reducing_keeps_means_and_commutes_with_compositing() -> None:
 
 @pytest.mark.parametrize("size", [(29, 17), (40, 30), (41, 1), (8, 6)])
 def test_reducing_is_opencvs_area_filter(size: tuple[int, int]) -> None:
-    cv2 = pytest.importorskip("cv2")
     image = noise(30, 41).astype(np.float32) / 255
     expected = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     np.testing.assert_allclose(reduced(torch.from_numpy(image), *size).numpy(), expected, atol=1e-6)
@@ -364,11 +348,7 @@ def test_threads_that_read_images_leave_warnings_as_they_were(tmp_path: Path) ->
 
 def test_oddities_of_a_file_cause_no_warning(tmp_path: Path) -> None:
     """Run apart, since pytest has filters of its own."""
-    path = empty_png(tmp_path / "large.png", 9500, 1)
-    content = bytearray(path.read_bytes())
-    content[16:24] = struct.pack(">II", 9500, 9500)  # Pillow warns from 89 megapixels on
-    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
-    path.write_bytes(content)
+    path = empty_png(tmp_path / "large.png", 9500, 1, (9500, 9500))  # Pillow warns from 89 megapixels on
     code = f"from pathlib import Path; from bidnerf_core.io.images import read_header; read_header(Path({str(path)!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""
