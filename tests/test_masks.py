@@ -36,6 +36,7 @@ from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training.ray_bank import RayBank
 from commands import Run
 from photo_files import write_photo
+from refusals import refused
 from tiny import config, options, views, write_dataset
 
 SIZE = (12, 8)  # width, height
@@ -97,16 +98,22 @@ def test_a_mask_that_fits_both_orientations_is_turned_by_its_own_exif(tmp_path: 
         assert torch.equal(read_mask(plain, raster, (8, 8)), upright)
 
 
-def test_unusable_masks_are_refused(tmp_path: Path) -> None:
-    black, wide = saved(tmp_path / "b.png", left() * 0), saved(tmp_path / "w.png", left(30, 8))
-    text = tmp_path / "t.png"
-    text.write_text("no image")
-    with pytest.raises(WhollyHidden, match=r"all black.*inverted"):
-        read_mask(black, Raster(*SIZE), SIZE)
-    with pytest.raises(InputError, match="mask is 30x8, but its image is 12x8"):
-        read_mask(wide, Raster(*SIZE), SIZE)
-    with pytest.raises(InputError, match=r"t\.png"):
-        read_mask(text, Raster(*SIZE), SIZE)
+@pytest.mark.parametrize(
+    ("mask", "error", "found", "expected"),
+    [
+        (left() * 0, WhollyHidden, "inverted", None),
+        (left(30, 8), InputError, "mask is 30x8, but its image is 12x8", "the same aspect ratio"),
+        (None, InputError, "is in none of the formats", "a complete image file"),
+    ],
+    ids=["black", "wide", "text"],
+)
+def test_unusable_masks_are_refused(
+    tmp_path: Path, mask: np.ndarray | None, error: type[InputError], found: str, expected: str | None
+) -> None:
+    path = tmp_path / "mask.png"
+    path.write_text("no image") if mask is None else saved(path, mask)
+    with refused(where=path, found=found, expected=expected, error=error):
+        read_mask(path, Raster(*SIZE), SIZE)
 
 
 @pytest.mark.parametrize(
@@ -120,19 +127,19 @@ def test_masks_are_found_by_the_name_of_their_photo(tmp_path: Path, name: str) -
 
 
 def test_folders_of_masks_without_masks_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder"):
+    with refused(where=tmp_path / "none", found="no such folder", expected="a folder of masks"):
         MaskFolder(tmp_path / "none")
-    with pytest.raises(InputError, match="contains no images"):
+    with refused(where=tmp_path, found="contains no images", expected="masks"):
         MaskFolder(tmp_path)
     saved(tmp_path / "a" / "1.png", left())
     saved(tmp_path / "b" / "1.png", left())
     masks = MaskFolder(tmp_path)
     assert masks.file_of("a_1") == tmp_path / "a" / "1.png"
-    with pytest.raises(InputError, match="both match 1"):
+    with refused(found="both match 1", expected="one mask"):
         masks.file_of("1")
-    with pytest.raises(InputError, match=r"no mask in it.*x\.png"):
+    with refused(where=tmp_path, found="no mask in it", expected="x.png"):
         masks.require_any(["x", "y"])
-    with pytest.raises(InputError, match="black, white"):
+    with refused(found="mask_hides is 'grey'", expected="one of black, white"):
         MaskFolder(tmp_path, "grey")  # type: ignore[arg-type]
 
 
@@ -157,7 +164,7 @@ def masked_dataset(folder: Path, **keys: str) -> Path:
 
 def test_mask_path_and_dynamic_masks_are_read(tmp_path: Path) -> None:
     data = masked_dataset(tmp_path, mask_path="masks/{}.png")
-    with pytest.raises(InputError, match="mask_path"):
+    with refused(found="no mask", expected="mask_path"):
         open_dataset(data)
     names = [f"r_{number:04d}" for number in range(3)]
     for name in names[:2]:
@@ -170,7 +177,7 @@ def test_mask_path_and_dynamic_masks_are_read(tmp_path: Path) -> None:
     saved(data / "images" / f"dynamic_mask_{names[0]}.png", left(24, 24))
     with pytest.warns(InputWarning):
         opened = open_dataset(data)
-    with pytest.raises(WhollyHidden):  # the one hides the left, the other the rest
+    with refused(error=WhollyHidden):  # the one hides the left, the other the rest
         opened.views("train", names[:1])
     assert [view.frame.name for view in opened.views("train")] == names[1:]
     assert wholly_hidden(opened, "train") == []  # neither mask hides everything by itself
@@ -190,7 +197,7 @@ def test_a_folder_of_masks_serves_datasets_and_sequences(tmp_path: Path) -> None
     timed = {f.frame.name: f.frame.hidden for f in open_sequence(data, masks=tmp_path / "masks")}
     assert [name for name, hidden in timed.items() if hidden is not None] == [names[1]]
     saved(tmp_path / "others" / "zebra.png", left(24, 24))
-    with pytest.raises(InputError, match="no mask in it"):
+    with refused(where=tmp_path / "others", found="no mask in it", expected=f"{names[0]}.png"):
         open_dataset(data, masks=tmp_path / "others")
 
 
@@ -325,12 +332,12 @@ def test_training_says_what_is_hidden(tmp_path: Path, bidnerf: Run) -> None:
     assert done.status == 0
     assert "1 image left out, being entirely hidden" in done.err
     assert "masks hide 25 % of the pixels of 1 image; 1 image without hidden pixels" in done.err
-    refused = bidnerf("train", data, "--out", tmp_path / "m2", "--mask-hides", "white", *options())
-    assert (refused.status, "without --masks" in refused.err) == (2, True)
+    failed = bidnerf("train", data, "--out", tmp_path / "m2", "--mask-hides", "white", *options())
+    assert (failed.status, "without --masks" in failed.err) == (2, True)
     for name in (first, second):
         saved(masks / f"{name}.png", 0 * left(24, 24))
-    refused = bidnerf("train", data, "--out", tmp_path / "m3", "--masks", masks, *options())
-    assert (refused.status, "masks hide every image" in refused.err) == (1, True)
+    failed = bidnerf("train", data, "--out", tmp_path / "m3", "--masks", masks, *options())
+    assert (failed.status, "masks hide every image" in failed.err) == (1, True)
 
 
 def test_training_in_memory_takes_hidden_pixels(caplog: pytest.LogCaptureFixture) -> None:
