@@ -175,28 +175,23 @@ def write_fisheye(folder: Path, **changes: object) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("in_folder", [False, True])
 @pytest.mark.parametrize("changes", [{}, {"camera_model": None, "is_fisheye": True}])
-def test_fisheye_in_transforms(changes: dict[str, object], tmp_path: Path) -> None:
-    dataset = open_dataset(write_fisheye(tmp_path, **changes))
+def test_fisheye_in_transforms_has_masks_of_the_images_as_stored(
+    changes: dict[str, object], in_folder: bool, tmp_path: Path
+) -> None:
+    folder, masks = write_fisheye(tmp_path, **changes), tmp_path / "masks"
+    masks.mkdir()
+    (masks / "1.png").write_bytes((folder / "mask.png").read_bytes())
+    dataset = open_dataset(folder, masks=masks if in_folder else None)
     (first,), (second,) = dataset.views("test"), dataset.views("train")
     assert first.frame.intrinsics == lens_of("OPENCV_FISHEYE").pinhole
     assert error_of(first.frame) < 4
-    assert second.frame.hidden is not None
-    left = second.frame.hidden[:, : int(first.frame.intrinsics.cx) - 2]
-    assert bool(left.all()), "masks are of the image as it is stored"
-    assert not bool(second.frame.hidden[40:-40, int(first.frame.intrinsics.cx) + 2 : -40].any())
-
-
-def test_masks_in_a_folder_are_of_the_images_as_stored(tmp_path: Path) -> None:
-    folder, masks = write_fisheye(tmp_path), tmp_path / "masks"
-    masks.mkdir()
-    (masks / "0.png").write_bytes((folder / "mask.png").read_bytes())
-    (view,) = open_dataset(folder, masks=masks).views("test")
-    hidden, middle = view.frame.hidden, int(view.frame.intrinsics.cx)
+    hidden, middle = second.frame.hidden, int(first.frame.intrinsics.cx)
     assert hidden is not None
     assert bool(hidden[:, : middle - 2].all())
     assert not bool(hidden[40:-40, middle + 2 : -40].any())
-    assert view.frame.held_rgb.dtype == torch.uint8
+    assert second.frame.held_rgb.dtype == torch.uint8
 
 
 @pytest.mark.parametrize(("size", "factor"), [((400, 320), 2), ((100, 80), 0.5)])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.errors import InputError
+from refusals import refused
 
 CODES = range(1, 9)
 WIDTH, HEIGHT = 9, 6
@@ -77,6 +77,6 @@ def test_turning_by_a_quarter_four_times_changes_nothing() -> None:
 
 def test_a_tilted_sensor_cannot_be_transposed() -> None:
     camera = Intrinsics(11.0, 12.0, 4.0, 3.4, WIDTH, HEIGHT, (0.0,) * 12 + (0.1, 0.2))
-    with pytest.raises(InputError, match="tilted sensor cannot be rotated"):
+    with refused(found="tilted sensor cannot be rotated", expected="an upright image"):
         camera.upright(Orientation.from_exif(6))
     assert camera.upright(Orientation.from_exif(3)).distortion[12:] == (-0.1, -0.2)

@@ -9,10 +9,10 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.scenes.primitives import Box, Cylinder, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import blotches, checker, stripes
+from refusals import refused
 
 PAINT = checker((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)
 SHAPES = [Sphere(0.7), Box((0.3, 0.6, 0.5)), Cylinder(0.5, 0.4), Cylinder(0.8, 0.01)]
@@ -105,7 +105,7 @@ def test_normals_are_the_gradient_of_the_implicit_function(shape: Shape, generat
 
 def test_impossible_shapes_are_refused() -> None:
     for make in (lambda: Sphere(0.0), lambda: Box((1.0, -1.0, 1.0)), lambda: Cylinder(1.0, float("nan"))):
-        with pytest.raises(InputError, match="expected positive"):
+        with refused(found="expected positive numbers of metres"):
             make()
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.robust import Robust, RobustName, chi_squared_quantile
+from refusals import refused
 
 NAMES = get_args(RobustName)
 SCALE = 0.3
@@ -74,7 +74,7 @@ def test_barrons_general_form(name: RobustName, alpha: float) -> None:
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
 def test_a_scale_that_is_none_is_told(scale: float) -> None:
-    with pytest.raises(InputError, match="positive"):
+    with refused(found=f"is {scale}", expected="a positive number"):
         Robust("huber", scale)
 
 

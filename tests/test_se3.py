@@ -1,4 +1,4 @@
-"""Laws of rigid transforms: at the identity, near it, far from it, and against scipy and kornia."""
+"""Laws of rigid transforms: at the identity, near it, far from it, and against scipy's matrix exponential."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.geometry.liegroup import Se3
 from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import (
     SE3,
     se3_left_jacobian,
@@ -23,6 +20,7 @@ from bidnerf_core.geometry.se3 import (
     so3_left_jacobian,
     so3_left_jacobian_inverse,
 )
+from refusals import refused
 
 SIZES = [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.0099, 0.0101, 0.5, 2.0, math.pi - 1e-3, math.pi - 1e-6]
 
@@ -42,15 +40,10 @@ def generator_matrix(xi: torch.Tensor) -> np.ndarray:
 tangents = st.builds(tangent, st.floats(0, math.pi - 1e-4), st.integers(0, 10**6), st.floats(0, 1e4))
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_exp_is_the_matrix_exponential(size: float) -> None:
-    xi = tangent(size)
-    np.testing.assert_allclose(SE3.exp(xi).matrix().numpy(), expm(generator_matrix(xi)), atol=1e-9, rtol=1e-9)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_log_inverts_exp(size: float) -> None:
-    xi = tangent(size, seed=1)
+def test_exp_is_the_matrix_exponential_and_log_inverts_it() -> None:
+    xi = torch.stack([tangent(size, seed) for size in SIZES for seed in (0, 1)])
+    expected = np.stack([expm(generator_matrix(x)) for x in xi])
+    np.testing.assert_allclose(SE3.exp(xi).matrix().numpy(), expected, atol=1e-9, rtol=1e-9)
     torch.testing.assert_close(SE3.exp(xi).log(), xi, atol=1e-8, rtol=1e-8)
 
 
@@ -85,24 +78,15 @@ def test_adjoint_moves_a_tangent_to_the_other_side(a: torch.Tensor, b: torch.Ten
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_jacobians_against_finite_differences(size: float) -> None:
-    xi = tangent(size, seed=2)
-    eps = 1e-6
-    columns_left, columns_right = [], []
-    for k in range(6):
-        step = torch.zeros(6, dtype=torch.float64)
-        step[k] = eps
-        plus, minus, here = SE3.exp(xi + step), SE3.exp(xi - step), SE3.exp(xi)
-        columns_left.append(((plus @ here.inverse()).log() - (minus @ here.inverse()).log()) / (2 * eps))
-        columns_right.append(((here.inverse() @ plus).log() - (here.inverse() @ minus).log()) / (2 * eps))
-    torch.testing.assert_close(se3_left_jacobian(xi), torch.stack(columns_left, -1), atol=2e-7, rtol=1e-6)
-    torch.testing.assert_close(se3_right_jacobian(xi), torch.stack(columns_right, -1), atol=2e-7, rtol=1e-6)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_rotation_jacobian_and_its_inverse(size: float) -> None:
-    phi = tangent(size)[3:]
-    product = so3_left_jacobian(phi) @ so3_left_jacobian_inverse(phi)
+def test_jacobians_against_finite_differences_and_the_inverse_of_rotations(size: float) -> None:
+    xi, eps = tangent(size, seed=2), 1e-6
+    steps = eps * torch.eye(6, dtype=torch.float64)
+    plus, minus, back = SE3.exp(xi + steps), SE3.exp(xi - steps), SE3.exp(xi).inverse()
+    left = ((plus @ back).log() - (minus @ back).log()).mT / (2 * eps)
+    right = ((back @ plus).log() - (back @ minus).log()).mT / (2 * eps)
+    torch.testing.assert_close(se3_left_jacobian(xi), left, atol=2e-7, rtol=1e-6)
+    torch.testing.assert_close(se3_right_jacobian(xi), right, atol=2e-7, rtol=1e-6)
+    product = so3_left_jacobian(xi[3:]) @ so3_left_jacobian_inverse(xi[3:])
     torch.testing.assert_close(product, torch.eye(3, dtype=torch.float64), atol=1e-9, rtol=0)
 
 
@@ -117,13 +101,6 @@ def test_derivative_of_log_is_the_inverse_right_jacobian() -> None:
     xi, zero = tangent(1.3), torch.zeros(6, dtype=torch.float64)
     found = torch.autograd.functional.jacobian(lambda d: SE3.exp(xi).retract(d).log(), zero)
     torch.testing.assert_close(found, torch.linalg.inv(se3_right_jacobian(xi)), atol=1e-8, rtol=1e-8)
-
-
-def test_against_kornia_and_scipy() -> None:
-    xi = torch.stack([tangent(s, seed=i) for i, s in enumerate(SIZES)])
-    torch.testing.assert_close(SE3.exp(xi).matrix(), Se3.exp(xi).matrix().detach(), atol=1e-8, rtol=1e-8)
-    turned = Rotation.from_rotvec(xi[:, 3:].numpy()).as_matrix()
-    np.testing.assert_allclose(SE3.exp(xi).rotation.numpy(), turned, atol=1e-9)
 
 
 def test_batches_broadcast_against_leading_axes() -> None:
@@ -144,15 +121,10 @@ def test_normalized_is_the_nearest_rigid_transform() -> None:
     assert float((noisy.normalized().rotation - T.rotation).abs().max()) < 1e-3
 
 
-@pytest.mark.parametrize("spoil", ["nan", "mirror", "scale"])
-def test_is_rigid_refuses(spoil: str) -> None:
+def test_what_is_not_finite_mirrored_or_scaled_is_not_rigid() -> None:
     T = SE3.exp(tangent(1.0))
-    change = {
-        "nan": torch.full((3,), math.nan),
-        "mirror": torch.tensor([1.0, 1.0, -1.0]),
-        "scale": torch.full((3,), 1.1),
-    }
-    assert not bool(SE3(T.rotation * change[spoil].double(), T.translation).is_rigid())
+    for change in ([math.nan] * 3, [1.0, 1.0, -1.0], [1.1] * 3):
+        assert not bool(SE3(T.rotation * torch.tensor(change).double(), T.translation).is_rigid())
     assert not bool(SE3(T.rotation, torch.tensor([0.0, math.inf, 0.0], dtype=torch.float64)).is_rigid())
 
 
@@ -168,5 +140,6 @@ def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one() -> 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("matrix", [np.eye(4), [[1.0]], torch.eye(3), torch.eye(4)[0]])
 def test_what_is_no_tensor_of_matrices_is_refused(matrix: Any) -> None:
-    with pytest.raises(InputError, match=r"matrix (is a|has shape) .*, expected"):
+    found = f"has shape {tuple(matrix.shape)}" if isinstance(matrix, torch.Tensor) else type(matrix).__name__
+    with refused(found=found, expected="a tensor" if found[:3] != "has" else "(..., 4, 4)"):
         SE3.from_matrix(matrix)
