@@ -37,20 +37,37 @@ def matrix(camera: Intrinsics) -> list[float]:
     return [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0]
 
 
-def ros_info(camera: Intrinsics) -> str:
-    return f"""image_width: {camera.width}
-image_height: {camera.height}
+ROS_INFO = """image_width: 640
+image_height: 480
 camera_name: narrow_stereo
 camera_matrix:
   rows: 3
   cols: 3
-  data: {matrix(camera)}
+  data: {K}
 distortion_model: plumb_bob
 distortion_coefficients:
   rows: 1
-  cols: {len(camera.distortion)}
-  data: {list(camera.distortion)}
+  cols: 5
+  data: {D}
 """
+KALIBR = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: {four}
+  distortion_model: radtan
+  intrinsics: {focal_and_centre}
+  resolution: [640, 480]
+"""
+ORB_SLAM = """%YAML:1.0
+#--- ORB-SLAM ---
+Camera.type: "PinHole"
+"""
+HLOC = """dir/a.jpg PINHOLE 640 480 {camera.fx} {camera.fy} {camera.cx} {camera.cy}
+dir/b.jpg SIMPLE_RADIAL 640 480 500 311 240.75 0.1
+"""
+
+
+def ros_info(camera: Intrinsics) -> str:
+    return ROS_INFO.format(K=matrix(camera), D=list(camera.distortion))
 
 
 def ros_topic(camera: Intrinsics) -> str:
@@ -59,30 +76,21 @@ def ros_topic(camera: Intrinsics) -> str:
 
 
 def orb_slam(camera: Intrinsics) -> str:
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "width", "height")
     numbers = (camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5, *camera.distortion, *SIZE)
-    lines = (f"Camera.{name}: {number}" for name, number in zip(names, numbers, strict=True))
-    return "\n".join(["%YAML:1.0", "#--- ORB-SLAM ---", 'Camera.type: "PinHole"', *lines, ""])
+    names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "width", "height"]
+    return ORB_SLAM + "".join(f"Camera.{name}: {x}\n" for name, x in zip(names, numbers, strict=True))
 
 
 def kalibr(camera: Intrinsics) -> str:
-    return f"""cam0:
-  camera_model: pinhole
-  distortion_coeffs: {list(camera.distortion[:4])}
-  distortion_model: radtan
-  intrinsics: {[camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5]}
-  resolution: {list(SIZE)}
-"""
+    numbers = [camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5]
+    return KALIBR.format(four=list(camera.distortion[:4]), focal_and_centre=numbers)
 
 
-def opencv(camera: Intrinsics, sized: bool = True) -> str:
-    """Written by OpenCV itself, under the names of ROS with the size or under those of OpenCV's samples."""
+def opencv(camera: Intrinsics, *names: str, **sizes: int) -> str:
     storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
-    for name, size in zip(("image_width", "image_height"), SIZE if sized else (), strict=False):
-        storage.write(name, size)
-    names = ("camera_matrix", "distortion_coefficients") if sized else ("cameraMatrix", "distCoeffs")
-    storage.write(names[0], np.array(matrix(camera)).reshape(3, 3))
-    storage.write(names[1], np.array(camera.distortion))
+    arrays = (np.array(matrix(camera)).reshape(3, 3), np.array(camera.distortion))
+    for name, value in (*sizes.items(), *zip(names, arrays, strict=True)):
+        storage.write(name, value)
     return str(storage.releaseAndGetString())
 
 
@@ -98,23 +106,19 @@ def splats(*cameras: Intrinsics) -> str:
     )
 
 
-def hloc(camera: Intrinsics) -> str:
-    numbers = f"640 480 {camera.fx} {camera.fy} {camera.cx} {camera.cy}"
-    return f"dir/a.jpg PINHOLE {numbers}\ndir/b.jpg SIMPLE_RADIAL 640 480 500 311 240.75 0.1\n"
-
-
+NAMES = ("camera_matrix", "distortion_coefficients")
 FILES: dict[str, tuple[Callable[[Intrinsics], str], int]] = {
     "info.yaml": (ros_info, 5),
     "topic.yml": (ros_topic, 5),
-    "opencv.yml": (opencv, 5),
-    "no_size": (lambda camera: opencv(camera, sized=False), 5),
+    "opencv.yml": (lambda camera: opencv(camera, *NAMES, image_width=640, image_height=480), 5),
+    "no_size": (lambda camera: opencv(camera, "cameraMatrix", "distCoeffs"), 5),
     "slam.yaml": (orb_slam, 5),
     "kalibr.yaml": (kalibr, 4),
     "open3d.json": (lambda camera: json.dumps(open3d(camera)), 0),
     "view.json": (lambda camera: json.dumps({"extrinsic": [1.0] * 16, "intrinsic": open3d(camera)}), 0),
     "path.json": (lambda camera: json.dumps({"parameters": [{"intrinsic": open3d(camera)}] * 3}), 0),
     "splats.json": (splats, 0),
-    "list.txt": (hloc, 0),
+    "list.txt": (lambda camera: HLOC.format(camera=camera), 0),
 }
 """What writes a camera as other programs do, and how many of its coefficients the format keeps."""
 
@@ -195,7 +199,9 @@ def test_focal_lengths_in_millimetres_are_questioned(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        ros_info(replace(CAMERA, distortion=D[:4])).replace("plumb_bob", "equidistant"),
+        ros_info(replace(CAMERA, distortion=D[:4]))
+        .replace("plumb_bob", "equidistant")
+        .replace("cols: 5", "cols: 4"),
         kalibr(CAMERA).replace("radtan", "equidistant"),
         orb_slam(CAMERA).replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4"),
     ],
@@ -210,7 +216,7 @@ def test_fisheye_calibrations(content: str, tmp_path: Path) -> None:
 
 
 def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
-    (tmp_path / "list.txt").write_text(hloc(IDEAL))
+    (tmp_path / "list.txt").write_text(HLOC.format(camera=IDEAL))
     (tmp_path / "splats.json").write_text(splats(IDEAL, replace(IDEAL, fx=600.0, fy=610.0)))
     assert read_camera(tmp_path / "list.txt", SIZE, "dir/b.jpg") != IDEAL
     for name in ("b.png", "folder/b.png", "b", "C:\\photos\\b.png"):
