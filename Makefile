@@ -9,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 REQUIREMENTS := pyproject.toml constraints.txt
 DEMO_OUT := demo-out
-SHAPES := tests/test_contract.py::TestHashGrid tests/test_cli_bake.py::test_a_baked_map_needs_no_start
+SHAPES := tests/testing/test_contract.py::TestHashGrid tests/cli/test_cli_bake.py::test_a_baked_map_needs_no_start
 # A process a core, of one thread each; a file's tests share fixtures, and conftest.py puts the longest files first.
 PARALLEL := -n logical --dist loadfile --no-loadscope-reorder
 PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL)
