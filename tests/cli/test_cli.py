@@ -48,25 +48,6 @@ QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays
 Edit = Callable[[Path], None]
 
 
-@pytest.fixture(scope="session")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset, ``data``, and a map of it, ``map``; tests change copies only."""
-    folder = tmp_path_factory.mktemp("cli")
-    tiny.write_dataset(folder / "data")
-    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
-    return folder
-
-
-@pytest.fixture
-def data(shared: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(shared / "data", tmp_path / "data"))
-
-
-@pytest.fixture
-def map_folder(shared: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(shared / "map", tmp_path / "map"))
-
-
 @pytest.fixture
 def interrupted(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A map whose training was stopped half-way."""
