@@ -23,8 +23,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from bidnerf_core.localization import Outcome, confidence
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics
+from bidnerf_core.localization import LandmarkDiagnostics, Outcome, confidence
 
 STORED = Path(confidence.__file__).with_suffix(".json")
 RIDGE = 0.005

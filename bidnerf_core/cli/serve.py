@@ -11,10 +11,8 @@ import tyro
 from bidnerf_core.cli.options import Device, option, parse, require
 from bidnerf_core.cli.output import say
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import read_record
-from bidnerf_core.service import server
-from bidnerf_core.service.settings import LEAST_TOKEN, ServiceLimits
+from bidnerf_core.io import read_file, read_record
+from bidnerf_core.service import LEAST_TOKEN, ServiceLimits, server
 
 TOKEN = "BIDNERF_TOKEN"
 """The environment variable that may hold the token; a command-line argument would be visible to all users of

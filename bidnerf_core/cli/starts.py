@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.datasets.queries import Query
+from bidnerf_core.datasets import Query
 from bidnerf_core.errors import UsageError
 from bidnerf_core.evaluation import protocols
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.results.pose_files import pose_of
+from bidnerf_core.geometry import SE3
+from bidnerf_core.results import pose_of
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from bidnerf_core.backend import load_backend
-from bidnerf_core.captures.training_views import RefinementChoice
+from bidnerf_core.captures import RefinementChoice
 from bidnerf_core.cli.camera_options import (
     DatasetCamera,
     DatasetDepthUnit,
@@ -32,19 +32,22 @@ from bidnerf_core.cli.options import (
     wrong_usage,
 )
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.datasets import Background, open_dataset
-from bidnerf_core.datasets.colmap import SparseChoice
+from bidnerf_core.datasets import SparseChoice, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.io.images import background_colour
-from bidnerf_core.io.json import from_plain
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
-from bidnerf_core.maps import training
-from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS
-from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
-from bidnerf_core.maps.views import Images
+from bidnerf_core.io import Background, background_colour, from_plain
+from bidnerf_core.mapping import USUAL_FEATURES
+from bidnerf_core.maps import (
+    CHECKPOINT_SECONDS,
+    DESCRIPTION,
+    Images,
+    MapInfo,
+    load_info,
+    longest_side,
+    training,
+)
 from bidnerf_core.settings import to_flat
-from bidnerf_core.structure.sources import lacks_poses
+from bidnerf_core.structure import lacks_poses
 
 
 def run(arguments: list[str]) -> None:

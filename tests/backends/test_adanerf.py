@@ -15,17 +15,18 @@ from bidnerf_adanerf.bins import Bins, chosen
 from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_weights
 from bidnerf_adanerf.oracle_loss import ENOUGH, by_depth, by_weight, oracle_loss
 from bidnerf_adanerf.recipe import Phase, phase_at, room_for_matter, sparsity
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import FieldValues, Rays, RaySamples
-from bidnerf_core.fields.rendering import query_samples, render, rendering_weights
-from bidnerf_core.frames.frame import View
-from bidnerf_core.scenes.closed_form import views as seen_from
-from bidnerf_core.scenes.demo import demo_object, demo_room
+from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, render, rendering_weights
+from bidnerf_core.frames import View
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.scenes import views as seen_from
+from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.scenes.trajectories import look_around
-from bidnerf_core.testing import BackendContract
-from bidnerf_core.testing.recipes import Recorder, colour_error
-from bidnerf_core.testing.scene import BOUNDS, SIDE, awkward_rays, points, rgbd_views
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing import BackendContract, Recorder
+from bidnerf_core.testing.recipes import colour_error
+from bidnerf_core.testing.scene import SIDE, awkward_rays, points, rgbd_views
 from bidnerf_core.training import RayBank, TrainingBatch
 from tiny import black_batch
 

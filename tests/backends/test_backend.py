@@ -11,7 +11,7 @@ from torch import nn
 
 from bidnerf_adanerf import backend as adanerf
 from bidnerf_core.backend import Backend, QuickConfig, RecipeBackend, quick_config
-from bidnerf_core.testing.scene import BOUNDS
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid

@@ -12,10 +12,18 @@ from torch import Tensor
 
 import tiny
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import Concentrated, Resampled, SplittingSampler
-from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.fields import (
+    Concentrated,
+    FieldValues,
+    RadianceField,
+    Rays,
+    RaySampler,
+    Resampled,
+    SceneBounds,
+    VoxelGrid,
+    render,
+)
+from bidnerf_core.fields.sampling import SplittingSampler
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
 from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid

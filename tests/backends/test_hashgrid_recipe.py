@@ -8,7 +8,7 @@ import torch
 
 import tiny
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields import SceneBounds
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.recipe import adapted

@@ -14,19 +14,29 @@ from torch import Tensor
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField, RaySampler, RaySamples, SceneBounds, levels
-from bidnerf_core.fields.encoding import encoded_width, frequency_encoding, octaves
-from bidnerf_core.fields.rendering import query_samples, render
-from bidnerf_core.fields.sampling import Importance, OccupiedOnly, Stratified
-from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
-from bidnerf_core.frames.frame import View
-from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.files import save_map
-from bidnerf_core.maps.map import load_map
-from bidnerf_core.testing import BackendContract
-from bidnerf_core.testing.recipes import Recorder
-from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views
+from bidnerf_core.fields import (
+    Importance,
+    OccupancyMask,
+    OccupiedOnly,
+    RadianceField,
+    RaySampler,
+    RaySamples,
+    SceneBounds,
+    Stratified,
+    VoxelGrid,
+    encoded_width,
+    frequency_encoding,
+    levels,
+    octaves,
+    query_samples,
+    render,
+)
+from bidnerf_core.frames import View
+from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.maps import MapInfo, load_map, save_map
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing import BackendContract, Recorder, rgb_views
+from bidnerf_core.testing.scene import SIDE, points, rgbd_views
 from bidnerf_core.training import RayBank, Supervision, TrainingState, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig

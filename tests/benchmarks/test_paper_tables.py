@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bidnerf_core.evaluation.bench import Plan, planned
+from bidnerf_core.evaluation import Plan, planned
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "paper_tables.py"
 PLACE = "demo:blobs"

@@ -11,13 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.files import read_camera
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.lenses import CentralLens
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.queries import Photos, depth_files
+from bidnerf_core.camera import CameraSource, CentralLens, Intrinsics, read_camera
+from bidnerf_core.datasets import Photos, depth_files
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame
 from photo_files import noise, write_photo
 
 SIZE = (640, 480)

@@ -12,11 +12,17 @@ from typing import Any
 import pytest
 import torch
 
-from bidnerf_core.camera.exif import Exif, read_exif
-from bidnerf_core.camera.files import read_camera
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.camera.source import CameraSource, FoundCamera, Raster
+from bidnerf_core.camera import (
+    UPRIGHT,
+    CameraSource,
+    Exif,
+    FoundCamera,
+    Intrinsics,
+    Orientation,
+    Raster,
+    read_camera,
+    read_exif,
+)
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from photo_files import noise, write_photo

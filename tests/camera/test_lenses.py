@@ -13,21 +13,22 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.camera.colmap_models import MODELS, colmap_camera
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.lenses import (
-    LENS_MODELS,
+from bidnerf_core.camera import (
+    MODELS,
     PANORAMA_FACES,
     CentralLens,
+    Intrinsics,
     Lens,
+    Orientation,
     PanoramaFace,
-    lens_camera,
+    colmap_camera,
 )
-from bidnerf_core.camera.orientation import CODES, Orientation
+from bidnerf_core.camera.lenses import LENS_MODELS, lens_camera
+from bidnerf_core.camera.orientation import CODES
 from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
 from photo_files import write_photo
 
 PARAMETERS = {
@@ -107,7 +108,7 @@ def test_fisheye_is_opencvs_and_resampling_its_undistortion() -> None:
 @pytest.mark.parametrize("model", LENS_MODELS)
 def test_an_undistorted_image_is_that_of_its_pinhole_camera(model: str) -> None:
     lens = lens_of(model)
-    from bidnerf_core.frames.resampling import Images
+    from bidnerf_core.frames import Images
 
     depth = torch.ones(SIZE[1], SIZE[0])
     frame = Frame.taken("f", lens, Images(torch.from_numpy(photo_of(lens)), depth, depth))

@@ -10,8 +10,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
+from bidnerf_core.camera import UPRIGHT, Intrinsics, Orientation
 from bidnerf_core.errors import InputError
 
 CODES = range(1, 9)

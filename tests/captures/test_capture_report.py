@@ -14,21 +14,28 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
-from bidnerf_core.captures.advice import SUMMARY_LINES, sentences, summary
+from bidnerf_core.captures import (
+    CaptureReport,
+    Gap,
+    PhotoRecord,
+    UpDirection,
+    given_up,
+    sentences,
+    summary,
+    surveyed,
+)
+from bidnerf_core.captures.advice import SUMMARY_LINES
 from bidnerf_core.captures.links import groups
 from bidnerf_core.captures.photos import exposures, nearby, photo_measures
-from bidnerf_core.captures.report import CaptureReport, CoverageRecord, Gap, PhotoRecord
-from bidnerf_core.captures.survey import surveyed
-from bidnerf_core.captures.up_direction import UpDirection, given_up
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.geometry.looking import look_at
-from bidnerf_core.io.json import from_plain, to_plain
+from bidnerf_core.captures.report import CoverageRecord
+from bidnerf_core.fields import render_image
+from bidnerf_core.geometry import look_at
+from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.mapping import HeldOutTrial, LandmarkConfig, tracked_views
-from bidnerf_core.results.capture_plot import draw_capture
-from bidnerf_core.scenes.closed_form import views
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.testing.textured_field import BOUNDS, TexturedGround
+from bidnerf_core.results import draw_capture
+from bidnerf_core.scenes import demo_object, orbit, views
+from bidnerf_core.testing import BOUNDS
+from bidnerf_core.testing.textured_field import TexturedGround
 from landmark_scene import Points, looking_in, ring
 
 CAMERA = Intrinsics(162.0, 162.0, 80.0, 60.0, 160, 120)

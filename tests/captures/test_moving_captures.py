@@ -12,40 +12,42 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
-from bidnerf_core.camera.rolling_shutter import STILL
-from bidnerf_core.captures import training_views
-from bidnerf_core.captures.cameras import (
+from bidnerf_core.camera import STILL
+from bidnerf_core.captures import (
     PoseRefinement,
     at_stored_poses,
-    moved_from,
     pose_sentences,
     stored_cameras,
+    training_views,
+    tried_landmarks,
 )
+from bidnerf_core.captures.cameras import moved_from
 from bidnerf_core.captures.shutter_evidence import common_motion
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
-from bidnerf_core.captures.trial import tried_landmarks
-from bidnerf_core.fields.rendering import render, render_image
-from bidnerf_core.frames.pixels import all_pixels, observe
-from bidnerf_core.localization import LandmarkMatcher, propose
+from bidnerf_core.fields import render, render_image
+from bidnerf_core.frames import observe
+from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.localization import LandmarkMatcher, Motion, propose
 from bidnerf_core.localization.landmarks.hypotheses import (
     SHARE_AS_MAP,
     SHARE_MOVING,
-    Motion,
     camera_hypotheses,
     posterior,
     share_moving,
 )
 from bidnerf_core.mapping import (
+    GIVEN,
     LandmarkConfig,
     TrackedViews,
     landmark_tensors,
     landmarks_from_tensors,
+    observed_at_rest,
+    pose_updates,
     resect,
     tracked_views,
 )
-from bidnerf_core.mapping.geometry.calibration import GIVEN
-from bidnerf_core.mapping.landmarks.building import observed_at_rest, pose_updates
-from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, ground
+from bidnerf_core.testing.textured_field import unseen
 from bidnerf_core.training import RayBank
 from landmark_scene import PINHOLE, Points, looking_in
 

@@ -11,11 +11,10 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_
 from torch import Tensor
 
 from bidnerf_core import SE3, InputError, register
-from bidnerf_core.captures.pose_conventions import PoseContradiction, pose_contradiction
+from bidnerf_core.captures import pose_contradiction, prepared
+from bidnerf_core.captures.pose_conventions import PoseContradiction
 from bidnerf_core.captures.pose_readings import AS_GIVEN, Y_AND_Z_REVERSED, readings, signed_permutations
-from bidnerf_core.captures.training_views import prepared
-from bidnerf_core.mapping import ImageKeypoints
-from bidnerf_core.mapping.landmarks.building import posed_keypoints
+from bidnerf_core.mapping import ImageKeypoints, posed_keypoints
 from landmark_scene import Points, looking_in, ring
 
 REVERSED = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))

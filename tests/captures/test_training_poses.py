@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
-from bidnerf_core.captures.cameras import (
+from bidnerf_core.captures import (
     PoseRefinement,
     as_given,
     at_stored_poses,
     moved_cameras,
-    moved_from,
     pose_sentences,
     stored_cameras,
 )
+from bidnerf_core.captures.cameras import moved_from
 from bidnerf_core.captures.pose_refinement import adjusted_poses
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
 from bidnerf_core.datasets import open_dataset

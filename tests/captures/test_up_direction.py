@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core.captures.up_direction import given_up, up_direction
+from bidnerf_core.captures import given_up, up_direction
 from bidnerf_core.datasets.record3d import Record3DDataset
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 WORLD = SE3.exp(torch.tensor([0.0, 0, 0, 0.7, -1.1, 0.4], dtype=torch.float64)).rotation
 UP = WORLD @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -80,9 +80,8 @@ def test_gravity_is_taken_as_it_is() -> None:
 
 def test_datasets_that_wrap_others_keep_what_these_know() -> None:
     """A scan's unit and gravity reach training whatever masks or splits are chosen."""
-    from bidnerf_core.datasets.dataset import Georeferenced
+    from bidnerf_core.datasets import Georeferenced, Splits
     from bidnerf_core.datasets.polycam import PolycamDataset
-    from bidnerf_core.datasets.splits import Splits
     from bidnerf_core.datasets.whole import WholeDataset
 
     scan = PolycamDataset(Splits(Path("scan"), {"train": []}), None)

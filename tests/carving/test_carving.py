@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import FreeSpace, estimate_bounds, occupied_cells
 from bidnerf_core.carving.bounds import ONE_PLACE, ROOM, measured_points
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 
 CAMERA = Intrinsics(60.0, 58.0, 33.0, 23.0, 64, 48)
 LENS = replace(CAMERA, distortion=(-0.2, 0.05, 0.001, -0.002))

@@ -32,11 +32,10 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import METHODS
+from bidnerf_core.maps import MapInfo, load_info, load_map
 from bidnerf_core.maps.checkpoints import Checkpoints
-from bidnerf_core.maps.description import MapInfo, load_info
-from bidnerf_core.maps.map import load_map
 from bidnerf_core.registry import list_plugins
-from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import TrainingStep
 from commands import CommandResult, Run
 
@@ -803,7 +802,7 @@ def test_an_answer_that_is_not_finite_is_no_answer(
 ) -> None:
     from dataclasses import replace
 
-    from bidnerf_core.geometry.se3 import SE3
+    from bidnerf_core.geometry import SE3
     from bidnerf_core.localization import Localizer
 
     real, nowhere = (

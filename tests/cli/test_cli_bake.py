@@ -15,20 +15,18 @@ import torch
 
 import tiny
 from bidnerf_core import train
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures import training_views
-from bidnerf_core.captures.report import CaptureReport, CoverageRecord
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import CaptureReport, training_views
+from bidnerf_core.captures.report import CoverageRecord
 from bidnerf_core.cli import bake as command
 from bidnerf_core.cli import main
 from bidnerf_core.cli.output import read_views
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
-from bidnerf_core.maps import baking
-from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps import Map, baking, load_info, load_map
 from bidnerf_core.maps.files import save_capture
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.scenes.fields import HomogeneousBall
+from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
 from commands import Run

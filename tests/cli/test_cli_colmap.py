@@ -12,9 +12,8 @@ import sparse_model
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.groups import grouped
-from bidnerf_core.evaluation.results import read_results
-from bidnerf_core.maps.description import load_info
+from bidnerf_core.evaluation import grouped, read_results
+from bidnerf_core.maps import load_info
 from commands import CommandResult, Run
 from test_cli import stop_at
 

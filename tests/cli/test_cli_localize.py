@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import json
 import shutil
@@ -20,12 +19,11 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.cli.help_page import without_expert_settings
 from bidnerf_core.cli.options import parse
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.datasets.queries import Photos, Query
+from bidnerf_core.datasets import Photos, Query, open_dataset
 from bidnerf_core.errors import printable
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.maps.description import load_info
+from bidnerf_core.io import output_folder
+from bidnerf_core.localization import Outcome, Verdict
+from bidnerf_core.maps import load_info
 from bidnerf_core.settings import EXPERT, Settings
 from commands import Run
 
@@ -377,11 +375,7 @@ def test_public_names_are_there_and_no_others() -> None:
     for name in bidnerf_core.__all__:
         assert getattr(bidnerf_core, name) is not None
     assert set(bidnerf_core.__all__) <= set(dir(bidnerf_core))
-    source = ast.parse(Path(bidnerf_core.__file__).read_text())
-    imports = [node for node in ast.walk(source) if isinstance(node, ast.ImportFrom)]
-    declared = {name.asname: node.module for node in imports for name in node.names if name.asname}
-    assert declared == {name: f"bidnerf_core.{home}" for name, home in bidnerf_core.HOMES.items()}
-    with pytest.raises(AttributeError, match="no attribute 'localise'"):
+    with pytest.raises(AttributeError, match="attribute localise"):
         _ = bidnerf_core.localise
 
 

@@ -22,19 +22,17 @@ import torch
 
 import bidnerf_core.cli.localize as localize_module
 import bidnerf_core.cli.track as track_module
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli import _remarks_as_lines, main
 from bidnerf_core.cli.folders import check_folder, check_output
 from bidnerf_core.cli.interruptions import Interrupted, interruptions, uninterrupted
-from bidnerf_core.datasets import write_transforms
-from bidnerf_core.datasets.queries import DatasetFrames, Query
-from bidnerf_core.datasets.trajectories import read_trajectory
+from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory, write_transforms
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Localizer, Outcome, Tracker
-from bidnerf_core.results.tracked_path import TrackedPath
-from bidnerf_core.testing.textured_field import textured_map
+from bidnerf_core.results import TrackedPath
+from bidnerf_core.testing import textured_map
 from commands import Run
 from flights import flight
 from test_cli_track import StoredGround

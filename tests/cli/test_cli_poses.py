@@ -13,13 +13,13 @@ import torch
 
 import tiny
 from bidnerf_core import SE3, View
-from bidnerf_core.captures import training_views
-from bidnerf_core.captures.cameras import PoseConsistency, as_given, stored_cameras
+from bidnerf_core.captures import as_given, stored_cameras, training_views
+from bidnerf_core.captures.cameras import PoseConsistency
 from bidnerf_core.captures.training_poses import TrainingPoses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import TrackedViews, tracked_views
-from bidnerf_core.maps.description import cameras_of, load_info
+from bidnerf_core.maps import cameras_of, load_info
 from bidnerf_core.maps.files import load_capture
 from bidnerf_core.maps.views import read_views
 from commands import Run

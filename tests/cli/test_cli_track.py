@@ -19,13 +19,13 @@ import pytest
 import bidnerf_core.cli.track as track_module
 import bidnerf_core.cli.watch_folder as following
 from bidnerf_core import InputError, Tracker, View
-from bidnerf_core.captures.cameras import StoredCamera, stored_cameras
+from bidnerf_core.captures import StoredCamera, stored_cameras
 from bidnerf_core.cli.watch_folder import FrameRequest, requests
-from bidnerf_core.datasets import open_dataset, write_transforms
-from bidnerf_core.datasets.trajectories import read_trajectory
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textured_map
+from bidnerf_core.datasets import open_dataset, read_trajectory, write_transforms
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.maps import MapInfo
+from bidnerf_core.testing import CAMERA, textured_map
+from bidnerf_core.testing.textured_field import MapWithLandmarks
 from commands import Run
 from flights import covered, flight
 

@@ -13,21 +13,18 @@ import torch
 
 import sparse_model
 import tiny
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.datasets import SparseChoice, SparsePoints
 from bidnerf_core.datasets.colmap_files import read_model
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render, render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Observations, SceneBounds, render, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import rig
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.training import RayBank, Silent, ray_termination
 from bidnerf_hashgrid import backend as hashgrid
 from problems import FieldMap, localize

@@ -15,11 +15,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 
 CAMERAS = {
     1: "1 PINHOLE 16 12 20 21 8.5 6.25",

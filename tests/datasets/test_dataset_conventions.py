@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 
 pytestmark = pytest.mark.data
 PAIRS = 10

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 
 
 def test_views_come_back(tmp_path: Path) -> None:

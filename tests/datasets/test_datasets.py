@@ -18,7 +18,7 @@ from PIL import Image
 
 from bidnerf_core.datasets import READERS, Dataset, Reader, ReadOptions, open_dataset
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 W, H, ANGLE = 12, 8, 0.9
 FOCAL = W / 2 / math.tan(ANGLE / 2)

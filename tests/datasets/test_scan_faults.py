@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.datasets.phone_scans import thinned
 from bidnerf_core.datasets.posed_images import ImageFrame
 from bidnerf_core.datasets.video_frames import VideoFrames
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 from bidnerf_core.io import archives
-from bidnerf_core.testing.textured_field import training_views
+from bidnerf_core.testing import training_views
 from scan_layouts import (
     metres,
     record3d_files,

@@ -9,15 +9,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core.datasets import open_dataset, open_sequence, phone_scans
-from bidnerf_core.datasets.reader import READERS, find_reader
-from bidnerf_core.datasets.trajectories import read_trajectory
+from bidnerf_core.datasets import (
+    READERS,
+    find_reader,
+    open_dataset,
+    open_sequence,
+    phone_scans,
+    read_trajectory,
+)
 from bidnerf_core.errors import InputWarning
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 from bidnerf_core.maps.views import read_views
-from bidnerf_core.results.pose_files import PosedImage, write_poses
-from bidnerf_core.testing import ReaderContract
-from bidnerf_core.testing.textured_field import training_views
+from bidnerf_core.results import PosedImage, write_poses
+from bidnerf_core.testing import ReaderContract, training_views
 from scan_layouts import LAYOUTS, PERIOD
 
 COUNT = 10

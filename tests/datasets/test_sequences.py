@@ -14,20 +14,20 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import (
     Dataset,
     FileSequence,
     FrameSequence,
     Reader,
+    ReadingProgress,
     ReadOptions,
     open_dataset,
     open_sequence,
     write_transforms,
 )
-from bidnerf_core.datasets.dataset import ReadingProgress
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 NAMES = ("b_10", "b_2", "a_3", "b_1")
 

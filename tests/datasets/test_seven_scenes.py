@@ -11,12 +11,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
-from bidnerf_core.depth.registration import DepthCamera, register_depth
+from bidnerf_core.depth import DepthCamera
+from bidnerf_core.depth.registration import register_depth
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 SIZE = (160, 120)
 COLOUR, DEPTH = COLOUR_CAMERA.resized(*SIZE), DEPTH_CAMERA.resized(*SIZE)

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
-from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets import Dataset, open_dataset, open_sequence, unique_names
 from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 W, H = 16, 12
 Json = dict[str, Any]

@@ -16,13 +16,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets import open_dataset, open_sequence
-from bidnerf_core.datasets.trajectories import Trajectory, read_trajectory
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
+from bidnerf_core.datasets.trajectories import Trajectory
 from bidnerf_core.datasets.tum import CAMERAS, associate
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from tum_folder import Recorded, write_recording
 
 START, PERIOD = 1305031102.175304, 0.033

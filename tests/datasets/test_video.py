@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets import FrameSequence, MaskFolder, TimedFrame, open_sequence
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import FrameSequence, TimedFrame, open_sequence
 from bidnerf_core.datasets.masked import masked_sequence
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame, MaskFolder
 from photo_files import write_photo
 
 WIDTH, HEIGHT, COUNT, RATE = 64, 48, 20, 25

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.depth.images import DepthReader, depth_image, read_depth_image
+from bidnerf_core.depth import DepthReader, depth_image, read_depth_image
 from bidnerf_core.errors import InputError, InputWarning
 
 LARGEST_FLOAT = float(np.finfo(np.float32).max)

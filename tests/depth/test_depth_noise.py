@@ -10,10 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.depth import DepthNoise
 from bidnerf_core.depth.noise import DepthSteps, depth_steps, estimated_depth_noise
-from bidnerf_core.depth.sensors import KINECT, DepthNoise
+from bidnerf_core.depth.sensors import KINECT
 
 CAMERA = Intrinsics.from_hfov(60.0, 320, 240)
 LENS = Intrinsics(280.0, 280.0, 158.0, 121.0, 320, 240, (0.1, -0.05, 0.001, 0.002))

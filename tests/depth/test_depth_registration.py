@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.camera_options import depth_registration
 from bidnerf_core.datasets import DepthCamera, TimedFrame, open_dataset, open_sequence
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from tum_folder import Recorded, write_recording
 
 COLOUR = Intrinsics(131.0, 132.0, 79.0, 61.0, 160, 120)

@@ -12,17 +12,15 @@ from torch import Generator
 
 import baked
 from bidnerf_core import Intrinsics, Localizer
-from bidnerf_core.depth.noise import noise_remark
-from bidnerf_core.depth.sensors import (
+from bidnerf_core.depth import (
     DEPTH_SENSORS,
-    KINECT,
-    REALSENSE,
-    RENDERED,
     UNKNOWN,
     DepthNoise,
     DepthSensorModel,
     find_depth_sensor,
+    noise_remark,
 )
+from bidnerf_core.depth.sensors import KINECT, REALSENSE, RENDERED
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import AutoConfig, settings_of
 from commands import Run

@@ -20,19 +20,27 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.bench import Plan, planned, run_trials, shard_of
+from bidnerf_core.evaluation import (
+    Plan,
+    ResultsFile,
+    ResultTable,
+    Trial,
+    TrialResult,
+    planned,
+    read_results,
+    read_runs,
+    run_trial,
+    run_trials,
+)
+from bidnerf_core.evaluation.bench import shard_of
 from bidnerf_core.evaluation.json_lines import as_line
-from bidnerf_core.evaluation.provenance import read_runs
-from bidnerf_core.evaluation.results import ResultsFile, ResultTable, read_results
-from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.evaluation.workers import InThisProcess
-from bidnerf_core.geometry.arcs import arc, mean_up, seen_middle, turned_about
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.geometry import arc, turned_about
+from bidnerf_core.geometry.arcs import mean_up, seen_middle
+from bidnerf_core.io import to_plain
 from bidnerf_core.localization import METHODS
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
-from bidnerf_core.scenes.trajectories import look_at, orbit
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import closed_form_data, closed_form_map, look_at, orbit
 from bidnerf_core.settings import to_flat
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]

@@ -13,16 +13,21 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import trials
-from bidnerf_core.evaluation.bench import Plan
-from bidnerf_core.evaluation.comparison import Comparison, map_bytes, map_labels, map_row, plan_comparison
-from bidnerf_core.evaluation.evaluate import run_comparison
-from bidnerf_core.evaluation.plots import comparison_figure
+from bidnerf_core.evaluation import (
+    Comparison,
+    Plan,
+    Trial,
+    TrialResult,
+    comparison_figure,
+    run_comparison,
+    run_trial,
+    trials,
+)
+from bidnerf_core.evaluation.comparison import map_bytes, map_labels, map_row, plan_comparison
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
-from bidnerf_core.evaluation.trials import run_trial
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
 from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
-from bidnerf_core.io.json import from_plain, to_plain
+from bidnerf_core.io import from_plain, to_plain
 
 pytestmark = pytest.mark.slow
 

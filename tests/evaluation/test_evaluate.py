@@ -18,12 +18,10 @@ import bidnerf_core as bn
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation import trials
-from bidnerf_core.evaluation.results import ResultTable, read_results
-from bidnerf_core.evaluation.trial import TrialResult
-from bidnerf_core.io.json import from_plain
-from bidnerf_core.localization.methods import find_method
-from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
+from bidnerf_core.evaluation import ResultTable, TrialResult, read_results, trials
+from bidnerf_core.io import from_plain
+from bidnerf_core.localization import find_method
+from bidnerf_core.scenes import closed_form_data, closed_form_map
 
 QUICK: dict[str, Any] = {
     "method": "bid",

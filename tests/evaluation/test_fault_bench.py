@@ -16,17 +16,27 @@ from scipy.stats import chi2
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.bench import Plan, left_to_do, planned
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, faulty
-from bidnerf_core.evaluation.groups import grouped
-from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation import (
+    FAULTS,
+    NO_FAULT,
+    Plan,
+    ResultsFile,
+    ResultTable,
+    RowStore,
+    Trial,
+    TrialResult,
+    faulty,
+    grouped,
+    key_of,
+    left_to_do,
+    planned,
+)
 from bidnerf_core.evaluation.plots import draw_faults, fault_curves
-from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
 from bidnerf_core.evaluation.trials import trial_views
 from bidnerf_core.evaluation.workers import InThisProcess
 from bidnerf_core.registry import registered
-from bidnerf_core.scenes.closed_form_data import closed_form_data
+from bidnerf_core.scenes import closed_form_data
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 

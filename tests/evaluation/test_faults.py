@@ -11,16 +11,15 @@ import pytest
 import torch
 from scipy.ndimage import label
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults
-from bidnerf_core.evaluation.faults.camera import rolling_shutter
+from bidnerf_core.evaluation import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults, rolling_shutter
 from bidnerf_core.evaluation.protocols import random_units
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.scenes.closed_form import views as seen_from
-from bidnerf_core.scenes.demo import demo_object, demo_room
-from bidnerf_core.scenes.trajectories import look_at, orbit
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.scenes import demo_object, look_at, orbit
+from bidnerf_core.scenes import views as seen_from
+from bidnerf_core.scenes.demo import demo_room
 
 CAMERA = Intrinsics(70.0, 72.0, 41.0, 29.5, 80, 60)
 LENS = dataclasses.replace(CAMERA, distortion=(0.05, -0.01, 0.001, 0.002))

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import PROTOCOLS, draw_starts, find_protocol, inerf_start
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.evaluation import PROTOCOLS, find_protocol
+from bidnerf_core.evaluation.protocols import draw_starts, inerf_start
+from bidnerf_core.geometry import SE3
+from bidnerf_core.results import pose_error
 
 TRUE = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))
 by_name = pytest.mark.parametrize("name", PROTOCOLS)

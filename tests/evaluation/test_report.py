@@ -19,15 +19,27 @@ from scipy.stats import mannwhitneyu
 
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.groups import grouped, situation_titles, situations
+from bidnerf_core.evaluation import (
+    NEVER,
+    ResultTable,
+    Trial,
+    TrialResult,
+    grouped,
+    median,
+    note_run,
+    pairwise_tests,
+    provenance,
+    script_command,
+    steps_of,
+    summarize,
+)
+from bidnerf_core.evaluation.groups import situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
-from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
 from bidnerf_core.evaluation.report import page
-from bidnerf_core.evaluation.results import ResultTable
-from bidnerf_core.evaluation.summary import NEVER, compare_pair, median, pairwise_tests, steps_of, summarize
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.results.errors import success_rate_by_frame
+from bidnerf_core.evaluation.summary import compare_pair
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
+from bidnerf_core.io import to_plain
+from bidnerf_core.results import success_rate_by_frame
 
 STEPS = 10
 

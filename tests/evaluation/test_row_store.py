@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.evaluation import RowStore, write_record
 
 
 def test_a_script_goes_on_where_it_was_killed(tmp_path: Path) -> None:

@@ -16,11 +16,11 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.trial import Trace, Trial, TrialResult
-from bidnerf_core.evaluation.trials import forget_peak_memory, peak_memory_bytes, run_trial
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.evaluation import Trial, TrialResult, forget_peak_memory, peak_memory_bytes, run_trial
+from bidnerf_core.evaluation.trial import Trace
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.results import pose_error
 
 QUICK = '{"max_steps": 4, "rays": 64}'
 

@@ -7,12 +7,10 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField, Rays, RaySampler, SceneBounds, levels
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.fields import RadianceField, Rays, RaySampler, SceneBounds, Stratified, levels, render
+from bidnerf_core.geometry import SE3
+from bidnerf_core.scenes import HomogeneousBall, orbit
+from bidnerf_core.scenes.fields import GaussianBlobs
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)
 

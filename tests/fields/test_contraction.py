@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.contraction import RaySpacing, contract, expand
-from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.fields import RaySpacing, SceneBounds, VoxelGrid, contract_points
+from bidnerf_core.fields.contraction import expand
 
 OPEN = SceneBounds((-1.0, -2.0, 0.5), (2.0, 1.0, 3.0), 0.1, 400.0, contracted=True)
 
@@ -16,15 +15,15 @@ def points(scale: float, count: int = 2000) -> torch.Tensor:
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0, 1e6])
 def test_contraction_is_inverted_and_bounded(scale: float) -> None:
-    contracted = contract(points(scale))
+    contracted = contract_points(points(scale))
     assert float(contracted.abs().max()) < 2
     torch.testing.assert_close(expand(contracted), points(scale), rtol=1e-7, atol=1e-12)
 
 
 def test_near_points_stay_and_far_ones_keep_their_direction() -> None:
     near = points(0.1).clamp(-1, 1)
-    assert torch.equal(contract(near), near)
-    far, drawn = points(50.0), contract(points(50.0))
+    assert torch.equal(contract_points(near), near)
+    far, drawn = points(50.0), contract_points(points(50.0))
     torch.testing.assert_close(
         torch.nn.functional.normalize(drawn, dim=-1), torch.nn.functional.normalize(far, dim=-1)
     )
@@ -32,18 +31,20 @@ def test_near_points_stay_and_far_ones_keep_their_direction() -> None:
 
 def test_contraction_is_continuous_where_it_begins() -> None:
     face = points(1.0) / points(1.0).abs().amax(-1, keepdim=True)
-    torch.testing.assert_close(contract(face * (1 + 1e-9)), contract(face * (1 - 1e-9)), rtol=0, atol=1e-8)
+    torch.testing.assert_close(
+        contract_points(face * (1 + 1e-9)), contract_points(face * (1 - 1e-9)), rtol=0, atol=1e-8
+    )
 
 
 def test_contraction_has_the_derivative_that_differences_show() -> None:
-    assert torch.autograd.gradcheck(contract, points(3.0, 40).requires_grad_())
+    assert torch.autograd.gradcheck(contract_points, points(3.0, 40).requires_grad_())
 
 
 def test_farther_is_never_nearer_in_contracted_space() -> None:
     along = torch.linspace(0, 1000, 5000, dtype=torch.float64)[:, None] * torch.tensor(
         [0.48, -0.6, 0.64], dtype=torch.float64
     )
-    assert bool((contract(along).norm(dim=-1).diff() > 0).all())
+    assert bool((contract_points(along).norm(dim=-1).diff() > 0).all())
 
 
 @pytest.mark.parametrize("radius", [1.5, float("inf")])

@@ -10,11 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core.fields.contract import FieldValues, HitField, RayHits, Rays
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import HitsAroundDepth, Stratified
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import (
+    FieldValues,
+    HitField,
+    HitsAroundDepth,
+    Observations,
+    RayHits,
+    Rays,
+    Stratified,
+    render,
+)
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.linearization import linearize
 from bidnerf_core.testing.samples import check_hits
 

@@ -13,12 +13,11 @@ import bidnerf_vanilla
 import tiny
 from bidnerf_core.backend import Backend
 from bidnerf_core.carving import occupied_voxels
-from bidnerf_core.fields.contract import RadianceField, Rays, levels
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import RadianceField, Rays, VoxelGrid, levels, render
+from bidnerf_core.frames import View
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing import rgb_views
 from bidnerf_core.testing.samples import check_intervals, check_repeatable
-from bidnerf_core.testing.scene import BOUNDS, rgb_views
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_hashgrid.occupancy import OccupancyGrid

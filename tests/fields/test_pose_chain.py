@@ -5,20 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.contract import SceneBounds, widened
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.residuals import Objective, colour_term, depth_term
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import draw, uniform
-from bidnerf_core.geometry.robust import Robust
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widened
+from bidnerf_core.frames import Frame, View, draw, uniform
+from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization import Problem, rig
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import look_at, orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import look_at, orbit
 from problems import FieldMap, localize, single
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))

@@ -9,28 +9,27 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import (
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import (
     FieldValues,
+    Importance,
     RadianceField,
     Rays,
     RaySamples,
     SceneBounds,
+    Stratified,
+    inverse_transform,
     levels,
-    widened,
-)
-from bidnerf_core.fields.rendering import (
     query_samples,
     render,
     render_image,
     render_picture,
     render_samples,
     rendering_weights,
+    widened,
 )
-from bidnerf_core.fields.sampling import Importance, Stratified, inverse_transform
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
-from bidnerf_core.scenes.fields import HomogeneousBall
+from bidnerf_core.geometry import SE3
+from bidnerf_core.scenes import HomogeneousBall, closed_form_data, closed_form_map
 
 BLUE = (0.1, 0.2, 0.9)
 

@@ -9,10 +9,21 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.fields.contract import FieldValues, Rays, RaySampler, RaySamples, SceneBounds
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import AroundDepth, Concentrated, Importance, Resampled, Stratified
-from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
+from bidnerf_core.fields import (
+    AroundDepth,
+    Concentrated,
+    FieldValues,
+    Importance,
+    Rays,
+    RaySampler,
+    RaySamples,
+    Resampled,
+    SceneBounds,
+    Stratified,
+    render,
+)
+from bidnerf_core.scenes import HomogeneousBall
+from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.testing import samples as laws
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from voxels import cell_centres

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Generator
 
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
+from bidnerf_core.fields import OccupancyMask, SceneBounds, VoxelGrid
 from voxels import cell_centres, cells_of
 
 BOUNDS = SceneBounds((-1.2, -0.4, 0.1), (0.8, 0.7, 1.3), 0.1, 8.0)

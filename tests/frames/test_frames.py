@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame
 
 CAMERA = Intrinsics(10.0, 10.0, 4.0, 3.0, 8, 6)
 

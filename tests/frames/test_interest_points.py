@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import DrawerName, Frame, drawer
 from bidnerf_core.frames import pixels as interest
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.pixels import Among, DrawerName, drawer, interest_points, interest_regions
+from bidnerf_core.frames.pixels import Among, interest_points, interest_regions
 
 CAMERA = Intrinsics(40.0, 40.0, 32.0, 24.0, 64, 48)
 

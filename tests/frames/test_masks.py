@@ -15,25 +15,21 @@ import pytest
 import torch
 
 from bidnerf_core import Frame, InputError, InputWarning, View, open_dataset, open_sequence, train
-from bidnerf_core.camera.orientation import CODES, Orientation
-from bidnerf_core.camera.source import Raster
+from bidnerf_core.camera import Orientation, Raster
+from bidnerf_core.camera.orientation import CODES
 from bidnerf_core.captures.photos import photo_measures
-from bidnerf_core.carving.free_space import FreeSpace
-from bidnerf_core.datasets import MaskFolder
-from bidnerf_core.datasets.masked import wholly_hidden
-from bidnerf_core.datasets.whole import with_all
-from bidnerf_core.fields.rendering import RenderedImage
-from bidnerf_core.frames.masks import WhollyHidden, masks_sentence, read_mask
-from bidnerf_core.frames.pixels import DrawerName, drawer
+from bidnerf_core.carving import FreeSpace
+from bidnerf_core.datasets import wholly_hidden, with_all
+from bidnerf_core.fields import RenderedImage
+from bidnerf_core.frames import DrawerName, MaskFolder, WhollyHidden, drawer, masks_sentence, read_mask
 from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.costs.images import thumbnail
 from bidnerf_core.localization.costs.rendered import blurred
 from bidnerf_core.localization.landmarks.correspondences import query_images
-from bidnerf_core.mapping import tracked_views
-from bidnerf_core.mapping.landmarks.features import SIFT
-from bidnerf_core.maps.rendering import rendering_scores
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.training.ray_bank import RayBank
+from bidnerf_core.mapping import SIFT, tracked_views
+from bidnerf_core.maps import rendering_scores
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.training import RayBank
 from commands import Run
 from photo_files import write_photo
 from tiny import config, options, views, write_dataset

@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 
 from bidnerf_core import Frame, InputError, InputWarning, Intrinsics
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.frames.photos import photos_in
+from bidnerf_core.frames import photos_in
 from photo_files import noise, write_photo
 
 WIDTH, HEIGHT = 40, 30

@@ -13,13 +13,13 @@ import torch
 
 import bidnerf_core.cli.localize as localize_module
 from bidnerf_core import Frame, Intrinsics, Localizer
-from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import faulty
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.map import Map
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, textured_map, unseen
+from bidnerf_core.maps import Map, MapInfo
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import BOUNDS, CAMERA, textured_map
+from bidnerf_core.testing.textured_field import unseen
 from commands import Run
 
 

@@ -14,21 +14,22 @@ import torch
 from PIL import Image
 
 import tiny
-from bidnerf_core.camera import source
-from bidnerf_core.camera.batch import CameraBatch
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import CameraBatch, Intrinsics, source
 from bidnerf_core.captures.photos import nearby
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.datasets.rgbd import reading_at
+from bidnerf_core.datasets import open_dataset, reading_at
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.frames import image_pixels, pixel_store
-from bidnerf_core.frames.colours import as_floats
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.image_pixels import ImagePixels
-from bidnerf_core.frames.pixel_store import PixelStore
-from bidnerf_core.frames.pixels import observe
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.frames import (
+    Frame,
+    ImagePixels,
+    PixelStore,
+    View,
+    as_floats,
+    image_pixels,
+    observe,
+    pixel_store,
+)
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import memory
 from bidnerf_core.mapping.landmarks import tracks
 from bidnerf_core.maps import views as views_of_map
@@ -198,7 +199,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
 
 def test_a_map_of_reduced_images_is_resumed_at_their_size(tmp_path: Path) -> None:
     from bidnerf_core import resume, train
-    from bidnerf_core.maps.description import load_info, longest_side
+    from bidnerf_core.maps import load_info, longest_side
 
     data, out = tiny.write_dataset(tmp_path / "data"), tmp_path / "map"
     train(data, out=out, config=tiny.config(), largest=20, bake=False)

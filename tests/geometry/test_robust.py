@@ -10,7 +10,7 @@ import torch
 from scipy.stats import chi2
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.robust import Robust, RobustName, chi_squared_quantile
+from bidnerf_core.geometry import Robust, RobustName, chi_squared_quantile
 
 NAMES = get_args(RobustName)
 SCALE = 0.3

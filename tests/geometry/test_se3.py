@@ -15,14 +15,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import (
-    SE3,
-    se3_left_jacobian,
-    se3_right_jacobian,
-    skew,
-    so3_left_jacobian,
-    so3_left_jacobian_inverse,
-)
+from bidnerf_core.geometry import SE3, se3_right_jacobian, skew
+from bidnerf_core.geometry.se3 import se3_left_jacobian, so3_left_jacobian, so3_left_jacobian_inverse
 
 SIZES = [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.0099, 0.0101, 0.5, 2.0, math.pi - 1e-3, math.pi - 1e-6]
 

@@ -7,8 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity, fit_similarity, spread
+from bidnerf_core.geometry import SE3, Similarity, fit_similarity, spread
 
 GENERATOR = torch.Generator().manual_seed(0)
 CLOUD = torch.randn((20, 3), generator=GENERATOR, dtype=torch.float64)

@@ -25,20 +25,24 @@ from safetensors.torch import save
 
 import tiny
 from bidnerf_core import Frame, load_map
-from bidnerf_core.camera.files import read_camera
+from bidnerf_core.camera import read_camera
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.points import read_depth_points
-from bidnerf_core.depth.images import read_depth_image
+from bidnerf_core.depth import read_depth_image
 from bidnerf_core.errors import InputError, printable
-from bidnerf_core.evaluation.results import read_results
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.images import read_image
-from bidnerf_core.io.json import read_record, to_plain
-from bidnerf_core.io.tensors import read_archive, read_array, read_tensors
-from bidnerf_core.maps.description import MapInfo, load_info
-from bidnerf_core.maps.files import save_map
-from bidnerf_core.maps.map import load_map as load
-from bidnerf_core.results.pose_files import read_pose
+from bidnerf_core.evaluation import read_results
+from bidnerf_core.io import (
+    read_archive,
+    read_array,
+    read_file,
+    read_image,
+    read_record,
+    read_tensors,
+    to_plain,
+)
+from bidnerf_core.maps import MapInfo, load_info, save_map
+from bidnerf_core.maps import load_map as load
+from bidnerf_core.results import read_pose
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run

@@ -21,14 +21,12 @@ import torch
 from PIL import Image, features
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.colours import as_floats
-from bidnerf_core.frames.photos import photos_in
-from bidnerf_core.io import files
-from bidnerf_core.io.images import (
+from bidnerf_core.frames import as_floats, photos_in
+from bidnerf_core.io import (
     IMAGE_SUFFIXES,
     LARGEST_IMAGE,
-    ImageHeader,
     decode,
+    files,
     open_image,
     over,
     pixel_array,
@@ -38,6 +36,7 @@ from bidnerf_core.io.images import (
     reduced,
     resampled,
 )
+from bidnerf_core.io.images import ImageHeader
 from photo_files import noise
 
 READERS = pytest.mark.parametrize("read", [read_image, read_header], ids=["image", "header"])

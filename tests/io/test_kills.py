@@ -13,11 +13,10 @@ import pytest
 
 import tiny
 from bidnerf_core.cli import main
-from bidnerf_core.io import files
-from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary, write_file
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.maps.map import load_map
-from bidnerf_core.results.plot_style import new_figure, save_figure
+from bidnerf_core.io import FileInUse, files, is_temporary, locked, output_folder, write_file
+from bidnerf_core.io.files import temporary
+from bidnerf_core.maps import load_map
+from bidnerf_core.results import new_figure, save_figure
 from commands import Run
 
 pytestmark = pytest.mark.slow

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.json import LARGEST_INTEGER, from_plain, to_plain
+from bidnerf_core.io import LARGEST_INTEGER, from_plain, to_plain
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.torch_files import check_sizes, outline_of, read_saved
+from bidnerf_core.io import check_sizes, outline_of, read_saved
 
 Saved = Callable[[Any], Path]
 

@@ -25,10 +25,10 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, Intrinsics, Localization, View
-from bidnerf_core.evaluation.faults import faulty
+from bidnerf_core.evaluation import faulty
 from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Problem, rig, settings_of
 from bidnerf_core.mapping import Features, LandmarkMap, build_landmarks
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.testing import textured_field
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from problems import localize

@@ -24,10 +24,10 @@ import torch
 
 from bidnerf_core import SE3, Localization, Localizer, View, load_map
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.evaluation import perturb
 from bidnerf_core.localization import SceneMap, settings_of
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
+from bidnerf_core.scenes import closed_form_data, closed_form_map
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "auto": {},

@@ -11,16 +11,14 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import Outcome, PointCloud, Verdict
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import Outcome, PointCloud, Support, SurfaceDiagnostics, Verdict
 from bidnerf_core.localization.acceptance import (
-    SurfaceDiagnostics,
     descent_verdict,
     free_space_violations,
     rendered_verdict,
     surface_diagnostics,
 )
-from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.settings import RenderedThresholds

@@ -10,11 +10,10 @@ import torch
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import Observations, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     AutoConfig,
     Localization,
@@ -29,10 +28,10 @@ from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.mapping import bake
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 from problems import FieldMap, localize
 from tiny import depth_rays_of
 

@@ -10,17 +10,14 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig, Localization, Outcome
-from bidnerf_core.localization.beyond_chance import NO_RIVAL, Support, log_odds, support
-from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import NO_RIVAL, AutoConfig, Localization, Outcome, Problem, Support, rig
+from bidnerf_core.localization.beyond_chance import log_odds, support
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
-from bidnerf_core.scenes.trajectories import look_at
+from bidnerf_core.scenes import look_at
 from problems import FieldMap, localize
 
 CAMERA = Intrinsics(70.0, 70.0, 40.0, 30.0, 80, 60)

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import rig, settings_of
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap, localize, single
 from tiny import depth_rays_of

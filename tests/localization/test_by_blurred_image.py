@@ -9,13 +9,19 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import LandmarkMatcher, Localization, Outcome, Problem, by_blurred_image, rig
-from bidnerf_core.localization.beyond_chance import Support
+from bidnerf_core.evaluation import faulty
+from bidnerf_core.fields import Stratified, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import (
+    LandmarkMatcher,
+    Localization,
+    Outcome,
+    Problem,
+    Support,
+    by_blurred_image,
+    rig,
+)
 from bidnerf_core.localization.by_blurred_image import BLURS
 from bidnerf_core.localization.costs.images import (
     ColourScales,
@@ -26,9 +32,9 @@ from bidnerf_core.localization.costs.images import (
     thumbnail,
 )
 from bidnerf_core.mapping import build_landmarks
-from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 from landmark_scene import Points, ring
 from problems import FieldMap
 

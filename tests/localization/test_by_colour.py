@@ -10,17 +10,17 @@ import torch
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import faulty
+from bidnerf_core.fields import render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Localization, Outcome, Problem, rig
 from bidnerf_core.localization.acceptance import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.mapping import SurfaceMap, bake, build_landmarks
-from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 from landmark_scene import Points, ring
 from problems import FieldMap, localize
 

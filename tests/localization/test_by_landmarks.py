@@ -13,33 +13,32 @@ from torch import Tensor
 import bidnerf_core.localization.auto as auto_module
 import bidnerf_core.localization.by_landmarks as by_landmarks_module
 from bidnerf_core import Localization, Localizer, Outcome, View
-from bidnerf_core.depth.sensors import find_depth_sensor
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.depth import find_depth_sensor
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
+    SHARPEST,
     AutoConfig,
     LandmarkAnswer,
+    LandmarkDiagnostics,
     LandmarkMatcher,
     LandmarkPose,
     PointCloud,
     Problem,
     answer_by_landmarks,
+    landmark_verdict,
+    localization_by_landmarks,
     propose,
     rig,
 )
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_verdict, surface_diagnostics
-from bidnerf_core.localization.by_landmarks import (
-    SHARPEST,
-    at_pose,
-    fused_answer,
-    localization_by_landmarks,
-)
+from bidnerf_core.localization.acceptance import surface_diagnostics
+from bidnerf_core.localization.by_landmarks import at_pose, fused_answer
 from bidnerf_core.localization.covariance import finest_cost
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.fusion import FusedPose, Measurements
 from bidnerf_core.localization.landmarks.propose import Confirmation
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing import textured_field
-from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textured_map, unseen
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import CAMERA, textured_field, textured_map
+from bidnerf_core.testing.textured_field import MapWithLandmarks, unseen
 
 TRUTH = unseen().T_ref_camera
 RAYS = 256

@@ -11,16 +11,22 @@ import torch
 from torch import Generator
 
 from bidnerf_core import Frame, Localization, Outcome, View
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig, LandmarkMatcher, LandmarkPose, propose, rig
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import (
+    AutoConfig,
+    LandmarkMatcher,
+    LandmarkPose,
+    landmark_verdict,
+    propose,
+    rig,
+)
 from bidnerf_core.localization.landmarks.consensus import Candidate
 from bidnerf_core.localization.landmarks.far_cameras import UNSUSPECTED, camera_fit
-from bidnerf_core.mapping import Calibration, ObservedPoints, build_landmarks
-from bidnerf_core.mapping.geometry.calibration import GIVEN
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import CAMERA, textured_map, training_views, unseen
+from bidnerf_core.mapping import GIVEN, Calibration, ObservedPoints, build_landmarks
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import CAMERA, textured_map, training_views
+from bidnerf_core.testing.textured_field import unseen
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from problems import localize
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics, stretched_cameras
+from bidnerf_core.camera import Intrinsics, stretched_cameras
 from bidnerf_core.camera.orientation import QUARTER_TURNS
 from bidnerf_core.localization.landmarks.map_camera import map_cameras
 

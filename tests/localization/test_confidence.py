@@ -10,9 +10,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from bidnerf_core.localization import Outcome, Verdict, confidence
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
-from bidnerf_core.localization.beyond_chance import Support
+from bidnerf_core.localization import (
+    LandmarkDiagnostics,
+    Outcome,
+    Support,
+    SurfaceDiagnostics,
+    Verdict,
+    confidence,
+)
 
 GOOD = LandmarkDiagnostics(
     inliers=300, matches=400, agreeing=350, log10_nfa=-300.0, chance=4.0, visible=900, keypoints=1500, spread=0.7,

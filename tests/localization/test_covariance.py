@@ -10,9 +10,8 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.depth.sensors import EXACT
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.depth import EXACT
+from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (
     position_deviation,

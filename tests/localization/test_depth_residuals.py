@@ -7,9 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.fields.contract import RaySamples
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import Rendering
+from bidnerf_core.fields import Observations, RaySamples, Rendering
 from bidnerf_core.fields.residuals import depth_residual, first_surface_residual, truncated_depth_residual
 from bidnerf_core.localization import ColourSettings, DepthSettings, objective_of
 

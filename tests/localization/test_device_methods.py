@@ -13,13 +13,19 @@ from torch import Tensor
 import baked
 import module_fields
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.frames.frame import View
-from bidnerf_core.localization import AutoConfig, LandmarkMatcher, by_image_search, rig, settings_of
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.frames import View
+from bidnerf_core.localization import (
+    AutoConfig,
+    LandmarkMatcher,
+    by_image_search,
+    on_device,
+    rig,
+    settings_of,
+)
 from bidnerf_core.localization.landmarks import matching
-from bidnerf_core.localization.problem import on_device
 from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from bidnerf_core.testing.textured_field import MapWithLandmarks

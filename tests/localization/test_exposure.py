@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.geometry.robust import Robust
+from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.exposure import clipped, fit_exposure, robust_exposure
 
 

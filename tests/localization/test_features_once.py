@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import Localizer
+from bidnerf_core.captures import tried_landmarks
 from bidnerf_core.captures.relocated_photos import relocated
-from bidnerf_core.captures.trial import tried_landmarks
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.localization import AutoConfig
-from bidnerf_core.localization.alternatives import mirror_image
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization import AutoConfig, mirror_image
 from bidnerf_core.localization.tracking.relocalization import relocalized
-from bidnerf_core.mapping.landmarks.building import DEFAULT_LANDMARKS, tracked_views
-from bidnerf_core.mapping.landmarks.features import FoundOnce, Keypoints, Sift
-from bidnerf_core.testing.textured_field import CAMERA, textured_map, training_views, unseen
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, FoundOnce, Keypoints, Sift, tracked_views
+from bidnerf_core.testing import CAMERA, textured_map, training_views
+from bidnerf_core.testing.textured_field import unseen
 
 Seen = list[Tensor]
 QUICK = AutoConfig(fused_rays=256)

@@ -9,17 +9,18 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import DrawerName, draw, uniform
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import SceneBounds, render_image
+from bidnerf_core.frames import DrawerName, Frame, View, draw, uniform
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
+    NO_RIVAL,
     AdamSettings,
+    AdamSteps,
     BidConfig,
+    DescentDiagnostics,
     DescentSettings,
     InerfConfig,
     Outcome,
@@ -33,14 +34,11 @@ from bidnerf_core.localization import (
     rig,
     settings_of,
 )
-from bidnerf_core.localization.acceptance import DescentDiagnostics
-from bidnerf_core.localization.beyond_chance import NO_RIVAL
-from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.history import WINDOW
 from bidnerf_core.localization.solvers.pivots import PivotName
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_hashgrid import backend as hashgrid
 from problems import FieldMap, localize, single
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import NormalEquations, Pivot
 from bidnerf_core.localization.search.halving import Distinct, SearchStage, search
 

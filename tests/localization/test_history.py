@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.solvers.history import WINDOW, History
 
 

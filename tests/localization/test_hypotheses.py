@@ -8,7 +8,7 @@ from scipy.stats import kstest
 from torch import Generator
 
 import baked
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.search.starts import (
     _without_repetition,
     hypotheses_for_points,

@@ -8,15 +8,10 @@ import torch
 from scipy.stats import multivariate_normal
 
 from bidnerf_core import Intrinsics
-from bidnerf_core.localization.landmarks.hypotheses import (
-    Posterior,
-    Stated,
-    camera_hypotheses,
-    posterior,
-)
+from bidnerf_core.localization import Posterior, Stated
+from bidnerf_core.localization.landmarks.hypotheses import camera_hypotheses, posterior
 from bidnerf_core.localization.landmarks.map_camera import map_cameras
-from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL, Calibration
-from bidnerf_core.mapping.geometry.eliminated_pose import EliminatedPose
+from bidnerf_core.mapping import GIVEN, NOMINAL, Calibration, EliminatedPose
 from bidnerf_core.mapping.geometry.reprojection import RobustEquations
 from observed_points import TRUE, observed
 

@@ -11,19 +11,17 @@ from scipy.optimize import minimize
 from torch import Generator
 
 import baked
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import NormalEquations
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import SceneBounds, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import NormalEquations, SurfaceRenderer
 from bidnerf_core.localization.costs.images import (
     UNKNOWN_COST,
     ColourScales,
     FieldRenderer,
     ImageCost,
     RenderedView,
-    SurfaceRenderer,
     Thumbnail,
     ViewRenderer,
     exposed,
@@ -31,8 +29,8 @@ from bidnerf_core.localization.costs.images import (
     thumbnail,
 )
 from bidnerf_core.localization.search.by_images import WIDE_SCALES
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 BLOBS = GaussianBlobs.random(density=60.0)

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import settings_of
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH
 from problems import localize, single
 

@@ -8,12 +8,9 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, propose
 from bidnerf_core.localization.landmarks.chance import log10_nfa
-from bidnerf_core.mapping import LandmarkMap, build_landmarks
-from bidnerf_core.mapping.geometry.calibration import NOMINAL
-from bidnerf_core.mapping.landmarks.features import squared_distances
+from bidnerf_core.mapping import NOMINAL, LandmarkMap, build_landmarks, squared_distances
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 TRUE = looking_in(0.43, 0.45, 3.6)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3, skew
+from bidnerf_core.geometry import SE3, skew
 from bidnerf_core.localization import NormalEquations, Sum, descend
 
 GENERATOR = torch.Generator().manual_seed(0)

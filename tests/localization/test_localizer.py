@@ -16,11 +16,11 @@ import torch
 import baked
 import tiny
 from bidnerf_core import InputError, Localizer, Outcome, View
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import METHODS, AutoConfig, pose_from_matrix, settings_of
 from bidnerf_core.localization.tracking.motion import Clock
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from bidnerf_hashgrid import backend as hashgrid
 from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph

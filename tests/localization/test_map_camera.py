@@ -10,10 +10,17 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, Outcome, propose
-from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
+from bidnerf_core.localization import (
+    LandmarkMatcher,
+    LandmarkPose,
+    LandmarkThresholds,
+    Outcome,
+    Stated,
+    Whose,
+    landmark_verdict,
+    propose,
+)
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
-from bidnerf_core.localization.landmarks.hypotheses import Stated, Whose
 from bidnerf_core.localization.landmarks.map_camera import (
     SHARE_SAME_CAMERA,
     MapCamera,
@@ -22,8 +29,7 @@ from bidnerf_core.localization.landmarks.map_camera import (
 )
 from bidnerf_core.localization.landmarks.matching import unguided_matches
 from bidnerf_core.localization.landmarks.propose import updated
-from bidnerf_core.mapping import Calibration, LandmarkMap, build_landmarks
-from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL
+from bidnerf_core.mapping import GIVEN, NOMINAL, Calibration, LandmarkMap, build_landmarks
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 TRUE = looking_in(0.43, 0.45, 3.6)

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from bidnerf_core import Localizer, Outcome, View
-from bidnerf_core.localization import LandmarkMatcher, confirm, propose, rig
-from bidnerf_core.localization.alternatives import decide, mirror_evidence, mirror_image
-from bidnerf_core.testing.textured_field import textured_map, unseen
+from bidnerf_core.localization import LandmarkMatcher, confirm, mirror_image, propose, rig
+from bidnerf_core.localization.alternatives import decide, mirror_evidence
+from bidnerf_core.testing import textured_map
+from bidnerf_core.testing.textured_field import unseen
 
 
 def matcher() -> LandmarkMatcher:

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render, render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import Observations, SceneBounds, render, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     ColourSettings,
     DepthSettings,
@@ -29,9 +27,9 @@ from bidnerf_core.localization import (
     objective_of,
     window,
 )
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 from problems import localize, single
 from tiny import depth_rays_of
 

@@ -9,18 +9,15 @@ import torch
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import drawer
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig, Localization
-from bidnerf_core.localization.alternatives import mirror_image
+from bidnerf_core.frames import Frame, View, drawer
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import AutoConfig, Localization, mirror_image
 from bidnerf_core.localization.landmarks.guided import projected_landmarks
 from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
-from bidnerf_core.mapping.geometry.calibration import GIVEN
-from bidnerf_core.mapping.landmarks.features import SIFT
-from bidnerf_core.mapping.landmarks.image_keypoints import image_keypoints
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import textured_map, unseen
+from bidnerf_core.mapping import GIVEN, SIFT, image_keypoints
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import textured_map
+from bidnerf_core.testing.textured_field import unseen
 from problems import localize
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)

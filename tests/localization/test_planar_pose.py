@@ -9,16 +9,14 @@ import torch
 from torch import Generator, Tensor
 
 from bidnerf_core import Outcome
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import LandmarkPose, Problem, propose, rig
 from bidnerf_core.localization.alternatives import decide, pose_at
 from bidnerf_core.localization.landmarks.twins import second_pose, tilted_to_the_other_side
-from bidnerf_core.mapping import build_landmarks
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.resection import resect
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.trajectories import look_at
-from bidnerf_core.testing.textured_field import textured_map
+from bidnerf_core.mapping import ObservedPoints, build_landmarks, resect
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import look_at
+from bidnerf_core.testing import textured_map
 from landmark_scene import Points, looking_in, ring
 from pinned_landmarks import PointMatcher
 

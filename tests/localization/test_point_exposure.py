@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import baked
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.by_depth import STRONGEST, cloud_with_exposure_of_map
 

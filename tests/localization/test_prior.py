@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Cost, GaussianPrior, Pivot, Scaled, Sum, descend
 
 MEAN = SE3.exp(torch.tensor([0.4, -1.0, 2.0, 0.8, -0.5, 0.3], dtype=torch.float64))

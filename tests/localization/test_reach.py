@@ -8,11 +8,9 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     METHODS,
     ColourSettings,

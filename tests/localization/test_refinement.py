@@ -10,8 +10,8 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     ColourSettings,
     DepthSettings,
@@ -22,7 +22,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.localization.covariance import finest_cost
 from bidnerf_core.localization.refinement import refine, take_few_steps
 from bidnerf_core.localization.solvers.pivots import PivotName
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH
 from problems import single
 

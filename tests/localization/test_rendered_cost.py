@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.residuals import Objective, colour_term, depth_term
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.robust import Robust
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import Objective, colour_term, depth_term, render
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import Robust
 from bidnerf_core.localization import RefinementSettings, RefinementStage, RenderedCost
 from bidnerf_core.localization.costs.rendered import LEAST_WITH_DEPTH, Residuals, _residuals
 from problems import single

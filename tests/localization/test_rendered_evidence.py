@@ -8,20 +8,22 @@ import pytest
 import torch
 
 from bidnerf_core import Intrinsics, Localizer, Outcome, View
-from bidnerf_core.fields.contract import FieldValues
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import FieldValues
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     AutoConfig,
     LandmarkAnswer,
+    LandmarkDiagnostics,
     LandmarkMatcher,
     Problem,
     answer_by_landmarks,
+    mirror_image,
     rig,
 )
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics
-from bidnerf_core.localization.alternatives import NOISIEST, decide, log_odds_by_rendering, mirror_image
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import CAMERA, TexturedGround, seen, textured_map, unseen
+from bidnerf_core.localization.alternatives import NOISIEST, decide, log_odds_by_rendering
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import CAMERA, textured_map
+from bidnerf_core.testing.textured_field import TexturedGround, seen, unseen
 
 
 def stated(factor: float) -> Intrinsics:

@@ -5,11 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bidnerf_core.fields.contract import Rays, RaySamples, SceneBounds
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import Rendering, render
-from bidnerf_core.fields.residuals import DEPTH_RESIDUALS, Objective, depth_residual, free_space, masked_mean
-from bidnerf_core.geometry.robust import RobustName
+from bidnerf_core.fields import (
+    DEPTH_RESIDUALS,
+    Objective,
+    Observations,
+    Rays,
+    RaySamples,
+    Rendering,
+    SceneBounds,
+    masked_mean,
+    render,
+)
+from bidnerf_core.fields.residuals import depth_residual, free_space
+from bidnerf_core.geometry import RobustName
 from bidnerf_core.localization import BidConfig, ColourSettings, DepthSettings, objective_of
 from bidnerf_core.scenes.fields import GaussianBlobs
 

@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from bidnerf_core import Intrinsics
-from bidnerf_core.camera.rolling_shutter import exposure_times, moved_points
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.camera import exposure_times, moved_points
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, propose
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 POINTS = Points(noise=0.3)

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import from_plain
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain
 from bidnerf_core.localization import Localization, Outcome, Verdict, pose_from_matrix
 
 T = SE3.exp(torch.tensor([0.1, -2.0, 3.0, 0.4, -0.5, 0.6], dtype=torch.float64))

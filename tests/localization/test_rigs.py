@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
+from bidnerf_core.scenes import look_at, orbit
 from bidnerf_core.scenes.demo import demo_room
-from bidnerf_core.scenes.trajectories import look_around, look_at, orbit
+from bidnerf_core.scenes.trajectories import look_around
 
 CAMERA = Intrinsics(70.0, 75.0, 31.0, 24.5, 64, 48)
 

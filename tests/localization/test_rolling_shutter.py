@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import Localizer, View
-from bidnerf_core.evaluation.faults.camera import rolling_shutter
-from bidnerf_core.frames.pixels import observe
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import textured_map, unseen
+from bidnerf_core.evaluation import rolling_shutter
+from bidnerf_core.frames import observe
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import LandmarkDiagnostics, LandmarkMatcher, LandmarkPose, propose
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import textured_map
+from bidnerf_core.testing.textured_field import unseen
 
 TRUTH = unseen().T_ref_camera
 CHI2_99 = 16.8  # of six degrees of freedom

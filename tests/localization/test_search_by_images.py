@@ -10,13 +10,13 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.images import SurfaceRenderer
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import SurfaceRenderer
 from bidnerf_core.localization.search.by_images import APART, IMAGE_STAGES, TURNED, ImageSearch, ImageStage
 from bidnerf_core.localization.search.halving import Distinct
 from bidnerf_core.localization.search.starts import Surroundings, hypotheses_for_images
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
 

@@ -8,10 +8,10 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.search.by_points import POINT_STAGES
 from bidnerf_core.localization.search.starts import hypotheses_for_points, random_rotations
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
 

@@ -10,11 +10,9 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import measured_middle
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Observations, VoxelGrid
+from bidnerf_core.frames import Frame, View, measured_middle
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.mapping import SurfaceMap, SurfelIndex, Surfels
 from tiny import depth_rays_of

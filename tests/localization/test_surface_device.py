@@ -14,11 +14,10 @@ from torch import Generator, Tensor
 import baked
 import module_fields
 from bidnerf_core.devices import moved, without_waiting
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import RadianceField
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization import (
     ColourSettings,
     Cost,

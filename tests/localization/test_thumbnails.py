@@ -8,11 +8,11 @@ import torch
 from scipy.ndimage import convolve1d
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.images import slopes, smooth, thumbnail
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.scenes import orbit
 
 PLAIN = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64)
 LENS = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64, (-0.2, 0.05, 0.001, -0.002))

@@ -13,12 +13,12 @@ import torch
 from safetensors.torch import save_file
 
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.tensors import read_tensors_and_metadata
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import read_tensors_and_metadata
 from bidnerf_core.localization.tracking.state import METHOD, CorrectedCamera
-from bidnerf_core.results.errors import normalized_error_squared, pose_error
-from bidnerf_core.testing.textured_field import CAMERA, textured_map, view
+from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf_core.testing import CAMERA, textured_map, view
 from flights import (
     FRAMES,
     INTERVAL,

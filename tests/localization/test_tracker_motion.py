@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, InputError
-from bidnerf_core.geometry.rotations import retracted, update_between
+from bidnerf_core.geometry import retracted, update_between
 from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Clock, Motion, PoseEstimate, pixel_radius
 
 VELOCITY = torch.tensor([0.3, -0.1, 0.2, 0.2, 0.4, -0.1], dtype=torch.float64)

@@ -10,7 +10,7 @@ import torch
 
 from bidnerf_core import SE3, Frame, Localizer, Outcome, Tracker
 from bidnerf_core.depth.sensors import KINECT
-from bidnerf_core.geometry.independent import USUAL
+from bidnerf_core.geometry import USUAL
 from bidnerf_core.localization import (
     AutoConfig,
     GaussianPrior,
@@ -33,9 +33,9 @@ from bidnerf_core.localization.tracking.surface import (
     fused_with_surface,
     measured_cloud,
 )
-from bidnerf_core.mapping.landmarks.features import grey_image
-from bidnerf_core.results.errors import normalized_error_squared, pose_error
-from bidnerf_core.testing.textured_field import textured_map
+from bidnerf_core.mapping import grey_image
+from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf_core.testing import textured_map
 from flights import (
     INTERVAL,
     assert_honest,

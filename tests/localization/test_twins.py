@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Localization, Localizer, Outcome, View
-from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.fields import render_image
 from bidnerf_core.localization import (
     AutoConfig,
     LandmarkMatcher,
@@ -24,8 +24,9 @@ from bidnerf_core.localization.alternatives import Decision, decide
 from bidnerf_core.localization.landmarks.chance import log_odds_of_share
 from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, textured_map, unseen
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import BOUNDS, CAMERA, ground, textured_map
+from bidnerf_core.testing.textured_field import unseen
 from landmark_scene import Points, looking_in, ring
 from problems import localize
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import ColourSettings, DepthSettings, RayCounts, objective_of, rig
 from bidnerf_core.localization.costs.rendered import blurred, draw_weighted_rays
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
-from bidnerf_core.mapping import Adjustment, PosePrior, adjusted
+from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
+from bidnerf_core.mapping import Adjustment, PosePrior, Sightings, adjusted
 from bidnerf_core.mapping.geometry.bundle_adjustment import SMALL_DECREASE, linearized
-from bidnerf_core.mapping.geometry.observations import Sightings
 from landmark_scene import looking_in
 
 VIEWS, POINTS, FOCAL = 12, 150, 300.0

@@ -12,9 +12,8 @@ from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import SceneBounds, VoxelGrid
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.surface.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
 from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, measured_image

@@ -12,17 +12,20 @@ import torch
 
 import tiny
 from bidnerf_core import InputError
-from bidnerf_core.mapping import Features, Keypoints, Sift, tracked_views
-from bidnerf_core.mapping.landmarks.features import (
+from bidnerf_core.mapping import (
+    Features,
+    Keypoints,
+    Sift,
     byte_of_zero,
     detected,
     paired_squared_distances,
     quantized,
-    root_normalized,
     squared_distances,
     strongest,
+    tracked_views,
     unrelated_distance,
 )
+from bidnerf_core.mapping.landmarks.features import root_normalized
 
 
 def blobs(centres: list[tuple[float, float]], sigma: float = 3.0) -> torch.Tensor:

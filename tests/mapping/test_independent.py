@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bidnerf_core.geometry.independent import independent
+from bidnerf_core.geometry import independent
 
 
 @pytest.mark.parametrize("most", [3.0, 100.0])

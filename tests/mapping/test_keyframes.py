@@ -9,17 +9,15 @@ import pytest
 import torch
 
 from bidnerf_core import View
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.sampling import Stratified
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, propose
 from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
 from bidnerf_core.mapping.surface.baking import KEYFRAME_SIDE, MOST
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.testing import textured_field
-from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, training_views, unseen
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import HomogeneousBall, orbit
+from bidnerf_core.testing import BOUNDS, CAMERA, ground, textured_field, training_views
+from bidnerf_core.testing.textured_field import unseen
 
 BALL = HomogeneousBall(0.5, 400.0, rgb=(0.8, 0.3, 0.2), sampler=Stratified(256))
 CUBE = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)

@@ -10,11 +10,19 @@ import torch
 from torch.nn.functional import normalize
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
-from bidnerf_core.mapping import LandmarkConfig, LandmarkMap, Sift, build_landmarks, tracked_views
-from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping import (
+    LandmarkConfig,
+    LandmarkMap,
+    Sift,
+    Sightings,
+    build_landmarks,
+    likely_pairs,
+    robust_covariance,
+    tracked_views,
+    update_scatter,
+)
 from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
-from bidnerf_core.mapping.landmarks.building import robust_covariance, update_scatter
-from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks, likely_pairs
+from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 

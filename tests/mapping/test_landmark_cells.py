@@ -11,9 +11,8 @@ from torch import Tensor
 from bidnerf_core import SE3
 from bidnerf_core.localization.landmarks.correspondences import query_images
 from bidnerf_core.localization.landmarks.guided import guided_matches
-from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.mapping.landmarks import landmark_map
-from bidnerf_core.mapping.landmarks.building import build_landmarks
 from bidnerf_core.mapping.landmarks.landmark_cells import MOST_IN_CELL, LandmarkCells
 from landmark_scene import Points, looking_in, ring
 

@@ -13,20 +13,29 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from bidnerf_core import SE3, Intrinsics
-from bidnerf_core.camera.rolling_shutter import MotionPrior, exposure_times
+from bidnerf_core.camera import MotionPrior, exposure_times
+from bidnerf_core.localization import Motion, Posterior
 from bidnerf_core.localization.landmarks.hypotheses import (
     MIN_POINTS,
     SHARE_MOVING,
-    Motion,
-    Posterior,
     camera_hypotheses,
     posterior,
 )
 from bidnerf_core.localization.tracking.points import PointFit, with_motion
-from bidnerf_core.mapping import Calibration, LandmarkMap, ObservedPoints, build_landmarks, resect
-from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, NOMINAL, STRETCHED
-from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
-from bidnerf_core.mapping.geometry.resection import log_likelihood_ratio
+from bidnerf_core.mapping import (
+    FIXED,
+    GIVEN,
+    NOMINAL,
+    STRETCHED,
+    Calibration,
+    LandmarkMap,
+    ObservedPoints,
+    ReprojectionErrors,
+    State,
+    build_landmarks,
+    log_likelihood_ratio,
+    resect,
+)
 from landmark_scene import Points, ring
 from observed_points import FOCAL, HEIGHT, TRUE, observed
 

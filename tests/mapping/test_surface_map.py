@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import SurfaceMap, trace
 from bidnerf_core.scenes.primitives import Box, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import blotches

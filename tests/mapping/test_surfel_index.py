@@ -15,8 +15,7 @@ from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.fields import SceneBounds, VoxelGrid
 from bidnerf_core.mapping import SurfelIndex
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, block_levels, block_shape, index_bytes
 from voxels import cell_centres

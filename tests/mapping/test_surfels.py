@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.surface.surface_map import fused_surfels, merged
 
 

@@ -9,10 +9,10 @@ import pytest
 
 import bidnerf_core as bn
 import tiny
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.maps.extending import locate
-from bidnerf_core.testing.textured_field import training_views, view
+from bidnerf_core.testing import training_views, view
 from commands import Run
 from photo_files import write_photo
 

@@ -14,16 +14,14 @@ from torch import Tensor
 import tiny
 from bidnerf_core import import_map, load_map
 from bidnerf_core.cli import main
-from bidnerf_core.datasets.writing import write_transforms
+from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, SceneBounds
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.maps.importers import ImportedField, bounds_about, importer_of
+from bidnerf_core.fields import FieldValues, RayHits, Rays, SceneBounds, Stratified
+from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.maps import ImportedField, bounds_about, importer_of
 from bidnerf_core.maps.viewpoints import VIEWS, viewpoints
 from bidnerf_core.registry import registered
-from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import backend
 

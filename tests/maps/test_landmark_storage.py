@@ -14,13 +14,11 @@ from safetensors.torch import save as tensors_to_bytes
 import baked
 import tiny
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.mapping import LandmarkMap, build_landmarks, landmark_tensors
-from bidnerf_core.maps.description import MapInfo, load_info
-from bidnerf_core.maps.files import save_landmarks, save_map, save_surface
-from bidnerf_core.maps.map import load_map
-from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.maps import MapInfo, load_info, load_map, save_map
+from bidnerf_core.maps.files import save_landmarks, save_surface
+from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from landmark_scene import Points, ring

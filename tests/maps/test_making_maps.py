@@ -18,10 +18,9 @@ from torch import nn
 
 import bidnerf_core as bn
 import tiny
-from bidnerf_core.io.files import FileInUse
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.io import FileInUse, to_plain
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps import load_info
 from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
 

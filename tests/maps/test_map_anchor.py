@@ -12,12 +12,11 @@ from torch import nn
 
 import tiny
 from bidnerf_core import resume, train
-from bidnerf_core.captures.report import CaptureReport, CoverageRecord
-from bidnerf_core.maps import files
-from bidnerf_core.maps.anchor import Anchor, anchor_bytes, load_anchor, save_anchor
-from bidnerf_core.maps.description import load_info
-from bidnerf_core.maps.files import save_capture, save_map
-from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.captures import CaptureReport
+from bidnerf_core.captures.report import CoverageRecord
+from bidnerf_core.maps import Anchor, Map, files, load_info, load_map, save_map
+from bidnerf_core.maps.anchor import anchor_bytes, load_anchor, save_anchor
+from bidnerf_core.maps.files import save_capture
 from bidnerf_core.progress import Progress
 from bidnerf_core.training import TrainingState
 from interruptions import FULL, Stopped, outcomes

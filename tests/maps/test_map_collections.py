@@ -13,16 +13,14 @@ import torch
 
 import bidnerf_core as bn
 import bidnerf_core.maps.collection as collections_module
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
-from bidnerf_core.maps.collection import maps_in
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.map import Map
+from bidnerf_core.maps import Map, MapInfo, maps_in
 from bidnerf_core.service.worker import Served, Worker
 from bidnerf_core.service.worker import _together as together_of
-from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, POSES, ground, training_views, view
+from bidnerf_core.testing import BOUNDS, CAMERA, POSES, ground, training_views, view
 from commands import Run
 
 SEEDS = (0, 4, 5)

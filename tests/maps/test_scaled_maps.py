@@ -12,15 +12,15 @@ import torch
 
 import bidnerf_core as bn
 import tiny
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import levels
-from bidnerf_core.io.files import FileInUse, locked
-from bidnerf_core.maps.anchor import Anchor, load_anchor, save_anchor
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.map import Map
+from bidnerf_core.fields import levels
+from bidnerf_core.io import FileInUse, locked
+from bidnerf_core.maps import Anchor, Map, MapInfo
+from bidnerf_core.maps.anchor import load_anchor, save_anchor
 from bidnerf_core.maps.scaling import place_of
-from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, textured_map, unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, textured_map
+from bidnerf_core.testing.textured_field import unseen
 from commands import Run
 
 

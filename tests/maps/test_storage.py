@@ -20,19 +20,16 @@ from torch import Tensor, nn
 import baked
 import tiny
 from bidnerf_core.backend import load_backend
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
-from bidnerf_core.maps import files
+from bidnerf_core.maps import MapInfo, files, load_info, load_map, save_map
 from bidnerf_core.maps import map as map_module
-from bidnerf_core.maps.description import MapInfo, load_info
-from bidnerf_core.maps.files import load_state, save_map, save_surface
-from bidnerf_core.maps.map import load_map
-from bidnerf_core.scenes.fields import HomogeneousBall
+from bidnerf_core.maps.files import load_state, save_surface
+from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
 from interruptions import FULL, Stopped, outcomes, striking

@@ -18,11 +18,11 @@ import tiny
 from bidnerf_core import Localizer, Map, load_backend
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.io import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.scenes.fields import HomogeneousBall
+from bidnerf_core.maps import MapInfo
+from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from problems import FieldMap

@@ -17,8 +17,7 @@ import pytest
 
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.cli import _warnings_as_lines
-from bidnerf_core.datasets import Dataset, Reader, ReadOptions, open_dataset, open_sequence
-from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.datasets import Dataset, Reader, ReadOptions, find_reader, open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.localization import find_method
 from bidnerf_core.mapping import find_features
@@ -33,7 +32,7 @@ from bidnerf_core.registry import (
     load_plugin,
     register,
 )
-from bidnerf_core.results.pose_files import write_poses
+from bidnerf_core.results import write_poses
 
 GOOD = '''"""A field of {word}.
 

@@ -13,27 +13,20 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import (
-    bid_hard_start,
-    bid_start,
-    perturb,
-    random_units,
-    rotation_of_size,
-)
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.results.errors import (
+from bidnerf_core.evaluation import bid_start, perturb
+from bidnerf_core.evaluation.protocols import bid_hard_start, random_units, rotation_of_size
+from bidnerf_core.geometry import SE3
+from bidnerf_core.results import (
     CRITERIA,
-    Criterion,
     PoseError,
     Reduced,
-    Within,
     normalized_error_squared,
     pose_error,
-    rotation_angle,
     steps_to_success,
     success_rate,
     success_rate_by_frame,
 )
+from bidnerf_core.results.errors import Criterion, Within, rotation_angle
 
 tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(
     lambda x: torch.tensor(x, dtype=torch.float64)

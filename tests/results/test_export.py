@@ -11,14 +11,13 @@ import pytest
 import torch
 
 import bidnerf_core as bn
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets.transforms_json import read_frames
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.json import read_record
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.map import Map
+from bidnerf_core.io import read_record
+from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.registry import PluginError, registered
-from bidnerf_core.testing.textured_field import BOUNDS, textured_map, training_views
+from bidnerf_core.testing import BOUNDS, textured_map, training_views
 
 
 @pytest.fixture(scope="module")

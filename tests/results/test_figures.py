@@ -11,19 +11,9 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.plots import convergence_plot
-from bidnerf_core.results.errors import PoseError
-from bidnerf_core.results.overlays import (
-    NO_DEPTH,
-    as_picture,
-    blend,
-    chequered,
-    comparison,
-    depth_to_rgb,
-    edges,
-    save_gif,
-    tile,
-)
+from bidnerf_core.evaluation import convergence_plot
+from bidnerf_core.results import PoseError, as_picture, depth_to_rgb, save_gif, tile
+from bidnerf_core.results.overlays import NO_DEPTH, blend, chequered, comparison, edges
 
 
 def disc(column: float, size: int = 40) -> torch.Tensor:

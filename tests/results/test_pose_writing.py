@@ -12,19 +12,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets import open_dataset, open_sequence
-from bidnerf_core.datasets.trajectories import read_trajectory
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.results.pose_files import (
-    PosedImage,
-    tum_trajectory,
-    write_pose_transforms,
-    write_poses,
-    write_tum,
-)
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.results import PosedImage, write_poses
+from bidnerf_core.results.pose_files import tum_trajectory, write_pose_transforms, write_tum
 from photo_files import noise, write_photo
 
 CAMERA = Intrinsics(20.0, 21.0, 7.0, 5.5, 16, 12, (0.01, -0.02, 0.003, 0.004))

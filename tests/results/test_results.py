@@ -17,15 +17,12 @@ import torch
 
 import bidnerf_core as bn
 from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome, TrackedPath
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets import write_transforms
-from bidnerf_core.datasets.queries import Photos
-from bidnerf_core.frames.frame import View
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import Photos, write_transforms
+from bidnerf_core.frames import View
 from bidnerf_core.progress import Progress
-from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
-from bidnerf_core.results.errors import within
-from bidnerf_core.results.trajectory import TrajectoryErrors
-from bidnerf_core.testing.textured_field import textured_map
+from bidnerf_core.results import Answer, Answers, Failure, TrajectoryErrors, localize_each, within
+from bidnerf_core.testing import textured_map
 from flights import covered, flight
 
 FRAMES = 5

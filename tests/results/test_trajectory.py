@@ -10,14 +10,8 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, InputError
-from bidnerf_core.results.trajectory import (
-    ErrorSummary,
-    TrajectoryErrors,
-    alignment_errors,
-    relative_errors,
-    rigid_alignment,
-    spans,
-)
+from bidnerf_core.results import TrajectoryErrors, spans
+from bidnerf_core.results.trajectory import ErrorSummary, alignment_errors, relative_errors, rigid_alignment
 from bidnerf_core.results.trajectory_plot import PlottedPath, plot_path
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes.primitives import Box, Cylinder, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import blotches, checker, stripes
 

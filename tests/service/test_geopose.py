@@ -18,9 +18,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from bidnerf_core import SE3, InputError, Intrinsics, Localization, Outcome
-from bidnerf_core.geometry.wgs84 import Geodetic, geodetic
-from bidnerf_core.maps.anchor import Anchor, GeographicPose, load_anchor
-from bidnerf_core.results.answers import Answer
+from bidnerf_core.geometry import Geodetic, geodetic
+from bidnerf_core.maps import Anchor, GeographicPose
+from bidnerf_core.maps.anchor import load_anchor
+from bidnerf_core.results import Answer
 from bidnerf_core.service import geopose
 
 places = st.builds(Geodetic, st.floats(-90, 90), st.floats(-179.99, 179.99), st.floats(-5000, 20000))

@@ -39,7 +39,7 @@ from bidnerf_core import (
     settings_of,
 )
 from bidnerf_core.cli import main
-from bidnerf_core.service.access import Access
+from bidnerf_core.service import Access
 from bidnerf_core.service.description import description
 from bidnerf_core.service.pool import Pool
 from bidnerf_core.service.requests import PARAMETERS

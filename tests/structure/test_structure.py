@@ -19,17 +19,18 @@ from PIL import Image
 import bidnerf_core as bn
 import tiny
 from bidnerf_core.camera.orientation import CODES
-from bidnerf_core.datasets.whole import all_views
-from bidnerf_core.geometry.similarity import fit_similarity
+from bidnerf_core.datasets import all_views
+from bidnerf_core.geometry import fit_similarity
 from bidnerf_core.maps.photos import posed_images, poses_folder
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
+from bidnerf_core.structure import lacks_poses
 from bidnerf_core.structure.agreement import Agreement, agreement
 from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
 from bidnerf_core.structure.pairs import ALL_OF_FRAMES, ALL_OF_PHOTOS, NEIGHBOURS, chosen_pairs, few
 from bidnerf_core.structure.poses import found_before
 from bidnerf_core.structure.record import begin, clear, stored_rows
-from bidnerf_core.structure.sources import SourceImage, lacks_poses, photos_of
+from bidnerf_core.structure.sources import SourceImage, photos_of
 from bidnerf_core.structure.video_frames import MOST, STEP, FrameMeasure, chosen, measured, write_frames
 from commands import Run
 from photo_files import write_photo

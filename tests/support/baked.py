@@ -8,20 +8,18 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import SceneBounds, VoxelGrid
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import PointCloud, Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
+from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.scenes.closed_form import ClosedFormScene
-from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.primitives import Primitive, Shape
 from bidnerf_core.scenes.textures import Texture
-from bidnerf_core.scenes.trajectories import orbit
 from problems import FieldMap
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)

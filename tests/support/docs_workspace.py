@@ -14,18 +14,17 @@ from PIL.ExifTags import Base
 
 import tiny
 from bidnerf_core.backend import load_backend
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import write_transforms
-from bidnerf_core.frames.frame import View
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.frames import View
+from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.files import save_map, save_surface
-from bidnerf_core.scenes.closed_form import views as views_of
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.maps import MapInfo, save_map
+from bidnerf_core.maps.files import save_surface
+from bidnerf_core.scenes import demo_object, orbit
+from bidnerf_core.scenes import views as views_of
 from bidnerf_core.training import Silent, TrainingState
 
 TEST_FRAMES = ("r_0", "r_4", "r_8")

@@ -10,9 +10,9 @@ import torch
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.localization import AutoConfig
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.trajectories import look_at
-from bidnerf_core.testing.textured_field import textured_map, view
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import look_at
+from bidnerf_core.testing import textured_map, view
 
 FRAMES = 14
 INTERVAL = 0.1  # seconds

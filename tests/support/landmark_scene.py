@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
-from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
-from bidnerf_core.mapping import Keypoints
-from bidnerf_core.mapping.landmarks.features import quantized
+from bidnerf_core.camera import exposure_times, poses_of_rows
+from bidnerf_core.mapping import Keypoints, quantized
 
 PINHOLE = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300)
 SIZE = 0.04  # metres: of what a keypoint describes

@@ -10,12 +10,11 @@ from torch import Tensor, nn
 
 import baked
 from bidnerf_core.devices import moved
-from bidnerf_core.fields.contract import FieldValues, RaySampler
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.fields import FieldValues, RaySampler, render_image
+from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping import SurfaceMap, bake
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 
 
 class AsModule(nn.Module):

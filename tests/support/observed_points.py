@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from bidnerf_core import SE3
-from bidnerf_core.mapping import Calibration, ObservedPoints
-from bidnerf_core.mapping.geometry.calibration import GIVEN
+from bidnerf_core.mapping import GIVEN, Calibration, ObservedPoints
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
 FOCAL, HEIGHT = 400.0, 480.0

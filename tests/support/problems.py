@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Observations, RadianceField, SceneBounds
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Problem, find_method, rig, settings_of
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 

@@ -6,16 +6,13 @@ from dataclasses import replace
 
 import torch
 
-from bidnerf_core.fields.contract import Rays, SceneBounds
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.residuals import Objective, colour_term, depth_term
-from bidnerf_core.geometry.robust import Robust
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Objective, Observations, Rays, SceneBounds, colour_term, depth_term
+from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization import Pivot
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.rendered import WeightedRays
+from bidnerf_core.scenes import orbit
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 0.9, 0.8))
 FIELD = GaussianBlobs.random()

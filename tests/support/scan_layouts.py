@@ -14,7 +14,7 @@ import lzfse
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 START = 1000.0  # seconds

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import all_pixels, observe
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import View, observe
+from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.geometry import SE3
 
 UNIT = 0.37
 """Metres that one of the model is long."""

@@ -11,14 +11,12 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import Rays
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import all_pixels, observe
-from bidnerf_core.scenes.closed_form import views as seen_from
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import Observations, Rays
+from bidnerf_core.frames import View, observe
+from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.scenes import demo_object, orbit
+from bidnerf_core.scenes import views as seen_from
 from bidnerf_core.training import TrainingBatch
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid.encoding import HashEncodingConfig

@@ -10,7 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 HEAD = "# {}\n# file: 'rgbd_dataset.bag'\n# timestamp {}\n"
 

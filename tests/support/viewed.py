@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from bidnerf_core import SE3, BakeConfig, Frame, Map, View, train
-from bidnerf_core.datasets.queries import Query
+from bidnerf_core.datasets import Query
 from photo_room import CAMERA, HALF, photograph
 from photo_room import walk as walk
 from tiny import config

@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 
 import viewed
 from bidnerf_core import Localizer, ServiceLimits
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.queries import Photos
-from bidnerf_core.viewer.server import serve_view
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import Photos
+from bidnerf_core.viewer import serve_view
 from photo_room import CAMERA
 
 LIMITS = ServiceLimits(max_megabytes=1.0, max_megapixels=1.0)

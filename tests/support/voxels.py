@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.fields import VoxelGrid
 
 
 def cell_centres(grid: VoxelGrid) -> Float[Tensor, "x y z 3"]:

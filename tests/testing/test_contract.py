@@ -16,10 +16,17 @@ import torch
 from torch import Generator, Tensor, nn
 
 import tiny
-from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds, device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import (
+    FieldValues,
+    RayHits,
+    Rays,
+    RaySamples,
+    SceneBounds,
+    Stratified,
+    device_of,
+    render,
+)
+from bidnerf_core.frames import View
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.training import (
     RayBank,

@@ -11,17 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.datasets import Dataset, write_transforms
-from bidnerf_core.datasets.reader import READERS, Reader, ReadOptions
-from bidnerf_core.evaluation.faults import FAULTS, find_fault
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.datasets import READERS, Dataset, Reader, ReadOptions, write_transforms
+from bidnerf_core.evaluation import FAULTS, find_fault
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Problem, find_method, settings_of
-from bidnerf_core.mapping import Keypoints
-from bidnerf_core.mapping.landmarks.features import SIFT
+from bidnerf_core.mapping import SIFT, Keypoints
 from bidnerf_core.registry import registered
-from bidnerf_core.testing import FaultContract, FeaturesContract, MethodContract, ReaderContract
-from bidnerf_core.testing.textured_field import BOUNDS, training_views
+from bidnerf_core.testing import (
+    BOUNDS,
+    FaultContract,
+    FeaturesContract,
+    MethodContract,
+    ReaderContract,
+    training_views,
+)
 
 QUICK = AutoConfig(points=1000, hypotheses=64, rounds=1, refine_steps=0, fused_rays=128)
 

@@ -17,14 +17,13 @@ from bidnerf_core import Localizer, devices
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.cli import main
 from bidnerf_core.devices import constant
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.contract import FieldValues, SceneBounds, device_of, levels
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.localization import settings_of
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, render_image
+from bidnerf_core.localization import captured, settings_of
 from bidnerf_core.localization.solvers import adam
-from bidnerf_core.localization.solvers.adam import captured
-from bidnerf_core.maps.map import load_map
-from bidnerf_core.testing.scene import BOUNDS, rgbd_views
+from bidnerf_core.maps import load_map
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing.scene import rgbd_views
 from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
 from problems import FieldMap
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.photos import LEAST_BLUR, detail_kept
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.testing.textured_field import ground
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import detail_kept
+from bidnerf_core.captures.photos import LEAST_BLUR
+from bidnerf_core.fields import render
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.testing import ground
 from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, supervised_loss
 from landmark_scene import looking_in
 from test_supervision import BACKENDS

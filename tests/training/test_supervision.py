@@ -12,10 +12,9 @@ import torch
 import tiny
 from bidnerf_adanerf import AdaNerfConfig
 from bidnerf_adanerf import backend as adanerf
-from bidnerf_core.fields.contract import Rays, RaySamples
-from bidnerf_core.fields.rendering import Rendering, render, rendering_weights
-from bidnerf_core.frames.frame import SeenLandmarks, View
-from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.fields import Rays, RaySamples, Rendering, render, rendering_weights
+from bidnerf_core.frames import SeenLandmarks, View
+from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination, supervised_loss
 from bidnerf_core.training.loss import distortion, expected_distance
 from bidnerf_core.training.ray_bank import LANDMARK_SHARE

@@ -11,13 +11,13 @@ import torch
 from torch import Generator, Tensor, nn
 
 import tiny
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import all_pixels, observe
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.frames import Frame, View, observe
+from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.scenes import orbit
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from bidnerf_core.training import (
     RayBank,

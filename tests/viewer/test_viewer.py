@@ -16,25 +16,28 @@ import viewed
 from bidnerf_core import SE3, InputError, Intrinsics, Localizer, view
 from bidnerf_core.cli.report import link_to
 from bidnerf_core.errors import Cancelled
+from bidnerf_core.evaluation import ResultTable
 from bidnerf_core.evaluation.report import doubtful
 from bidnerf_core.evaluation.report import page as report_page
-from bidnerf_core.evaluation.results import ResultTable
 from bidnerf_core.evaluation.summary import usual_criterion
 from bidnerf_core.evaluation.trial import ScalarPoseError
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.localization import METHODS, Outcome
-from bidnerf_core.localization.acceptance import DescentDiagnostics, LandmarkThresholds
-from bidnerf_core.localization.advice import ADVICE
-from bidnerf_core.localization.beyond_chance import Support
-from bidnerf_core.localization.recording import (
+from bidnerf_core.fields import render_image
+from bidnerf_core.localization import (
+    ADVICE,
+    METHODS,
     ComparedExplanation,
+    DescentDiagnostics,
+    LandmarkThresholds,
+    Outcome,
     SearchRecord,
-    current_record,
+    Support,
     recorded,
 )
+from bidnerf_core.localization.recording import current_record
 from bidnerf_core.progress import stopped_by
-from bidnerf_core.results.pose_files import PosedImage, write_poses
-from bidnerf_core.viewer.answer import MOST_STEPS, ShownAnswer, depth_difference, ellipsoid, shown_answer
+from bidnerf_core.results import PosedImage, write_poses
+from bidnerf_core.viewer import ShownAnswer, shown_trajectory
+from bidnerf_core.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
 from bidnerf_core.viewer.explanations import EARLIER, HERE, KEPT, contests
 from bidnerf_core.viewer.figures import Bar, acceptance_figures
 from bidnerf_core.viewer.packing import packed_points
@@ -42,7 +45,6 @@ from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.rendering import field_image, quick_image
 from bidnerf_core.viewer.saving import MODULES, page_html
 from bidnerf_core.viewer.scene import shown_map, towards
-from bidnerf_core.viewer.trajectories import shown_trajectory
 from bidnerf_core.viewer.view import localized
 from commands import Run
 

@@ -23,12 +23,11 @@ from playwright.sync_api import sync_playwright
 
 import viewed
 from bidnerf_core import SE3, Localizer
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.viewer import page_of, shown_row, shown_trajectory
 from bidnerf_core.viewer.answer import shown_answer
 from bidnerf_core.viewer.saving import save_page
-from bidnerf_core.viewer.table import shown_row
-from bidnerf_core.viewer.trajectories import shown_trajectory
-from bidnerf_core.viewer.view import localized, page_of
+from bidnerf_core.viewer.view import localized
 from viewer_client import serving
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

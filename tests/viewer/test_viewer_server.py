@@ -23,7 +23,7 @@ from PIL import Image
 
 import viewed
 from bidnerf_core import Localizer, settings_of
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.viewer.jobs import Jobs
 from photo_room import CAMERA
 from viewer_client import Client, serving

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields import SceneBounds
 from bidnerf_nerf_pytorch import NerfPytorchConfig, backend, read_checkpoint
 from bidnerf_nerf_pytorch.network import NetworkConfig
 from conftest import SMALL, Writer, contents

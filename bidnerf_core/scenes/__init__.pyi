@@ -1,0 +1,9 @@
+from .closed_form import views as views
+from .closed_form_data import ClosedFormData as ClosedFormData
+from .closed_form_data import closed_form_data as closed_form_data
+from .closed_form_data import closed_form_map as closed_form_map
+from .closed_form_data import is_closed_form as is_closed_form
+from .demo import demo_object as demo_object
+from .fields import HomogeneousBall as HomogeneousBall
+from .trajectories import look_at as look_at
+from .trajectories import orbit as orbit

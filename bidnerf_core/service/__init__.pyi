@@ -1,0 +1,17 @@
+from .access import SAFE as SAFE
+from .access import Access as Access
+from .access import is_loopback as is_loopback
+from .app import problem as problem
+from .client import ServiceClient as ServiceClient
+from .client import ServiceError as ServiceError
+from .requests import Refused as Refused
+from .requests import body_of as body_of
+from .requests import json_of as json_of
+from .requests import query_of as query_of
+from .server import run_app as run_app
+from .server import serve as serve
+from .server import service_app as service_app
+from .settings import LEAST_TOKEN as LEAST_TOKEN
+from .settings import ServiceLimits as ServiceLimits
+from .settings import checked_token as checked_token
+from .upload import Upload as Upload

@@ -1,0 +1,15 @@
+from .contract import BackendContract as BackendContract
+from .image_contracts import FaultContract as FaultContract
+from .image_contracts import FeaturesContract as FeaturesContract
+from .method_contract import MethodContract as MethodContract
+from .reader_contract import ReaderContract as ReaderContract
+from .recipes import Recorder as Recorder
+from .scene import SCENE_BOUNDS as SCENE_BOUNDS
+from .scene import rgb_views as rgb_views
+from .textured_field import BOUNDS as BOUNDS
+from .textured_field import CAMERA as CAMERA
+from .textured_field import POSES as POSES
+from .textured_field import ground as ground
+from .textured_field import textured_map as textured_map
+from .textured_field import training_views as training_views
+from .textured_field import view as view
