@@ -40,10 +40,14 @@ from .residuals import DEPTH_RESIDUALS as DEPTH_RESIDUALS
 from .residuals import Objective as Objective
 from .residuals import Residual as Residual
 from .residuals import colour_term as colour_term
+from .residuals import depth_residual as depth_residual
 from .residuals import depth_term as depth_term
+from .residuals import first_surface_residual as first_surface_residual
+from .residuals import free_space as free_space
 from .residuals import free_space_term as free_space_term
 from .residuals import masked_mean as masked_mean
 from .residuals import opacity_term as opacity_term
+from .residuals import truncated_depth_residual as truncated_depth_residual
 from .sampling import AroundDepth as AroundDepth
 from .sampling import Concentrated as Concentrated
 from .sampling import HierarchicalField as HierarchicalField

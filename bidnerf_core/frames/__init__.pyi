@@ -22,6 +22,7 @@ from .pixel_store import PixelStore as PixelStore
 from .pixel_store import bytes_of as bytes_of
 from .pixels import DrawerName as DrawerName
 from .pixels import PixelDrawer as PixelDrawer
+from .pixels import all_pixels as all_pixels
 from .pixels import continued as continued
 from .pixels import draw as draw
 from .pixels import drawer as drawer

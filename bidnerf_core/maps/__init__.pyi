@@ -31,3 +31,4 @@ from .training import resume as resume
 from .training import train as train
 from .viewpoints import sphere as sphere
 from .views import Images as Images
+from .views import read_views as read_views
