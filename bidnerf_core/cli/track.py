@@ -45,7 +45,7 @@ from bidnerf_core.results import (
     read_pose,
     require_matplotlib,
 )
-from bidnerf_core.results import tracked_path as library
+from bidnerf_core.results import track as track_frames
 
 
 def run(arguments: list[str]) -> None:
@@ -168,7 +168,7 @@ def run(arguments: list[str]) -> None:
                     )
                     frames = frames if split is None else _of_split(frames, split)
                     with counted("tracking", "frames", -(-len(frames) // every)) as report:
-                        library.track(
+                        track_frames(
                             localizer, frames, config=config, start=begin, depth=depth, every=every, path=path,
                             each=None if drawn is None else drawn.add, progress=lambda p: report(p.done, p.total),
                         )  # fmt: skip

@@ -42,10 +42,13 @@ from bidnerf_core.maps import (
     DESCRIPTION,
     Images,
     MapInfo,
+    OtherSettings,
+    interrupted,
     load_info,
     longest_side,
-    training,
 )
+from bidnerf_core.maps import resume as resume_training
+from bidnerf_core.maps import train as train_map
 from bidnerf_core.settings import to_flat
 from bidnerf_core.structure import lacks_poses
 
@@ -137,7 +140,7 @@ def run(arguments: list[str]) -> None:
         if photos and not (out / DESCRIPTION).exists():
             resume = False  # it was interrupted during pose estimation, which resumes by itself
         if resume:
-            info = training.interrupted(out, not no_bake)
+            info = interrupted(out, not no_bake)
             _check_unchanged(out, info, named, default, config)
             _check_refinement(out, info, refine_poses)
             if largest is not None and largest != longest_side(info):
@@ -162,7 +165,7 @@ def run(arguments: list[str]) -> None:
                 "background": begun if photos else None, "camera": camera if photos else None,
             }  # fmt: skip
             if not resume:
-                training.train(
+                train_map(
                     images,
                     name,
                     out,
@@ -176,8 +179,8 @@ def run(arguments: list[str]) -> None:
                 )
                 return
             try:
-                training.resume(out, images, **same)
-            except training.OtherSettings as error:
+                resume_training(out, images, **same)
+            except OtherSettings as error:
                 raise UsageError(str(error)) from error
 
     parse("train", train, arguments, default)

@@ -18,7 +18,7 @@ from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
 from bidnerf_core.datasets import DatasetFrames, Query, QuerySource, in_other_split
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
 from bidnerf_core.results import BAD_INPUT
-from bidnerf_core.viewer import server
+from bidnerf_core.viewer import PORT, serve_view
 
 if TYPE_CHECKING:
     from bidnerf_core.localization import Localizer
@@ -59,7 +59,7 @@ def view(
         str | None,
         option("ADDRESS", "allow other machines to view the page; they need the address with its token", "this machine only"),
     ] = None,
-    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = server.PORT,
+    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = PORT,
     device: Device = "cpu",
 ) -> None:  # fmt: skip
     """View a map in a browser, drop photos on it, and see how and why a pose was found or rejected. Ctrl-C
@@ -102,7 +102,7 @@ def view(
             page_of(scene, answers, path, rows).save(save)
         show(f"look at {save}")
         return
-    server.serve_view(
+    serve_view(
         localizer,
         source,
         path,

@@ -22,6 +22,7 @@ from .groups import grouped as grouped
 from .json_lines import RowStore as RowStore
 from .plots import comparison_figure as comparison_figure
 from .plots import convergence_plot as convergence_plot
+from .protocols import FARTHEST_START as FARTHEST_START
 from .protocols import PROTOCOLS as PROTOCOLS
 from .protocols import Size as Size
 from .protocols import bid_start as bid_start

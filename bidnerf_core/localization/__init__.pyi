@@ -16,6 +16,8 @@ from .by_landmarks import SHARPEST as SHARPEST
 from .by_landmarks import LandmarkAnswer as LandmarkAnswer
 from .by_landmarks import answer_by_landmarks as answer_by_landmarks
 from .by_landmarks import localization_by_landmarks as localization_by_landmarks
+from .confidence import LogisticModel as LogisticModel
+from .confidence import landmark_features as landmark_features
 from .corrector import Corrector as Corrector
 from .costs.images import KERNEL_REACH as KERNEL_REACH
 from .costs.images import SurfaceRenderer as SurfaceRenderer

@@ -27,6 +27,8 @@ from .scaling import ScaleFit as ScaleFit
 from .scaling import factor_of_distance as factor_of_distance
 from .scaling import factor_of_poses as factor_of_poses
 from .summary import MapSummary as MapSummary
+from .training import OtherSettings as OtherSettings
+from .training import interrupted as interrupted
 from .training import resume as resume
 from .training import train as train
 from .viewpoints import sphere as sphere

@@ -8,6 +8,7 @@ from .requests import Refused as Refused
 from .requests import body_of as body_of
 from .requests import json_of as json_of
 from .requests import query_of as query_of
+from .server import PORT as PORT
 from .server import run_app as run_app
 from .server import serve as serve
 from .server import service_app as service_app

@@ -1,4 +1,5 @@
 from .answer import ShownAnswer as ShownAnswer
+from .server import PORT as PORT
 from .server import serve_view as serve_view
 from .table import ShownRow as ShownRow
 from .table import shown_row as shown_row
