@@ -99,7 +99,7 @@ def working_device(device: torch.device | str) -> torch.device:
         torch.ones((), device=found).item()
     except (RuntimeError, AssertionError, TypeError) as error:  # depends on the build of torch
         raise InputError(
-            f"device {str(device)!r} does not work here, expected a working device such as cpu"
+            f"device {str(device)!r} does not work here", expected="a working device such as cpu"
         ) from error
     return found
 

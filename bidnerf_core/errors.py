@@ -9,7 +9,33 @@ from collections.abc import Collection, Sequence
 
 
 class InputError(ValueError):
-    """An input that cannot be used. The message is a single line that can be shown to the user unchanged."""
+    """An input that cannot be used.
+
+    The message is a single line that can be shown to the user unchanged, ``where: found, expected ...``, and its
+    parts are fields. Where ``found`` ends in a colon or a semicolon, no comma follows it. ``InputError(error,
+    where=path)`` is ``error`` in a wider context: ``where`` precedes its own, and the other parts stay as they are.
+    """
+
+    where: str | None
+    """The file, frame, argument or setting that is wrong, None if the message does not begin with one."""
+    found: str
+    """What was found there, or the whole problem."""
+    expected: str | None
+    """What was expected, with any advice that follows; None if the message does not say."""
+
+    def __init__(self, found: object = "", *, where: object = None, expected: object = None) -> None:
+        places = [where]
+        if isinstance(found, InputError):
+            places.append(found.where)
+            expected, found = found.expected if expected is None else expected, found.found
+        self.where = ": ".join(str(place) for place in places if place) or None
+        self.found = str(found)
+        self.expected = None if expected is None else str(expected)
+        problem = self.found
+        if self.expected is not None:
+            comma = "" if problem.endswith((":", ";")) or not problem else ","
+            problem = f"{problem}{comma} expected {self.expected}".lstrip()
+        super().__init__(f"{self.where}: {problem}" if self.where else problem)
 
 
 class UsageError(InputError):
@@ -28,8 +54,8 @@ class Cancelled(Exception):
 
 def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
     """Return the error for a name that is not among ``known``; it suggests the closest known spelling."""
-    listed = f", expected one of {', '.join(known)}"
-    return InputError(f"no {what} {name!r}{spelling_hint(name, known, listed)}")
+    hint = spelling_hint(name, known)
+    return InputError(f"no {what} {name!r}{hint}", expected=None if hint else f"one of {', '.join(known)}")
 
 
 def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str:
@@ -45,7 +71,7 @@ def refuse_text(what: str, given: object) -> None:
     of letters.
     """
     if isinstance(given, str):
-        raise InputError(f"{what} is {given!r}, expected a list, such as [{given!r}]")
+        raise InputError(f"{what} is {given!r}", expected=f"a list, such as [{given!r}]")
 
 
 def amount(count: int, noun: str) -> str:

@@ -39,7 +39,7 @@ def check_cancelled(cancel: Cancel | None, stage: str) -> None:
     """
     if cancel is not None and not callable(cancel):
         raise InputError(
-            f"cancel is a {type(cancel).__name__}, expected a function, such as the is_set of an event"
+            f"cancel is a {type(cancel).__name__}", expected="a function, such as the is_set of an event"
         )
     if cancel is not None and cancel():
         raise Cancelled(f"cancelled during stage {stage!r}")

@@ -99,12 +99,12 @@ def register(group: str, name: str, value: Any, replace: bool = False) -> None:
     """
     _check_group(group)
     if not (isinstance(name, str) and NAME.fullmatch(name)):
-        raise InputError(f"register: name is {name!r}, expected letters, digits, '.', '-' and '_'")
+        raise InputError(f"name is {name!r}", where="register", expected="letters, digits, '.', '-' and '_'")
     taken = [info for info in list_plugins(group) if info.name == name]
     if taken and not replace and registered.get((group, name)) is not value:
         raise InputError(
-            f"register: the name is taken by {taken[0]}; choose another name, or pass replace=True to"
-            " replace it"
+            f"the name is taken by {taken[0]}; choose another name, or pass replace=True to replace it",
+            where="register",
         )
     registered[group, name] = value
 
@@ -161,7 +161,7 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
     try:
         return _loaded(group, name, defects)
     except PluginError as error:
-        raise PluginError(f"{wanted_by}: {error}" if wanted_by else str(error)) from error.__cause__
+        raise PluginError(error, where=wanted_by) from error.__cause__
 
 
 class Plugins(Mapping[str, Plugin], Generic[Plugin]):
@@ -200,7 +200,7 @@ def _loaded(group: str, name: str, defects: Defects | None) -> Any:
         raise PluginError(_unknown(group, name))
     info = _described_info(found[0], {})
     if info.fault is not None:
-        raise PluginError(f"{info}: {info.fault}")
+        raise PluginError(info.fault, where=info)
     return _checked(info, _imported(info), defects)
 
 
@@ -397,11 +397,11 @@ def _imported(info: PluginInfo) -> Any:
     except (
         BaseException
     ) as error:  # including SystemExit and the like, which must not end the caller's program
-        raise PluginError(f"{info}: cannot be imported: {_described(error)}") from error
+        raise PluginError(f"cannot be imported: {_described(error)}", where=info) from error
     try:
         return reduce(getattr, filter(None, (point.attr or "").split(".")), module)
     except Exception as error:
-        raise PluginError(f"{info}: there is no such object: {_described(error)}") from error
+        raise PluginError(f"there is no such object: {_described(error)}", where=info) from error
 
 
 def _checked(info: PluginInfo, plugin: Any, defects: Defects | None) -> Any:
@@ -410,9 +410,9 @@ def _checked(info: PluginInfo, plugin: Any, defects: Defects | None) -> Any:
     try:
         wrong = None if defects is None else next(defects(plugin), None)
     except Exception as error:  # a property may raise anything
-        raise PluginError(f"{info}: not {kind}: {_described(error)}") from error
+        raise PluginError(f"not {kind}: {_described(error)}", where=info) from error
     if wrong is not None:
-        raise PluginError(f"{info}: not {kind}: {wrong}")
+        raise PluginError(f"not {kind}: {wrong}", where=info)
     return plugin
 
 

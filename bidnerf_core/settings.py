@@ -118,7 +118,7 @@ class Settings:
         for name, (allowed, optional) in _allowed(type(self)).items():  # type: ignore[arg-type]
             value = getattr(self, name)
             if value not in allowed and not (optional and value is None):
-                raise InputError(f"{name} is {value!r}, expected {allowed}")
+                raise InputError(f"{name} is {value!r}", expected=allowed)
 
 
 @functools.cache
@@ -167,8 +167,9 @@ def from_flat(
     given = {(renamed or {}).get(name, name): value for name, value in values.items()}
     for name in given:
         if name not in known:
-            hint = spelling_hint(name, known, f", expected any of {', '.join(known)}")
-            raise InputError(f"{where}: {type(default).__name__} has no setting {name!r}{hint}")
+            hint = spelling_hint(name, known)
+            found = f"{type(default).__name__} has no setting {name!r}{hint}"
+            raise InputError(found, where=where, expected=None if hint else f"any of {', '.join(known)}")
     return _with_values(default, given, where)
 
 
@@ -187,4 +188,4 @@ def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
     try:
         return cast(S, kind(**values))
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error, where=where) from error

@@ -52,7 +52,7 @@ class AdaNerfConfig(SupervisionConfig):
         super().__post_init__()
         if not self.dense_part + self.soft_part <= 1:
             parts = self.dense_part + self.soft_part
-            raise InputError(f"dense_part and soft_part sum to {parts:g}, expected at most 1")
+            raise InputError(f"dense_part and soft_part sum to {parts:g}", expected="at most 1")
 
     @classmethod
     def paper(cls) -> AdaNerfConfig:

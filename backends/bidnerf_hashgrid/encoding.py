@@ -54,7 +54,8 @@ class HashEncodingConfig(Settings):
         super().__post_init__()
         if self.base_resolution > self.finest_resolution:
             raise InputError(
-                f"base_resolution is {self.base_resolution}, expected {self.finest_resolution} (finest_resolution) or less"
+                f"base_resolution is {self.base_resolution}",
+                expected=f"{self.finest_resolution} (finest_resolution) or less",
             )
 
 

@@ -45,7 +45,8 @@ class FieldConfig(Settings):
         super().__post_init__()
         if self.coarse_levels > self.encoding.levels:
             raise InputError(
-                f"coarse_levels is {self.coarse_levels}, expected {self.encoding.levels} (levels of the encoding) or less"
+                f"coarse_levels is {self.coarse_levels}",
+                expected=f"{self.encoding.levels} (levels of the encoding) or less",
             )
 
 

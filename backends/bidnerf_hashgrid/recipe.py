@@ -44,11 +44,11 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
         super().__post_init__()
         if self.coarse_every == 1:
             raise InputError(
-                "coarse_every is 1, expected 0 or 2 and more: the field itself would not be trained"
+                "coarse_every is 1", expected="0 or 2 and more: the field itself would not be trained"
             )
         if self.coarse_every > self.prune_every:
             raise InputError(
-                f"coarse_every is {self.coarse_every}, expected {self.prune_every} (prune_every) or less"
+                f"coarse_every is {self.coarse_every}", expected=f"{self.prune_every} (prune_every) or less"
             )
 
 

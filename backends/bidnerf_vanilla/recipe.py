@@ -36,7 +36,7 @@ class VanillaConfig(FieldConfig, SupervisionConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (self.include_input or self.position_frequencies):
-            raise InputError("position_frequencies is 0 without include_input, expected one of them")
+            raise InputError("position_frequencies is 0 without include_input", expected="one of them")
 
     @classmethod
     def paper(cls) -> VanillaConfig:

@@ -58,9 +58,9 @@ def read_yaml_camera(where: str, content: bytes, size: tuple[int, int]) -> Camer
         values = next(iter(yaml.load_all(text, Loader=_Loader)), None)
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{where}: is not YAML ({reason}), expected {EXPECTED}") from error
+        raise InputError(f"is not YAML ({reason})", where=where, expected=EXPECTED) from error
     if not isinstance(values, Mapping):
-        raise InputError(f"{where}: expected {EXPECTED}")
+        raise InputError(where=where, expected=EXPECTED)
     return calibrated_camera(where, values, size)
 
 
@@ -71,7 +71,9 @@ def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, in
     inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]
     if len(inner) > 1:
         raise InputError(
-            f"{where}: holds {len(inner)} cameras, expected one; keep only the lines of this photo's camera"
+            f"holds {len(inner)} cameras",
+            where=where,
+            expected="one; keep only the lines of this photo's camera",
         )
     if inner and isinstance(inner[0], Mapping):
         return _kalibr(where, inner[0], size)
@@ -84,7 +86,7 @@ def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, in
         given = _first(values, MATRICES)
         if given is None:
             raise InputError(
-                f"{where}: no camera matrix ({', '.join(MATRICES[:3])} or K), expected {EXPECTED}"
+                f"no camera matrix ({', '.join(MATRICES[:3])} or K)", where=where, expected=EXPECTED
             )
         by_columns = "intrinsic_matrix" in values and not isinstance(given, Mapping)
         matrix, coefficients = _array(where, given), _array(where, _first(values, COEFFICIENTS) or [])
@@ -97,7 +99,7 @@ def _kalibr(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Cam
     four, kind = _array(where, values.get("intrinsics", [])), str(values.get("camera_model", "pinhole"))
     if kind != "pinhole" or four.size != 4:
         raise InputError(
-            f"{where}: camera_model is {kind} with {four.size} intrinsics, expected pinhole with 4"
+            f"camera_model is {kind} with {four.size} intrinsics", where=where, expected="pinhole with 4"
         )
     fx, fy, cx, cy = four.ravel().tolist()
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -126,14 +128,14 @@ def _camera(
     kind = model.lower()
     if kind not in (*FISHEYES, *PERSPECTIVE):
         raise InputError(
-            f"{where}: distortion model {model}, expected plumb_bob, rational_polynomial or equidistant"
+            f"distortion model {model}", where=where, expected="plumb_bob, rational_polynomial or equidistant"
         )
     try:
         if kind not in FISHEYES or not matrix.size:
             return Intrinsics.from_opencv(matrix, coefficients if len(coefficients) else None, size)
         flat = Intrinsics.from_opencv(matrix, None, size)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error, where=where) from error
     lens = [*coefficients.tolist(), 0.0, 0.0, 0.0, 0.0][:4]
     return lens_camera(where, "OPENCV_FISHEYE", *size, [flat.fx, flat.fy, flat.cx, flat.cy, *lens])
 
@@ -148,7 +150,7 @@ def gaussian_splatting_camera(where: str, values: Mapping[str, Any]) -> Intrinsi
         question_focal(fx, int(width), int(height))
         return Intrinsics(fx, fy, width / 2, height / 2, int(width), int(height))
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error, where=where) from error
 
 
 def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> Any:
@@ -161,7 +163,7 @@ def _array(where: str, given: Any) -> np.ndarray:
     try:
         return np.asarray(found, dtype=float)  # YAML reads 1e-05 as text
     except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: {str(given)[:60]!r}, expected numbers") from error
+        raise InputError(f"{str(given)[:60]!r}", where=where, expected="numbers") from error
 
 
 def _size(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> tuple[int, int]:
@@ -170,6 +172,6 @@ def _size(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> tuple
         where, pair if pair is not None else [_first(values, keys) or 0 for keys in (WIDTHS, HEIGHTS)]
     )
     if found.size != 2 or not np.isfinite(found).all():
-        raise InputError(f"{where}: size is {str(pair)[:60]!r}, expected width and height in pixels")
+        raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")
     width, height = (int(value) for value in found.ravel())
     return (width, height) if width > 0 and height > 0 else size

@@ -50,7 +50,7 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
     """
     if len(parameters) != colmap_parameters(model):
         raise InputError(
-            f"{where}: {model} has {len(parameters)} parameters, expected {colmap_parameters(model)}"
+            f"{model} has {len(parameters)} parameters", where=where, expected=colmap_parameters(model)
         )
     if model not in COLMAP_MODELS:
         return lens_camera(where, model, width, height, parameters)
@@ -58,7 +58,7 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
     try:
         return Intrinsics(fx, fy, cx, cy, width, height, tuple(lens) if any(lens) else ())
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error, where=where) from error
 
 
 def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
@@ -69,8 +69,8 @@ def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
     k = camera.distortion
     if any(k[MOST_TERMS:]):
         raise InputError(
-            "a camera with thin prism distortion or a tilted sensor, expected one that a COLMAP model"
-            " describes"
+            "a camera with thin prism distortion or a tilted sensor",
+            expected="one that a COLMAP model describes",
         )
     model, count = (
         ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", MOST_TERMS)

@@ -63,7 +63,7 @@ class CameraRecord:
                 return PanoramaFace(self.face or "front", width, height)
             return self._central(width, height)
         except InputError as error:
-            raise self.record.error(str(error)) from error
+            raise self.record.error(error) from error
 
     def _central(self, width: int, height: int) -> Camera:
         fx = self.focal_x if self.angle_x is None else focal_length(width, self.angle_x)
@@ -95,7 +95,7 @@ def camera_record(record: Record) -> CameraRecord:
     focal_x, angle_x = _focal(record, "x")
     focal_y, angle_y = _focal(record, "y")
     if focal_x is None and angle_x is None:
-        raise record.error("no focal length, expected fl_x (pixels) or camera_angle_x (radians)")
+        raise record.error("no focal length", expected="fl_x (pixels) or camera_angle_x (radians)")
     return CameraRecord(
         record,
         width,
@@ -122,7 +122,7 @@ def _lens(record: Record) -> str | None:
         return model
     if model and model not in PERSPECTIVE_MODELS:
         expected = ", ".join((*PERSPECTIVE_MODELS, *LENS_MODELS, PANORAMA))
-        raise record.error(f"camera_model is {model}, expected one of {expected}")
+        raise record.error(f"camera_model is {model}", expected=f"one of {expected}")
     return None
 
 
@@ -142,11 +142,11 @@ def _focal(record: Record, axis: str) -> tuple[float | None, float | None]:
         focal, angle = scope.number(f"fl_{axis}"), scope.number(f"camera_angle_{axis}")
         if focal is not None:
             if focal <= 0:
-                raise record.error(f"fl_{axis} is {focal:g}, expected a positive number of pixels")
+                raise record.error(f"fl_{axis} is {focal:g}", expected="a positive number of pixels")
             return focal, None
         if angle is not None:
             if not 0 < angle < math.pi:
-                raise record.error(f"camera_angle_{axis} is {angle:g}, expected radians between 0 and pi")
+                raise record.error(f"camera_angle_{axis} is {angle:g}", expected="radians between 0 and pi")
             return None, angle
     return None, None
 
@@ -154,7 +154,7 @@ def _focal(record: Record, axis: str) -> tuple[float | None, float | None]:
 def _distortion(record: Record) -> tuple[float, ...]:
     """Return the coefficients in OpenCV's order; an ideal lens has none."""
     if record.number("k4"):
-        raise record.error("k4 is not 0, expected no distortion beyond k1 k2 p1 p2 k3")
+        raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
     values = tuple(record.number(key) or 0.0 for key in DISTORTION_KEYS)
     if not any(values):
         return ()
@@ -187,7 +187,7 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
     if isinstance(views, list) and views and isinstance(views[0], Mapping):  # Open3D's trajectory
         found = {calibrated_camera(record.where, view, size) for view in views}
         if len(found) > 1:
-            raise record.error(f"holds {len(found)} cameras, expected one")
+            raise record.error(f"holds {len(found)} cameras", expected="one")
         return found.pop()
     if any(key in values for key in ("intrinsic_matrix", "intrinsic", "camera_matrix", "K")):
         return calibrated_camera(record.where, values, size)
@@ -202,7 +202,7 @@ def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
     for number, entry in enumerate(entries):
         if not isinstance(entry, Mapping):
             raise InputError(
-                f"{path}: entry {number} is not a camera, expected img_name, width, height, fx and fy"
+                f"entry {number} is not a camera", where=path, expected="img_name, width, height, fx and fy"
             )
         found[str(entry.get("img_name", number))] = gaussian_splatting_camera(
             f"{path}: entry {number}", entry
@@ -220,8 +220,9 @@ def _chosen(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Cam
         if len(fits) == 1:
             return fits.pop()
     raise InputError(
-        f"{path}: holds {len(cameras)} cameras, expected exactly one, or one named after the photo; keep"
-        " only this photo's line"
+        f"holds {len(cameras)} cameras",
+        where=path,
+        expected="exactly one, or one named after the photo; keep only this photo's line",
     )
 
 
@@ -240,7 +241,7 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
         key, camera = _text_camera(row, named)
         if found.setdefault(key, camera) != camera:
-            raise InputError(f"{row.where}: camera {key} is repeated, expected each id once")
+            raise InputError(f"camera {key} is repeated", where=row.where, expected="each id once")
     return found
 
 
@@ -249,7 +250,7 @@ def _text_camera(row: Row, named: bool) -> tuple[str, Camera]:
     if len(words) < 5:
         raise row.error(f" has {len(words)} entries")
     if words[1] not in MODELS:
-        raise InputError(f"{row.where}: camera model {words[1]}, expected one of {', '.join(MODELS)}")
+        raise InputError(f"camera model {words[1]}", where=row.where, expected=f"one of {', '.join(MODELS)}")
     width, height = (row.integer(words[place]) for place in (2, 3))
     key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
     return key, colmap_camera(row.where, words[1], width, height, row.numbers(words[4:]))

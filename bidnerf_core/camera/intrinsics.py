@@ -60,19 +60,19 @@ class Intrinsics:
         for name in ("fx", "fy"):
             value = getattr(self, name)
             if not SMALLEST_FOCAL <= value <= LARGEST_PIXELS:
-                raise InputError(f"focal length {name} is {value}, {_expected_focal(value)}")
+                raise InputError(f"focal length {name} is {value}", expected=_expected_focal(value))
         if not (1 <= self.width <= LARGEST_SIZE and 1 <= self.height <= LARGEST_SIZE):
             expected = f"1x1 to {LARGEST_SIZE}x{LARGEST_SIZE}"
-            raise InputError(f"image size is {self.width}x{self.height}, expected {expected}")
+            raise InputError(f"image size is {self.width}x{self.height}", expected=expected)
         for name in ("cx", "cy"):
             value = getattr(self, name)
             if not abs(value) <= LARGEST_PIXELS:
-                raise InputError(f"principal point {name} is {value}, expected pixels near the image")
+                raise InputError(f"principal point {name} is {value}", expected="pixels near the image")
         if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.distortion):
-            raise InputError(f"distortion is {self.distortion}, expected coefficients of a real lens")
+            raise InputError(f"distortion is {self.distortion}", expected="coefficients of a real lens")
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
             raise InputError(
-                f"distortion has {len(self.distortion)} coefficients, expected 0, 4, 5, 8, 12 or 14"
+                f"distortion has {len(self.distortion)} coefficients", expected="0, 4, 5, 8, 12 or 14"
             )
 
     def _check_types(self) -> None:
@@ -82,7 +82,7 @@ class Intrinsics:
         for name in ("width", "height"):
             _require(name, getattr(self, name), Integral, "a whole number of pixels")
         if not isinstance(self.distortion, tuple | list):
-            raise InputError(f"distortion is a {type(self.distortion).__name__}, expected coefficients")
+            raise InputError(f"distortion is a {type(self.distortion).__name__}", expected="coefficients")
         for value in self.distortion:
             _require("distortion", value, Real, "coefficients of a real lens")
 
@@ -95,7 +95,8 @@ class Intrinsics:
         question_focal(focal, width, height)
         if focal > LARGEST_FOCAL * max(width, height):
             raise InputError(
-                f"focal length is {focal} px for an image of {width}x{height}, expected at most {LARGEST_FOCAL} times its longer side"
+                f"focal length is {focal} px for an image of {width}x{height}",
+                expected=f"at most {LARGEST_FOCAL} times its longer side",
             )
         return Intrinsics(focal, focal, width / 2, height / 2, width, height)
 
@@ -106,12 +107,12 @@ class Intrinsics:
         _require_size("width", width)
         if not 0 < degrees < 180:
             raise InputError(
-                f"horizontal field of view is {degrees}, expected degrees between 0 and 180 (both excluded)"
+                f"horizontal field of view is {degrees}", expected="degrees between 0 and 180 (both excluded)"
             )
         focal = focal_length(width, math.radians(degrees))
         if not SMALLEST_FOCAL <= focal <= LARGEST_PIXELS:
             found = f"horizontal field of view is {degrees}, which gives a focal length of {focal:.3g} pixels"
-            raise InputError(f"{found}, {_expected_focal(focal)}")
+            raise InputError(found, expected=_expected_focal(focal))
         return Intrinsics.from_focal(focal, width, height)
 
     @staticmethod
@@ -129,14 +130,15 @@ class Intrinsics:
             () if distortion is None else _numbers("distortion", distortion).ravel(),
         )
         if matrix.size != 9:
-            raise InputError(f"K has shape {matrix.shape}, expected the 3 x 3 matrix of a camera")
+            raise InputError(f"K has shape {matrix.shape}", expected="the 3 x 3 matrix of a camera")
         (fx, skew, cx), (zero, fy, cy), last = matrix.reshape(3, 3).tolist()
         if abs(skew) > SKEW * abs(fx) or zero != 0 or last != [0, 0, 1]:
             raise InputError(
-                f"K is {matrix.reshape(3, 3).tolist()}, expected rows (fx 0 cx), (0 fy cy), (0 0 1) in pixels"
+                f"K is {matrix.reshape(3, 3).tolist()}",
+                expected="rows (fx 0 cx), (0 fy cy), (0 0 1) in pixels",
             )
         if size is None or len(size) != 2:
-            raise InputError(f"size is {size!r:.60}, expected (width, height) of the image in pixels")
+            raise InputError(f"size is {size!r:.60}", expected="(width, height) of the image in pixels")
         width, height = (_whole(name, value) for name, value in zip(("width", "height"), size, strict=True))
         question_focal(fx, width, height)
         return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height, tuple(lens) if any(lens) else ())
@@ -240,7 +242,7 @@ class Intrinsics:
 
     def _transposed(self) -> Intrinsics:
         if any(self.distortion[TAU_X:]):
-            raise InputError("a camera with a tilted sensor cannot be rotated, expected an upright image")
+            raise InputError("a camera with a tilted sensor cannot be rotated", expected="an upright image")
         order = [TRANSPOSED.get(place, place) for place in range(len(self.distortion))]
         distortion = tuple(self.distortion[place] for place in order)
         return Intrinsics(self.fy, self.fx, self.cy, self.cx, self.height, self.width, distortion)
@@ -265,36 +267,36 @@ def _numbers(name: str, given: Any) -> np.ndarray:
     try:
         array = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {given!r:.60}, expected an array of numbers") from error
+        raise InputError(f"{name} is {given!r:.60}", expected="an array of numbers") from error
     if not np.isfinite(array).all():
-        raise InputError(f"{name} has values that are NaN or infinite, expected finite numbers")
+        raise InputError(f"{name} has values that are NaN or infinite", expected="finite numbers")
     return array
 
 
 def _whole(name: str, value: Any) -> int:
     _require(name, value, Real, "a whole number of pixels")
     if value != int(value):
-        raise InputError(f"{name} is {value!r:.60}, expected a whole number of pixels")
+        raise InputError(f"{name} is {value!r:.60}", expected="a whole number of pixels")
     return int(value)
 
 
 def _require(name: str, value: object, kind: type, expected: str) -> None:
     if isinstance(value, bool) or not isinstance(value, kind):
-        raise InputError(f"{name} is {value!r:.60}, expected {expected}")
+        raise InputError(f"{name} is {value!r:.60}", expected=expected)
 
 
 def _expected_focal(value: float) -> str:
     if value > LARGEST_PIXELS:
-        return f"expected at most {LARGEST_PIXELS:g} pixels"
+        return f"at most {LARGEST_PIXELS:g} pixels"
     if 0 < value < SMALLEST_FOCAL:
-        return f"expected at least {SMALLEST_FOCAL:g} pixels"
-    return "expected a positive number of pixels"
+        return f"at least {SMALLEST_FOCAL:g} pixels"
+    return "a positive number of pixels"
 
 
 def _require_size(name: str, value: object) -> None:
     _require(name, value, Integral, "a whole number of pixels")
     if not 1 <= int(value) <= LARGEST_SIZE:  # type: ignore[call-overload]
-        raise InputError(f"{name} is {value!r:.30}, expected 1 to {LARGEST_SIZE} pixels")
+        raise InputError(f"{name} is {value!r:.30}", expected=f"1 to {LARGEST_SIZE} pixels")
 
 
 P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13

@@ -149,12 +149,12 @@ class CentralLens(Lens):
         )  # checks the numbers
         if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.coefficients):
             raise InputError(
-                f"the coefficients of {self.name} are {self.coefficients}, expected those of a real lens"
+                f"the coefficients of {self.name} are {self.coefficients}", expected="those of a real lens"
             )
         if not all(map(math.isfinite, self._angles)):
             raise InputError(
-                f"{self.name} with coefficients {self.coefficients} maps no ray to a side of its image,"
-                " expected coefficients of a real lens"
+                f"{self.name} with coefficients {self.coefficients} maps no ray to a side of its image",
+                expected="coefficients of a real lens",
             )
 
     def resized(self, width: int, height: int) -> CentralLens:
@@ -239,14 +239,14 @@ class PanoramaFace(Lens):
     def __post_init__(self) -> None:
         if not same_aspect((self.stored_width, self.stored_height), (2, 1)):
             size = f"{self.stored_width}x{self.stored_height}"
-            raise InputError(f"an equirectangular image is {size}, expected twice as many columns as rows")
+            raise InputError(f"an equirectangular image is {size}", expected="twice as many columns as rows")
 
     def resized(self, width: int, height: int) -> PanoramaFace:
         return replace(self, stored_width=width, stored_height=height)
 
     def upright(self, orientation: Orientation) -> PanoramaFace:
         if orientation != UPRIGHT:
-            raise InputError("an equirectangular image cannot be rotated, expected an upright one")
+            raise InputError("an equirectangular image cannot be rotated", expected="an upright one")
         return self
 
     @property
@@ -319,8 +319,8 @@ def lens_camera(where: str, model: str, width: int, height: int, parameters: Seq
             return PanoramaFace("front", width, height)
         ours, places = LENS_MODELS[model]
         if len(parameters) != max(places) + 1:
-            raise InputError(f"{model} has {len(parameters)} parameters, expected {max(places) + 1}")
+            raise InputError(f"{model} has {len(parameters)} parameters", expected=max(places) + 1)
         fx, fy, cx, cy, *rest = (0.0 if place < 0 else float(parameters[place]) for place in places)
         return CentralLens(ours, fx, fy, cx, cy, width, height, tuple(rest), model)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error, where=where) from error

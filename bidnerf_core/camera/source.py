@@ -64,7 +64,7 @@ class FoundCamera:
 def checked_side(largest: int | None) -> int | None:
     """Return ``largest``, the most pixels along an image's longer side. Raises ``InputError`` unless it is a positive integer."""
     if largest is not None and (isinstance(largest, bool) or not isinstance(largest, int) or largest < 1):
-        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
+        raise InputError(f"largest is {largest!r}", expected="a positive whole number of pixels")
     return largest
 
 
@@ -119,7 +119,7 @@ class CameraSource:
     def require(self, path: Path, why: str) -> None:
         """Raise ``InputError`` if no camera is given or assumed; ``why`` states why one is needed."""
         if not self.is_given and not self.assumed:
-            raise InputError(f"{path}: {why}, expected a camera: {WAYS}")
+            raise InputError(why, where=path, expected=f"a camera: {WAYS}")
 
     def find(self, where: Path | str, raster: Raster, exif: Exif = NO_EXIF) -> FoundCamera:
         """Return the camera of an upright image: the given one, else the one in EXIF, else one of the
@@ -130,20 +130,20 @@ class CameraSource:
         """
         camera, focal, hfov, size = self.camera, self.focal, self.hfov, raster.upright_size
         if sum(given is not None for given in (camera, focal, hfov)) > 1:
-            raise InputError(f"{where}: several cameras are given, expected one of {WAYS}")
+            raise InputError("several cameras are given", where=where, expected=f"one of {WAYS}")
         try:
             if focal is not None:
                 return _described(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px, as given")
             if hfov is not None:
                 return _described(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
         except InputError as error:
-            raise InputError(f"{where}: {error}") from error
+            raise InputError(error, where=where) from error
         if camera is None:
             return replace(_found_camera(str(where), raster, exif, self.assumed), approximate=True)
         if isinstance(camera, Intrinsics | Lens):
             return _fitted(str(where), raster, camera, "camera as given")
         if not isinstance(camera, str | Path):
-            raise InputError(f"{where}: camera is {_of_kind(camera)}")
+            raise InputError(f"camera is {_of_kind(camera)}", where=where)
         return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
     def at(self, image: Path) -> Callable[[int, int], Camera]:
@@ -165,13 +165,17 @@ def folder_camera(
     the ``ways`` to give one, and for a given file that does not exist.
     """
     if isinstance(given, Path) and not given.exists():
-        raise InputError(f"{given}: no such file, expected the camera of {folder}: {ways}")
+        raise InputError("no such file", where=given, expected=f"the camera of {folder}: {ways}")
     beside = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
     found = given or beside or published
     if found is None:
         raise InputError(
-            f"{folder}: {unknown}; expected its camera: {' or '.join(CAMERA_FILES)} in the folder, or --camera with "
-            f"{ways} (camera= in Python)"
+            f"{unknown};",
+            where=folder,
+            expected=(
+                f"its camera: {' or '.join(CAMERA_FILES)} in the folder, or --camera with {ways} (camera= in"
+                " Python)"
+            ),
         )
     return CameraSource(found)
 
@@ -204,8 +208,9 @@ def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCame
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
         raise InputError(
-            f"{where}: image is {size}, but its camera is for {given.width}x{given.height}, expected one"
-            " with the same aspect ratio"
+            f"image is {size}, but its camera is for {given.width}x{given.height}",
+            where=where,
+            expected="one with the same aspect ratio",
         )
     if isinstance(fitted, Lens):
         return FoundCamera(fitted.pinhole, f"{origin}: {fitted.sentence}", lens=fitted)
@@ -225,7 +230,9 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
     if taken and _is_cropped(raster, taken):
         size = f"{raster.width}x{raster.height}"
         raise InputError(
-            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS_OF_PHOTO}"
+            f"image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera:"
+            f" {WAYS_OF_PHOTO}",
+            where=where,
         )
     return _by_exif(where, raster, exif, raster.size)
 
@@ -259,7 +266,7 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
         return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
-    raise InputError(f"{where}: no focal length in EXIF, expected a camera: {WAYS_OF_PHOTO}")
+    raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
@@ -285,4 +292,4 @@ def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> FoundC
     try:
         return _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
     except InputError as error:
-        raise InputError(f"{where}: EXIF: {error}; give its camera: {WAYS}") from error
+        raise InputError(f"EXIF: {error}; give its camera: {WAYS}", where=where) from error

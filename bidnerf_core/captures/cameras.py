@@ -70,7 +70,7 @@ class PoseConsistency:
     def __post_init__(self) -> None:
         for value in (self.noise_before, self.noise_after):
             if not 0 <= value <= LARGEST_NOISE:
-                raise InputError(f"the keypoint noise is {value}, expected 0 to {LARGEST_NOISE:g} pixels")
+                raise InputError(f"the keypoint noise is {value}", expected=f"0 to {LARGEST_NOISE:g} pixels")
 
     @property
     def inconsistency(self) -> float:

@@ -67,6 +67,6 @@ def _read(file: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
             cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise InputError(
-                f"{file}: camera {len(cameras)} is not readable ({error}), expected Inria's layout"
+                f"camera {len(cameras)} is not readable ({error})", where=file, expected="Inria's layout"
             ) from error
     return tuple(cameras)

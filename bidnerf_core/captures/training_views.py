@@ -189,7 +189,8 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
             f" {right:.3g}, depth_unit in Python, or depth_unit_scale_factor in a transforms.json)"
         )
     raise InputError(
-        f"{remark}; expected depth and poses in the same unit: {remedy}; otherwise scale the poses by {ratio:.3g}"
+        f"{remark};",
+        expected=f"depth and poses in the same unit: {remedy}; otherwise scale the poses by {ratio:.3g}",
     )
 
 

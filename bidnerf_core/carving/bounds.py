@@ -55,7 +55,7 @@ def estimate_bounds(
     least half the longest side is assumed. Raises ``InputError`` if there are no views.
     """
     if not views:
-        raise InputError("scene bounds: no views to estimate them from")
+        raise InputError("no views to estimate them from", where="scene bounds")
     measured = [view for view in views if view.frame.has_depth]
     dense = [view for view in measured if view.frame.has_dense_depth]
     outlined = [view for view in views if has_outline(view)]

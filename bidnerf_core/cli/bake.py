@@ -62,10 +62,10 @@ def bake(
     """
     if rendered_landmarks and data is not None:
         raise UsageError(
-            "--rendered-landmarks uses no photos, but --data gives some; expected only one of them"
+            "--rendered-landmarks uses no photos, but --data gives some;", expected="only one of them"
         )
     if masks is not None and data is None:
-        raise UsageError("--masks was given without --data, expected the dataset that they belong to")
+        raise UsageError("--masks was given without --data", expected="the dataset that they belong to")
     registration, hiding = depth_registration(register_depth), mask_folder(masks, mask_hides)
     scene = load_map(map, device, baked=False)  # its baked parts may be damaged, and are replaced anyway
     photos = None

@@ -78,7 +78,7 @@ DepthSensorName = Annotated[str, option("NAME", "what measured the depth:" + ", 
 def mask_folder(masks: Path | None, hides: HiddenColour) -> MaskFolder | None:
     """Return the mask folder given by ``--masks`` and ``--mask-hides``. Raises ``UsageError`` for the latter alone."""
     if masks is None and hides != "black":
-        raise UsageError(f"--mask-hides {hides} was given without --masks, expected the folder of masks")
+        raise UsageError(f"--mask-hides {hides} was given without --masks", expected="the folder of masks")
     return None if masks is None else MaskFolder(masks, hides)
 
 

@@ -79,8 +79,8 @@ def run(arguments: list[str]) -> None:
         """
         if len(folders) < 2:
             raise UsageError(
-                f"{len(folders)} folder{'s' if len(folders) != 1 else ''} given, "
-                "expected the folders of one or more maps, then that of a dataset"
+                f"{len(folders)} folder{'s' if len(folders) != 1 else ''} given",
+                expected="the folders of one or more maps, then that of a dataset",
             )
         *maps, data = folders
         mask_folder(masks, mask_hides)  # rejects anything but a folder of masks

@@ -92,7 +92,7 @@ def _demonstrated(
         config = quick_config(chosen)
         config = config if steps is None else dataclasses.replace(config, steps=steps)
     except TypeError as error:
-        raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has it") from error
+        raise UsageError(f"backend {backend!r} has no setting 'steps'", expected="one that has it") from error
     with (
         timed(f"trained on {len(seen)} views of the closed-form scene, and baked"),
         stopped_by_ctrl_c() as cancel,

@@ -130,7 +130,7 @@ def read_sizes(words: Sequence[str]) -> tuple[Size, ...]:
     try:
         return tuple(tuple(float(number) for number in word.split(":")) for word in words)
     except ValueError as error:
-        raise UsageError(f"--size is {' '.join(words)}, expected numbers such as 0.5, or 0.2:10") from error
+        raise UsageError(f"--size is {' '.join(words)}", expected="numbers such as 0.5, or 0.2:10") from error
 
 
 def _own_data(map: str) -> str:

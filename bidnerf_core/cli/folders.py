@@ -21,16 +21,16 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
     # os.path functions return False for a name that is too long, which is reported when it is written.
     if os.path.isdir(out) or not os.path.isdir(out.parent):
         what = "is a folder" if os.path.isdir(out) else f"no folder {out.parent}"
-        raise InputError(f"{out}: {what}, expected a file in an existing folder")
+        raise InputError(what, where=out, expected="a file in an existing folder")
     require_outside_maps(out.parent, out)
     if not os.path.exists(out):
         return
     for given in [Path(each) for each in inputs if each is not None]:
         if given.exists() and out.samefile(given):
-            raise UsageError(f"{out}: is an input of this command, expected another name for its output")
+            raise UsageError("is an input of this command", where=out, expected="another name for its output")
         if given.is_dir() and out.resolve().is_relative_to(given.resolve()):
             raise UsageError(
-                f"{out}: is a file in the input {given}; expected a new name, or remove the file first"
+                f"is a file in the input {given};", where=out, expected="a new name, or remove the file first"
             )
 
 
@@ -47,7 +47,7 @@ def check_plot(plot: Path, inputs: Iterable[Path | str | None]) -> None:
     not a plot's.
     """
     if plot.suffix.lower() not in PLOTS:
-        raise UsageError(f"{plot}: expected a name that ends with {' or '.join(PLOTS)}")
+        raise UsageError(where=plot, expected=f"a name that ends with {' or '.join(PLOTS)}")
     check_output(plot, inputs)
 
 
@@ -58,7 +58,9 @@ def check_folder(out: Path, inputs: Iterable[Path | str | None], may_be_map: boo
         require_outside_maps(out, out)
     for given in [Path(each) for each in inputs if each is not None]:
         if out.exists() and given.exists() and out.samefile(given):
-            raise UsageError(f"{out}: is an input of this command, expected another folder for its output")
+            raise UsageError(
+                "is an input of this command", where=out, expected="another folder for its output"
+            )
 
 
 def require_outside_maps(folder: Path, out: Path) -> None:
@@ -66,7 +68,7 @@ def require_outside_maps(folder: Path, out: Path) -> None:
     from bidnerf_core.maps import DESCRIPTION
 
     if (folder / DESCRIPTION).exists():
-        raise UsageError(f"{out}: lies in the folder of a map, expected a name outside of it")
+        raise UsageError("lies in the folder of a map", where=out, expected="a name outside of it")
 
 
 def make_folder(folder: Path, inputs: Iterable[Path | str | None]) -> None:
@@ -78,4 +80,4 @@ def make_folder(folder: Path, inputs: Iterable[Path | str | None]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}, expected a folder that can be created") from error
+        raise InputError(error.strerror, where=folder, expected="a folder that can be created") from error

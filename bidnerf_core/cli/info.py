@@ -39,10 +39,11 @@ def _draw(scene: Map, out: Path) -> None:
     """Draw the capture from above. Raises ``InputError`` if the map has no record of it."""
     if scene.capture is None:
         raise InputError(
-            f"{scene.folder}: has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one"
+            "has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one",
+            where=scene.folder,
         )
     if out.suffix.lower() != ".png":
-        raise InputError(f"{out}: expected the name of a PNG file")
+        raise InputError(where=out, expected="the name of a PNG file")
     seen_by = None if scene.landmarks is None else scene.landmarks.views
     points = None if scene.landmarks is None else scene.landmarks.positions
     draw_capture(scene.capture, points, seen_by, out, scene.unit)

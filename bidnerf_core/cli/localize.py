@@ -169,7 +169,7 @@ def run(arguments: list[str]) -> None:
         """
         require("--seed", seed, 0, LARGEST_SEED)
         if frame and not any(frame):
-            raise UsageError("--frame names no frame, expected the stem of an image file")
+            raise UsageError("--frame names no frame", expected="the stem of an image file")
         photos = PhotoOptions(
             depth, CameraSource(camera, focal, hfov), depth_unit, depth_registration(register_depth),
             mask_folder(masks, mask_hides),
@@ -207,7 +207,7 @@ def run(arguments: list[str]) -> None:
         photos = replace(photos, camera=replace(photos.camera, assumed=assumed))
         source = open_queries(query, photos, frames, stored.bounds.background, points)
         if perturb is not None and isinstance(source, Photos):
-            raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
+            raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
         if draw is not None:
             for name in source.names:
                 check_output(_picture_file(draw, name), inputs)
@@ -291,7 +291,7 @@ class _Output:
         if out is not None:
             if not accepted and pose_format(out) != ".json":
                 raise InputError(
-                    f"{out}: not written, since no pose converged; a .json file takes all of them"
+                    "not written, since no pose converged; a .json file takes all of them", where=out
                 )
             answers.save(out)
         if failed := len(answers) - len(answers.answers):

@@ -136,7 +136,7 @@ def _require_finite(settings: Any) -> None:
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if isinstance(value, float) and not math.isfinite(value):
-            raise UsageError(f"--{field.name.replace('_', '-')} is {value}, expected a finite number")
+            raise UsageError(f"--{field.name.replace('_', '-')} is {value}", expected="a finite number")
         _require_finite(value)
 
 
@@ -144,14 +144,14 @@ def require(what: str, value: float, least: float, most: float = math.inf) -> No
     """Check a number from the command line. Raises ``UsageError`` if it is out of range."""
     if not least <= value <= most:
         expected = f"{least} or more" if most == math.inf else f"{least} to {most}"
-        raise UsageError(f"{what} is {value}, expected {expected}")
+        raise UsageError(f"{what} is {value}", expected=expected)
 
 
 def require_different(what: str, names: Sequence[str]) -> None:
     """Check that no name is listed twice. Raises ``UsageError``."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
-        raise UsageError(f"{what} names {twice[0]} more than once, expected each once")
+        raise UsageError(f"{what} names {twice[0]} more than once", expected="each once")
 
 
 @contextlib.contextmanager
@@ -160,7 +160,7 @@ def wrong_usage() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(error) from error
 
 
 def value_of(option: str, arguments: Sequence[str]) -> str | None:

@@ -67,7 +67,7 @@ def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None)
     dataset = with_all(dataset, split)
     total = len(dataset.frame_names(split)) if names is None else len(names)
     if total == 0:
-        raise InputError(f"{dataset.path}: split {split!r} has no frames")
+        raise InputError(f"split {split!r} has no frames", where=dataset.path)
     if total <= 10:
         return dataset.views(split, names)
     with console.status("") as status:

@@ -46,7 +46,7 @@ class PhotoOptions:
         for option, value in (("--depth-unit", self.depth_unit), ("--register-depth", self.registration)):
             if value and not self.depth:
                 raise UsageError(
-                    f"{option} was given without --depth, expected the depth image that it belongs to"
+                    f"{option} was given without --depth", expected="the depth image that it belongs to"
                 )
 
 
@@ -64,7 +64,8 @@ class FrameOptions:
         require("--window", self.window, 1)
         if self.window > 1 and len(self.names) > 1:
             raise UsageError(
-                f"--window {self.window} with {len(self.names)} frames, expected one: the last of the window"
+                f"--window {self.window} with {len(self.names)} frames",
+                expected="one: the last of the window",
             )
 
 
@@ -83,7 +84,7 @@ def open_queries(
     if frames.names or datasets:
         return _dataset(paths, photos, frames, background, points)
     if frames.window > 1:
-        raise UsageError(f"--window {frames.window} needs known relative poses, expected a dataset")
+        raise UsageError(f"--window {frames.window} needs known relative poses", expected="a dataset")
     files = photo_files(paths, photos.depth)
     _check_points(points, len(files), "photos; expected one photo")
     depth = depth_files(files, photos.depth)
@@ -97,7 +98,7 @@ def _dataset(
     points: DepthPoints | None,
 ) -> QuerySource:  # fmt: skip
     if len(paths) > 1:
-        raise UsageError(f"{len(paths)} queries including a dataset, expected only the dataset")
+        raise UsageError(f"{len(paths)} queries including a dataset", expected="only the dataset")
     if photos.for_photos:
         raise UsageError(
             f"{photos.for_photos[0]} is for photos, but {paths[0]} is a dataset, which has its own; to use"
@@ -118,4 +119,4 @@ def _dataset(
 
 def _check_points(points: DepthPoints | None, queries: int, expected: str) -> None:
     if points is not None and points.sparse is None and queries > 1:
-        raise UsageError(f"{points.path}: points of a single camera, but {queries} {expected}")
+        raise UsageError(f"points of a single camera, but {queries} {expected}", where=points.path)

@@ -44,15 +44,15 @@ def report(
     from bidnerf_core.evaluation import ResultTable, chosen_criterion, read_runs, write_report
 
     if not results:
-        raise UsageError("no results file, expected at least one written by 'bidnerf evaluate'")
+        raise UsageError("no results file", expected="at least one written by 'bidnerf evaluate'")
     table = ResultTable.load(*results)
     if not table.rows:
-        raise InputError(f"{', '.join(map(str, results))}: no finished trial in it, nothing to report")
+        raise InputError("no finished trial in it, nothing to report", where=", ".join(map(str, results)))
     with wrong_usage():
         chosen = chosen_criterion(criterion, table.groups)
     if view is not None and not view.is_file():
         raise InputError(
-            f"{view}: no such page, expected one written by 'bidnerf view MAP --results ... --save'"
+            "no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'"
         )
     check_folder(out, results)
     runs = [(path.name, read_runs(path)) for path in results]

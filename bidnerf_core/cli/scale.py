@@ -79,7 +79,7 @@ def _factor(
         first, second, length = distance
         return factor_of_distance(scene, first, second, _metres(length))
     if factor is None:
-        raise UsageError("expected one of --distance, --poses and --factor")
+        raise UsageError(expected="one of --distance, --poses and --factor")
     return factor
 
 
@@ -87,4 +87,4 @@ def _metres(word: str) -> float:
     try:
         return float(word)
     except ValueError as error:
-        raise UsageError(f"--distance: METRES is {word!r}, expected a number") from error
+        raise UsageError(f"METRES is {word!r}", where="--distance", expected="a number") from error

@@ -75,7 +75,7 @@ def serve(
     """
     require("--port", port, 0, 65535)
     if not maps:
-        raise UsageError("no MAP, expected folders of maps")
+        raise UsageError("no MAP", expected="folders of maps")
     given = _token(token_file)
     serve_maps(
         _named(maps), host=host, port=port, token=given, method=method, device=device, limits=limits,
@@ -94,7 +94,7 @@ def _named(maps: tuple[str, ...]) -> dict[str, str | Path]:
         if not equals or Path(given).is_dir():
             name, folder = Path(given).resolve().name, given
         if name in found:
-            raise UsageError(f"two maps are named {name!r}, expected a different name for each: NAME=MAP")
+            raise UsageError(f"two maps are named {name!r}", expected="a different name for each: NAME=MAP")
         found[name] = folder
     return found
 
@@ -105,9 +105,9 @@ def _token(file: Path | None) -> str | None:
     try:
         token = read_file(file, "a file with a token", 4096).decode().strip()
     except UnicodeDecodeError as error:
-        raise InputError(f"{file}: is not text, expected a token") from error
+        raise InputError("is not text", where=file, expected="a token") from error
     if not token:
-        raise InputError(f"{file}: is empty, expected a token")
+        raise InputError("is empty", where=file, expected="a token")
     return token
 
 

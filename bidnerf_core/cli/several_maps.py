@@ -35,16 +35,17 @@ def named_maps(first: Path, others: Sequence[Path]) -> tuple[list[Path], tuple[P
 
 def no_query(maps: Sequence[Path]) -> UsageError:
     """Return the error for arguments that all count as maps: no query is among them, or it comes first."""
-    expected = "expected image files, folders of photos, or a folder of a dataset"
+    expected = "image files, folders of photos, or a folder of a dataset"
     first, *others = maps
     if not others:
-        return UsageError(f"no QUERY, {expected}")
+        return UsageError("no QUERY", expected=expected)
     if first.exists() and not maps_in(first):
         return UsageError(
             f"{str(first)!r} is not a map, but {str(others[0])!r} is: MAP comes first, then QUERY"
         )
     return UsageError(
-        f"{enumeration([repr(str(path)) for path in maps])} are maps, and no QUERY follows them; {expected}"
+        f"{enumeration([repr(str(path)) for path in maps])} are maps, and no QUERY follows them;",
+        expected=expected,
     )
 
 
@@ -68,7 +69,7 @@ def check_for_several(given: dict[str, bool], out: Path | None) -> None:
         if is_given:
             raise UsageError(f"{option} applies to one map, but several are given")
     if out is not None and pose_format(out) != ".json":
-        raise UsageError(f"{out}: poses in several maps have different worlds, expected a .json file")
+        raise UsageError("poses in several maps have different worlds", where=out, expected="a .json file")
 
 
 def localize_in_several(

@@ -26,7 +26,9 @@ class StartSpec:
             limits = (("T", "metres", FARTHEST_START), ("R", "degrees", 180.0))
             for (what, unit, most), value in zip(limits, self.perturb, strict=True):
                 if not 0 <= value <= most:
-                    raise UsageError(f"--perturb: {what} is {value:g}, expected {unit} from 0 to {most:g}")
+                    raise UsageError(
+                        f"{what} is {value:g}", where="--perturb", expected=f"{unit} from 0 to {most:g}"
+                    )
 
     @property
     def given(self) -> bool:

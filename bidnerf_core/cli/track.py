@@ -123,13 +123,15 @@ def run(arguments: list[str]) -> None:
         if follow and split is not None:
             raise UsageError("--split is for datasets, leave it out with --follow")
         if follow and depth_unit is not None:
-            raise UsageError("--depth-unit does not work with --follow, expected depth_unit in each request")
+            raise UsageError(
+                "--depth-unit does not work with --follow", expected="depth_unit in each request"
+            )
         if follow and masks is not None:
             raise UsageError(
                 '--masks needs the images in advance; with --follow, lines of stdin may name a "mask"'
             )
         if out is None and not follow:
-            raise UsageError("no --out, expected the name of a pose file")
+            raise UsageError("no --out", expected="the name of a pose file")
         inputs = (sequence, camera, start, register_depth)
         if out is not None:
             check_pose_file(out, inputs)
@@ -210,7 +212,7 @@ def _finish(path: TrackedPath, stored: Map, out: Path | None, plot: Path | None,
 
 def _of_split(frames: FrameSequence, split: str) -> FileSequence:
     if not isinstance(frames, FileSequence):
-        raise InputError(f"{frames.path}: a video has no splits, leave out --split {split}")
+        raise InputError(f"a video has no splits, leave out --split {split}", where=frames.path)
     return frames.of_split(split)
 
 

@@ -181,7 +181,7 @@ def run(arguments: list[str]) -> None:
             try:
                 resume_training(out, images, **same)
             except OtherSettings as error:
-                raise UsageError(str(error)) from error
+                raise UsageError(error) from error
 
     parse("train", train, arguments, default)
 

@@ -77,7 +77,7 @@ def view(
     require("--port", port, 0, 65535)
     names = tuple(name for group in frame for name in group)
     if names and not query:
-        raise UsageError("--frame names frames of a dataset, expected the dataset as QUERY")
+        raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
     if save is not None:
         check_output(save, (*query, *depth, results, trajectory))
     path = None if trajectory is None else shown_trajectory(trajectory, load_info(map).unit)

@@ -40,7 +40,7 @@ class FrameRequest:
         if image is None:
             raise request.error(f'no "image" in {line.strip()[:80]!r}')
         if unknown := sorted(request.values.keys() - KEYS):
-            raise request.error(f"unknown key {unknown[0]!r}, expected any of {', '.join(sorted(KEYS))}")
+            raise request.error(f"unknown key {unknown[0]!r}", expected=f"any of {', '.join(sorted(KEYS))}")
         time, unit = request.number("time"), request.number("depth_unit")
         mask = request.text("mask")
         return FrameRequest(
@@ -81,7 +81,9 @@ def _lines() -> Iterator[FrameRequest | InputError]:
 def _arriving(folder: Path) -> Iterator[FrameRequest]:
     """Yield the images of a folder in natural name order, and later ones as they arrive."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder, expected one that receives images, or {STDIN} for stdin")
+        raise InputError(
+            "no such folder", where=folder, expected=f"one that receives images, or {STDIN} for stdin"
+        )
     given, sizes = set[Path](), dict[Path, tuple[int, int]]()
     while True:
         photos, others = photos_in(folder)

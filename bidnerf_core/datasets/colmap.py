@@ -41,9 +41,9 @@ class SparseChoice:
 
     def __post_init__(self) -> None:
         if not self.points_error > 0:
-            raise InputError(f"points_error is {self.points_error}, expected a positive number of pixels")
+            raise InputError(f"points_error is {self.points_error}", expected="a positive number of pixels")
         if self.points_views < 1:
-            raise InputError(f"points_views is {self.points_views}, expected 1 or more")
+            raise InputError(f"points_views is {self.points_views}", expected="1 or more")
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,9 @@ class SparsePoints:
         self._kept = _kept(self._points, choice)
         if not bool(self._kept.any()):
             raise InputError(
-                f"{folder}: none of its {len(self._kept)} points has a reprojection error of "
-                f"{choice.points_error:g} pixels or less and {choice.points_views} observations or more"
+                f"none of its {len(self._kept)} points has a reprojection error of {choice.points_error:g}"
+                f" pixels or less and {choice.points_views} observations or more",
+                where=folder,
             )
         self.unit = self._measured(places, split)
 
@@ -113,7 +114,9 @@ class SparsePoints:
         ]
         if not parts:
             names = ", ".join(view.frame.name for view in views)
-            raise InputError(f"{self.folder}: has no points observed by {names}; it has {self._images.some}")
+            raise InputError(
+                f"has no points observed by {names}; it has {self._images.some}", where=self.folder
+            )
         return Observations.joined(parts)
 
     def onto(self, view: View, split: str) -> View:
@@ -133,8 +136,9 @@ class SparsePoints:
         known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
         if len(known) < 2:
             raise InputError(
-                f"{self.folder}: has {len(known)} of the {len(places)} training cameras, expected at least 2"
-                f" to determine its unit; it has {self._images.some}"
+                f"has {len(known)} of the {len(places)} training cameras",
+                where=self.folder,
+                expected=f"at least 2 to determine its unit; it has {self._images.some}",
             )
         there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
         try:
@@ -144,12 +148,13 @@ class SparsePoints:
             misfit = float(_off(there[fits], here[fits]).median()) / spread(here[fits])
         except InputError as error:
             raise InputError(
-                f"{self.folder}: the unit cannot be estimated from the training cameras: {error}"
+                f"the unit cannot be estimated from the training cameras: {error}", where=self.folder
             ) from error
         if misfit > LARGEST_MISFIT:
             raise InputError(
-                f"{self.folder}: its cameras are {misfit:.0%} of their spread away from the training"
-                f" cameras, expected at most {LARGEST_MISFIT:.0%}; is it a model of these images?"
+                f"its cameras are {misfit:.0%} of their spread away from the training cameras",
+                where=self.folder,
+                expected=f"at most {LARGEST_MISFIT:.0%}; is it a model of these images?",
             )
         return Unit(unit, int(fits.sum()), misfit)
 
@@ -180,7 +185,9 @@ class _Names:
         if len(fits) > 1:
             listed = ", ".join(image.name for _, image in fits[:4])
             raise InputError(
-                f"{self._folder}: frame {name!r} may be any of {listed}; expected one image of that name"
+                f"frame {name!r} may be any of {listed};",
+                where=self._folder,
+                expected="one image of that name",
             )
         return fits[0][1] if fits else None
 

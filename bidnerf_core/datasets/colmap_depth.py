@@ -39,11 +39,13 @@ def read_colmap_depth(path: Path, unit: float) -> DepthImage:
     content = read_file(path, EXPECTED)
     *sizes, numbers = content.split(b"&", 3)
     if len(sizes) != 3 or not all(size.isdigit() and len(size) < LARGEST_HEAD for size in sizes):
-        raise InputError(f"{path}: does not begin with width&height&channels&, expected {EXPECTED}")
+        raise InputError("does not begin with width&height&channels&", where=path, expected=EXPECTED)
     width, height, channels = map(int, sizes)
     if channels != 1 or width * height < 1 or len(numbers) != 4 * width * height:
         raise InputError(
-            f"{path}: has {len(numbers)} bytes after {width}&{height}&{channels}&, expected {4 * width * height} of one channel"
+            f"has {len(numbers)} bytes after {width}&{height}&{channels}&",
+            where=path,
+            expected=f"{4 * width * height} of one channel",
         )
     values = np.frombuffer(numbers, "<f4").reshape(height, width)
     return depth_image(np.where(values > 0, values, 0), unit, f"{path}: depth")

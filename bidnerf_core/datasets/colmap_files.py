@@ -74,7 +74,7 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
         ]
         hint = f"; did you mean {inside[0]}?" if inside else ""
         wanted = "images.bin and points3D.bin, or the same as .txt"
-        raise InputError(f"{folder}: no COLMAP sparse model in it, expected {wanted}{hint}")
+        raise InputError("no COLMAP sparse model in it", where=folder, expected=f"{wanted}{hint}")
     images, points = (folder / f"{name}{suffix}" for name in NAMES)
     if suffix == ".bin":
         return _binary(images, _binary_image), _together(points, _binary(points, _binary_point))
@@ -89,7 +89,9 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
     """
     suffix = next((s for s in (".bin", ".txt") if has_posed_images(folder, s)), None)
     if suffix is None:
-        raise InputError(f"{folder}: no cameras and images of a COLMAP sparse model, expected .bin or .txt")
+        raise InputError(
+            "no cameras and images of a COLMAP sparse model", where=folder, expected=".bin or .txt"
+        )
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
     if suffix == ".txt":
         return _text_images(images), read_text_cameras(cameras)
@@ -121,7 +123,7 @@ def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
     if name is None:
         expected = ", ".join(MODEL_IDS.values())
         raise InputError(
-            f"{where} has the model {model}, expected one of {expected}; undistort the images with COLMAP"
+            f"{where} has the model {model}", expected=f"one of {expected}; undistort the images with COLMAP"
         )
     parameters = file.array(np.dtype("<f8"), colmap_parameters(name)).tolist()
     return int(number), colmap_camera(where, name, int(width), int(height), parameters)
@@ -165,7 +167,7 @@ class _Bytes:
         if size > self.left:
             length = len(self._content)
             raise InputError(
-                f"{self.path}: ends too early, at byte {length}; expected a complete COLMAP file"
+                f"ends too early, at byte {length};", where=self.path, expected="a complete COLMAP file"
             )
         self._place += size
         return self._place - size
@@ -176,10 +178,10 @@ def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
     file = _Bytes(path)
     (count,) = file.take(COUNT)
     if count > file.left:  # a false count must not allocate memory
-        raise InputError(f"{path}: declares {count} entries in {file.left} bytes; is the file damaged?")
+        raise InputError(f"declares {count} entries in {file.left} bytes; is the file damaged?", where=path)
     found = [one(file) for _ in range(int(count))]
     if file.left:
-        raise InputError(f"{path}: {file.left} bytes after its {count} entries, expected a COLMAP file")
+        raise InputError(f"{file.left} bytes after its {count} entries", where=path, expected="a COLMAP file")
     return found
 
 
@@ -232,7 +234,7 @@ def _text_points(path: Path) -> list[ModelPoint]:
 def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np.ndarray) -> ModelImage:
     """Build an image from a ``pose``, which is a quaternion w x y z followed by a translation."""
     if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(pose[:4]) < 2):
-        raise InputError(f"{where}: image {name!r} has an invalid pose, expected a unit quaternion")
+        raise InputError(f"image {name!r} has an invalid pose", where=where, expected="a unit quaternion")
     rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
     T = SE3(torch.from_numpy(rotation), torch.tensor(pose[4:], dtype=torch.float64))
     return ModelImage(name, camera, T, torch.from_numpy(np.unique(points)))
@@ -242,7 +244,7 @@ def _together(path: Path, points: list[ModelPoint]) -> ModelPoints:
     ordered = sorted(points, key=lambda point: point.id)
     ids = torch.tensor([point.id for point in ordered], dtype=torch.int64)
     if bool((ids.diff() == 0).any()):
-        raise InputError(f"{path}: two points have the same id, expected unique ids")
+        raise InputError("two points have the same id", where=path, expected="unique ids")
     positions = torch.tensor([point.position for point in ordered], dtype=torch.float64).reshape(-1, 3)
     errors = torch.tensor([point.error for point in ordered], dtype=torch.float64)
     tracks = torch.tensor([point.track for point in ordered], dtype=torch.int64)

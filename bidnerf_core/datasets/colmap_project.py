@@ -158,21 +158,23 @@ def _largest(path: Path, models: Sequence[Path]) -> Path:
 def _frames(path: Path, model: Path) -> list[ColmapFrame]:
     images, cameras = read_posed_images(model)
     if not images:
-        raise InputError(f"{model}: has no registered image, expected at least one")
+        raise InputError("has no registered image", where=model, expected="at least one")
     folder, files = _image_folder(path, model, images)
     there = present(
         images,
         lambda image: image.name in files,
         folder,
         lambda image: image.name,
-        lambda image: InputError(f"{folder / image.name}: no such file, although {model} lists that image"),
+        lambda image: InputError(
+            f"no such file, although {model} lists that image", where=folder / image.name
+        ),
     )
     _remark_unregistered(path, folder, files)
     frames = [_frame(model, image, files[image.name], cameras) for image in there]
     frames.sort(key=lambda frame: natural_order(str(frame.name)))
     for frame, following in pairwise(frames):
         if frame.name == following.name:
-            raise InputError(f"{model}: image {frame.name} is registered twice, expected once")
+            raise InputError(f"image {frame.name} is registered twice", where=model, expected="once")
     return frames
 
 
@@ -206,7 +208,7 @@ def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> No
 def _frame(model: Path, image: ModelImage, file: Path, cameras: dict[int, Camera]) -> ColmapFrame:
     if image.camera not in cameras:
         raise InputError(
-            f"{model}: image {image.name!r} has the camera {image.camera}, which is missing from cameras"
+            f"image {image.name!r} has the camera {image.camera}, which is missing from cameras", where=model
         )
     name = PurePosixPath(posix_name(image.name))
     return ColmapFrame(

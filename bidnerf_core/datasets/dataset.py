@@ -84,7 +84,7 @@ def positions(
     for name in asked:
         if name not in index:
             elsewhere = in_other_split(name, splits or {})
-            raise InputError(f"{where}: {elsewhere or _not_there(name, names, stems)}")
+            raise InputError(elsewhere or _not_there(name, names, stems), where=where)
     return [index[name] for name in asked]
 
 

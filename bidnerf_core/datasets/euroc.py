@@ -46,7 +46,7 @@ class EurocReader(Reader):
         """Read the lists. Raises ``InputError`` if one is missing or invalid, and if no image has a pose."""
         truth = _truth(path)
         if truth is None:
-            raise InputError(f"{path}: has no poses, expected mav0/{TRUTHS[0]}/data.csv")
+            raise InputError("has no poses", where=path, expected=f"mav0/{TRUTHS[0]}/data.csv")
         frames = images_posed(truth, _frames(path, options))
         return MetricImageDataset(Splits(path, hold_out(frames)), options.background)
 
@@ -90,7 +90,9 @@ def _sensor(file: Path, options: ReadOptions) -> tuple[CameraSource, SE3]:
     try:
         T_body_camera = rigid_pose(matrix[:3])
     except InputError as error:
-        raise InputError(f"{file}: the rotation of T_BS is {error}, expected a rigid transform") from error
+        raise InputError(
+            f"the rotation of T_BS is {error}", where=file, expected="a rigid transform"
+        ) from error
     if options.camera is not None:
         return CameraSource(options.camera), T_body_camera
     fx, fy, cx, cy = _numbers(file, text, "intrinsics", 4)
@@ -100,13 +102,13 @@ def _sensor(file: Path, options: ReadOptions) -> tuple[CameraSource, SE3]:
     if any(lens) and (model is None or model[1] not in ("radial-tangential", "radtan", "plumb_bob")):
         found = "unknown" if model is None else model[1]
         raise InputError(
-            f"{file}: distortion_model is {found}, expected radial-tangential; undistort the images"
+            f"distortion_model is {found}", where=file, expected="radial-tangential; undistort the images"
         )
     lens = lens if any(lens) else []
     try:
         camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, int(width), int(height), tuple(lens))
     except InputError as error:
-        raise InputError(f"{file}: {error}") from error
+        raise InputError(error, where=file) from error
     return CameraSource(camera), T_body_camera
 
 
@@ -116,9 +118,9 @@ def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
     try:
         numbers = [float(word) for word in found[1].replace(",", " ").split()] if found else []
     except ValueError as error:
-        raise InputError(f"{file}: {key}: {error}, expected {count} numbers") from error
+        raise InputError(f"{key}: {error}", where=file, expected=f"{count} numbers") from error
     if len(numbers) != count:
-        raise InputError(f"{file}: {key} has {len(numbers)} numbers, expected {count} in brackets")
+        raise InputError(f"{key} has {len(numbers)} numbers", where=file, expected=f"{count} in brackets")
     return numbers
 
 

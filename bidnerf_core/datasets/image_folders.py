@@ -30,7 +30,7 @@ def open_images(
     """
     photos, _ = photos_in(folder)
     if not photos:
-        raise InputError(f"{folder}: no images in it, expected image files or a dataset")
+        raise InputError("no images in it", where=folder, expected="image files or a dataset")
     names = unique_names([(*photo.parts[:-1], photo.stem) for photo in photos])
 
     def read(photo: Path) -> tuple[Frame, None]:

@@ -46,7 +46,9 @@ class KittiReader(Reader):
         file = _poses(path)
         if file is None:
             raise InputError(
-                f"{path}: has no poses, expected poses.txt in it, or ../../poses/{path.resolve().name}.txt"
+                "has no poses",
+                where=path,
+                expected=f"poses.txt in it, or ../../poses/{path.resolve().name}.txt",
             )
         frames = images_posed(file, _frames(path))
         return MetricImageDataset(Splits(path, hold_out(frames)), options.background)
@@ -83,7 +85,7 @@ def _frames(path: Path) -> list[ImageFrame]:
         file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.stem.isdecimal()
     ]
     if not images:
-        raise InputError(f"{folder}: has no images, expected 000000.png ...")
+        raise InputError("has no images", where=folder, expected="000000.png ...")
     images.sort(key=lambda file: natural_order(file.name))
     header = read_header(images[0])
     camera, T_first_camera = _calibration(path / CALIBRATION, number, header.width, header.height)
@@ -117,7 +119,7 @@ def _calibration(file: Path, number: int, width: int, height: int) -> tuple[Intr
             fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
             camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
             return camera, SE3(torch.eye(3, dtype=torch.float64), -shift)
-    raise InputError(f"{file}: has no row P{number}, expected the projection matrix of image_{number}")
+    raise InputError(f"has no row P{number}", where=file, expected=f"the projection matrix of image_{number}")
 
 
 def _times(file: Path) -> list[float]:

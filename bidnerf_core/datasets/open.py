@@ -54,12 +54,12 @@ def open_dataset(
     """
     folder = Path(path)
     if not folder.exists():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError("no such folder", where=folder)
     reader = _reader_of(folder, readers)
     if reader is None and not folder.is_dir():
-        raise InputError(f"{folder}: {_not_a_dataset(folder)}")
+        raise InputError(_not_a_dataset(folder), where=folder)
     if reader is None:
-        raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
+        raise InputError(_without_dataset(folder, readers), where=folder)
     options = _options(reader, folder, CameraSource(camera), background, register_depth, depth_unit)
     found = opened(reader, folder, options)
     return found if masks is None else MaskedDataset(found, mask_folder(masks))
@@ -97,14 +97,14 @@ def open_sequence(
         return masked_sequence(unmasked, mask_folder(masks))
     place, given = Path(path), CameraSource(camera, focal, hfov, tuple(assumed))
     if not place.exists():
-        raise InputError(f"{place}: no such file or folder")
+        raise InputError("no such file or folder", where=place)
     reader = _reader_of(place, readers)
     if reader is None and not place.is_dir():
         if not is_video(place):
             video = f", or a video ({', '.join(VIDEO_SUFFIXES)})"
-            raise InputError(f"{place}: {_not_a_dataset(place)}{video}")
+            raise InputError(f"{_not_a_dataset(place)}{video}", where=place)
         if register_depth is not None:
-            raise InputError(f"{place}: is a video, which has no depth to register")
+            raise InputError("is a video, which has no depth to register", where=place)
         return open_video(place, given)
     if reader is None:
         sensor = ReadOptions(register_depth=register_depth).sensor(place)
@@ -123,18 +123,18 @@ def _options(
 ) -> ReadOptions:
     """Build the options for a reader. Raises ``InputError`` for options that the format does not accept."""
     if camera.is_given and "camera" not in reader.accepts:
-        raise InputError(f"{folder}: is a dataset with its own cameras; leave out the camera")
+        raise InputError("is a dataset with its own cameras; leave out the camera", where=folder)
     if camera.is_given and camera.camera is None:
-        raise InputError(f"{folder}: is a dataset, expected a camera with all intrinsics (camera=)")
+        raise InputError("is a dataset", where=folder, expected="a camera with all intrinsics (camera=)")
     if register not in (None, False) and "register_depth" not in reader.accepts:
         raise InputError(
-            f"{folder}: is a dataset whose depth is already registered to its images; leave out"
-            " register_depth"
+            "is a dataset whose depth is already registered to its images; leave out register_depth",
+            where=folder,
         )
     if depth_unit is not None and "depth_unit" not in reader.accepts:
         raise InputError(
-            f"{folder}: is a dataset without depth images, or with depth in a fixed unit; leave out"
-            " depth_unit"
+            "is a dataset without depth images, or with depth in a fixed unit; leave out depth_unit",
+            where=folder,
         )
     given = camera.camera
     return ReadOptions(

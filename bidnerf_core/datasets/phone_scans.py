@@ -112,11 +112,11 @@ class SureDepth:
         if confidence.shape != tuple(metres.shape):
             found = "x".join(map(str, confidence.shape[::-1]))
             raise InputError(
-                f"{where}: is {found}, expected {metres.shape[1]}x{metres.shape[0]} like its depth"
+                f"is {found}", where=where, expected=f"{metres.shape[1]}x{metres.shape[0]} like its depth"
             )
         if confidence.max() > high:
             raise InputError(
-                f"{where}: has values up to {confidence.max()}, expected confidences from 0 to {high}"
+                f"has values up to {confidence.max()}", where=where, expected=f"confidences from 0 to {high}"
             )
         sure = torch.where(torch.from_numpy(confidence.astype(np.int64)) == high, metres, 0)
         if not self._remarked and bool(metres.any()) and not bool(sure.any()):

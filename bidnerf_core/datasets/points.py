@@ -12,7 +12,7 @@ from bidnerf_core.fields import Observations
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_archive, read_array, read_rows
 
-EXPECTED_POINTS = "expected n rows of x, y, z in metres"
+EXPECTED_POINTS = "n rows of x, y, z in metres"
 
 
 def read_depth_points(path: Path) -> Observations:
@@ -26,13 +26,15 @@ def read_depth_points(path: Path) -> Observations:
     points, T_camera_sensor = _read(path)
     if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise InputError(
-            f"{path}: has an array of shape {points.shape} and type {points.dtype}, {EXPECTED_POINTS}"
+            f"has an array of shape {points.shape} and type {points.dtype}",
+            where=path,
+            expected=EXPECTED_POINTS,
         )
     xyz = torch.from_numpy(points[:, :3].astype(np.float64))
     try:
         return Observations.from_points(xyz, T_camera_sensor)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(error, where=path) from error
 
 
 def _read(path: Path) -> tuple[np.ndarray, SE3]:
@@ -41,13 +43,13 @@ def _read(path: Path) -> tuple[np.ndarray, SE3]:
         return _from_archive(path)
     if path.suffix == ".npy":
         return read_array(path, "a .npy file of points"), SE3.identity()
-    rows = read_rows(path, "a file of points", EXPECTED_POINTS.removeprefix("expected "))
+    rows = read_rows(path, "a file of points", EXPECTED_POINTS)
     # A row with commas has no other separator: "1,5 2,5" has decimal commas and is rejected.
     words = [(row, row.text.split("," if "," in row.text else None)[:3]) for row in rows]
     lengths = {len(found) for _, found in words}
     if len(lengths) > 1:
         raise InputError(
-            f"{path}: has rows of {min(lengths)} and of {max(lengths)} numbers, {EXPECTED_POINTS}"
+            f"has rows of {min(lengths)} and of {max(lengths)} numbers", where=path, expected=EXPECTED_POINTS
         )
     return np.array([row.numbers(found) for row, found in words], dtype=np.float64), SE3.identity()
 
@@ -55,12 +57,12 @@ def _read(path: Path) -> tuple[np.ndarray, SE3]:
 def _from_archive(path: Path) -> tuple[np.ndarray, SE3]:
     arrays = read_archive(path, ("points", "T_camera_sensor"), "a .npz file of points")
     if "points" not in arrays:
-        raise InputError(f"{path}: no array 'points', expected one with {EXPECTED_POINTS[9:]}")
+        raise InputError("no array 'points'", where=path, expected=f"one with {EXPECTED_POINTS}")
     if "T_camera_sensor" not in arrays:
         return arrays["points"], SE3.identity()
     given = arrays["T_camera_sensor"]
     matrix = torch.from_numpy(given.astype(np.float64)) if given.dtype.kind in "fiu" else torch.empty(0)
     pose = SE3.from_matrix(matrix) if matrix.shape == (4, 4) else None
     if pose is None or not bool(pose.is_rigid()):
-        raise InputError(f"{path}: T_camera_sensor is not a rigid transform, expected 4x4")
+        raise InputError("T_camera_sensor is not a rigid transform", where=path, expected="4x4")
     return arrays["points"], pose.normalized()

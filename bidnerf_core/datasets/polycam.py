@@ -137,7 +137,7 @@ def _frames(path: Path) -> list[PolycamFrame]:
         lambda file: file.stem in photos,
         images,
         lambda file: f"{file.stem}.jpg",
-        lambda file: InputError(f"{images / file.stem}.jpg: no such file, although {file} exists"),
+        lambda file: InputError(f"no such file, although {file} exists", where=f"{images / file.stem}.jpg"),
         noun="photo",
     )
     if alone := len(photos) - len(kept):
@@ -157,7 +157,7 @@ def _frame(description: Path, photo: Path, base: Path, corrected: bool) -> Polyc
     rows = [[record.number(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     missing = [f"t_{row}{column}" for row in range(3) for column in range(4) if rows[row][column] is None]
     if missing:
-        raise record.error(f"no {missing[0]}, expected t_00 to t_23, the rows of the camera's pose")
+        raise record.error(f"no {missing[0]}", expected="t_00 to t_23, the rows of the camera's pose")
     files = [base / kind / f"{description.stem}.png" for kind in ("depth", "confidence")]
     depth, confidence = (file if is_file(file) else None for file in files)
     pose = pose_of_rows(record, "t_00 to t_23", rows)
@@ -169,13 +169,13 @@ def _camera(record: Record, width: int, height: int) -> Intrinsics:
     numbers = [record.number(key) for key in ("fx", "fy", "cx", "cy")]
     missing = [key for key, number in zip(("fx", "fy", "cx", "cy"), numbers, strict=True) if number is None]
     if missing:
-        raise record.error(f"no {missing[0]}, expected fx, fy, cx and cy")
+        raise record.error(f"no {missing[0]}", expected="fx, fy, cx and cy")
     fx, fy, cx, cy = (number or 0.0 for number in numbers)
     size = record.size("width") or width, record.size("height") or height
     try:
         return Intrinsics(fx, fy, cx + CENTRE_OF_PIXEL, cy + CENTRE_OF_PIXEL, *size)
     except InputError as error:
-        raise record.error(str(error)) from error
+        raise record.error(error) from error
 
 
 def _depth(frame: PolycamFrame, filtered: SureDepth) -> Measured | None:
@@ -184,7 +184,7 @@ def _depth(frame: PolycamFrame, filtered: SureDepth) -> Measured | None:
     measured = read_depth_image(frame.depth, MILLIMETRE)
     confidence = None if frame.confidence is None else decode(frame.confidence)
     if confidence is not None and confidence.ndim != 2:
-        raise InputError(f"{frame.confidence}: has {confidence.shape[-1]} channels, expected one")
+        raise InputError(f"has {confidence.shape[-1]} channels", where=frame.confidence, expected="one")
     is_arkit = confidence is not None and 0 < confidence.max() <= ARKIT_CONFIDENCE
     high = ARKIT_CONFIDENCE if is_arkit else HIGH_CONFIDENCE
     sure = None if confidence is None else confidence.astype(np.int64)

@@ -58,7 +58,7 @@ def images_there(where: Path, frames: Sequence[ImageFrame]) -> list[ImageFrame]:
         lambda frame: is_file(frame.image),
         where,
         lambda frame: frame.image.name,
-        lambda frame: InputError(f"{frame.image}: no such file, although {where} lists it"),
+        lambda frame: InputError(f"no such file, although {where} lists it", where=frame.image),
     )
 
 
@@ -69,7 +69,7 @@ def images_posed(where: Path, frames: Sequence[ImageFrame]) -> list[ImageFrame]:
     posed = [frame for frame in frames if frame.T_world_camera is not None]
     if not posed:
         raise InputError(
-            f"{where}: has no pose for any of {amount(len(frames), 'image')}, expected at least one"
+            f"has no pose for any of {amount(len(frames), 'image')}", where=where, expected="at least one"
         )
     if len(posed) < len(frames):
         remark(

@@ -152,9 +152,9 @@ class DatasetFrames:
         self._split, self._points = split, points
         listed = dataset.frame_names(split)
         if not listed:
-            raise InputError(f"{dataset.path}: split {split!r} has no frames")
+            raise InputError(f"split {split!r} has no frames", where=dataset.path)
         if window > len(listed):
-            raise UsageError(f"--window is {window}, expected 1 to {len(listed)}")
+            raise UsageError(f"--window is {window}", expected=f"1 to {len(listed)}")
         asked = [names] if names else [(name,) for name in listed]
         self._rigs = [self._with_window(rig, listed, window) for rig in asked]
 
@@ -202,13 +202,13 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
     for path in paths:
         if not path.is_dir():
             if (instead := file_of_dataset(path)) is not None and not looks_like_image(path):
-                raise InputError(f"{path}: {instead}")
+                raise InputError(instead, where=path)
             files.append(path)
             continue
         found, others = photos_in(path)
         others = [file for file in others if file not in depth]
         if not found:
-            raise InputError(f"{path}: {no_dataset(path)}")
+            raise InputError(no_dataset(path), where=path)
         if others:
             named = ", ".join(file.name for file in others[:NAMED])
             more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
@@ -231,7 +231,7 @@ def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Pat
         return {by_stem[stem]: file for stem, file in zip(stems, depth, strict=True)}
     if len(depth) != len(photos):
         raise UsageError(
-            f"--depth names {amount(len(depth), 'file')} for {amount(len(photos), 'photo')}, expected one for each, in the"
-            " same order or matched by name"
+            f"--depth names {amount(len(depth), 'file')} for {amount(len(photos), 'photo')}",
+            expected="one for each, in the same order or matched by name",
         )
     return dict(zip(photos, depth, strict=True))

@@ -53,7 +53,7 @@ class ReadOptions:
             return None
         if register is True and own is None:
             raise InputError(
-                f"{folder}: its depth sensor is not known, expected the file of one (register_depth=)"
+                "its depth sensor is not known", where=folder, expected="the file of one (register_depth=)"
             )
         if register is True or isinstance(register, DepthCamera):
             return own if register is True else register
@@ -64,7 +64,7 @@ def checked_unit(depth_unit: float | None) -> float | None:
     """Return a depth unit as given. Raises ``InputError`` unless it is a positive number of metres per step."""
     if depth_unit is not None and not 0 < depth_unit <= FARTHEST:
         raise InputError(
-            f"depth_unit is {depth_unit:g}, expected a positive number of metres per step, such as 0.001"
+            f"depth_unit is {depth_unit:g}", expected="a positive number of metres per step, such as 0.001"
         )
     return depth_unit
 
@@ -132,8 +132,9 @@ def find_reader(folder: Path) -> Reader | None:
     }
     if len(claims) > 1:
         raise InputError(
-            f"{folder}: is recognized by the readers {enumeration(list(claims))}, expected one; uninstall"
-            " the others"
+            f"is recognized by the readers {enumeration(list(claims))}",
+            where=folder,
+            expected="one; uninstall the others",
         )
     return next(iter(claims.values()), None)
 
@@ -164,7 +165,7 @@ def _answer(reader: Reader, folder: Path, expected: type, ask: Callable[[], Answ
     except Exception as error:
         raise InputError(f"{who} failed to open it: {type(error).__name__}: {error}") from error
     if not isinstance(answer, expected):
-        raise InputError(f"{who} returned a {type(answer).__name__}, expected a {expected.__name__}")
+        raise InputError(f"{who} returned a {type(answer).__name__}", expected=f"a {expected.__name__}")
     return answer
 
 

@@ -96,7 +96,9 @@ def _photos(path: Path, file: Path) -> list[_Photo]:
     names, found = _columns(first.text), list[_Photo]()
     if "f" not in names:
         raise InputError(
-            f"{file}: has no column f, expected the export 'Internal/External camera parameters', which has focal lengths"
+            "has no column f",
+            where=file,
+            expected="the export 'Internal/External camera parameters', which has focal lengths",
         )
     places = [FileNames(path / place) for place in IMAGES if (path / place).is_dir()]
     for row in rows:
@@ -110,14 +112,16 @@ def _photos(path: Path, file: Path) -> list[_Photo]:
         images = (place.find(name, IMAGE_ENDINGS) for place in places)
         found.append(_Photo(row, values, next((image for image in images if image is not None), None)))
     if not found:
-        raise InputError(f"{file}: has no rows, expected one for each photo")
+        raise InputError("has no rows", where=file, expected="one for each photo")
     return present(
         found,
         lambda photo: photo.image is not None,
         file,
         lambda photo: photo.values["name"],
         lambda photo: InputError(
-            f"{photo.row.where}: no photo {photo.values['name']} in {path}, expected it there or in images"
+            f"no photo {photo.values['name']} in {path}",
+            where=photo.row.where,
+            expected="it there or in images",
         ),
         noun="photo",
     )
@@ -152,7 +156,7 @@ def _camera(photo: _Photo, image: Path) -> Intrinsics:
             (lens if lens[4] else lens[:4]) if any(lens) else (),
         )
     except InputError as error:
-        raise InputError(f"{photo.row.where}: {error}") from error
+        raise InputError(error, where=photo.row.where) from error
 
 
 reader = RealityCaptureReader()

@@ -176,15 +176,21 @@ class Record3DDataset(SplitDataset[Record3DFrame]):
         # expected.
         if len(content) > size + size // 8 + 1024:
             raise InputError(
-                f"{where}: has {len(content)} bytes, expected at most the {size} that it should unpack to"
+                f"has {len(content)} bytes",
+                where=where,
+                expected=f"at most the {size} that it should unpack to",
             )
         try:
             found = self._decompress(content)
         except Exception as error:  # raised by a C library
-            raise InputError(f"{where}: not readable as LZFSE ({error}), expected a complete file") from error
+            raise InputError(
+                f"not readable as LZFSE ({error})", where=where, expected="a complete file"
+            ) from error
         if len(found) != size:
             raise InputError(
-                f"{where}: unpacks to {len(found)} bytes, expected {size} according to metadata (dw, dh)"
+                f"unpacks to {len(found)} bytes",
+                where=where,
+                expected=f"{size} according to metadata (dw, dh)",
             )
         return found
 
@@ -201,7 +207,9 @@ def _lzfse(path: Path) -> Callable[[bytes], bytes]:
         try:
             import liblzfse as lzfse  # the same code under its former name
         except ImportError as error:
-            raise InputError(f"{path}: reading Record3D depth needs the package lzfse: {INSTALL}") from error
+            raise InputError(
+                f"reading Record3D depth needs the package lzfse: {INSTALL}", where=path
+            ) from error
     decompress: Callable[[bytes], bytes] = lzfse.decompress
     return decompress
 
@@ -211,7 +219,7 @@ def _frames(path: Path, metadata: Record, files: _Files) -> list[Record3DFrame]:
     poses = metadata.items("poses") or []
     if not poses:
         raise metadata.error(
-            "no poses, expected a list of qx qy qz qw tx ty tz; record with poses switched on"
+            "no poses", expected="a list of qx qy qz qw tx ty tz; record with poses switched on"
         )
     times, cameras = _times(metadata, len(poses)), _cameras(metadata, len(poses))
     frames = [
@@ -223,14 +231,16 @@ def _frames(path: Path, metadata: Record, files: _Files) -> list[Record3DFrame]:
         lambda frame: frame.file("jpg") in files,
         path,
         lambda frame: frame.file("jpg"),
-        lambda frame: InputError(f"{path}/{frame.file('jpg')}: no such photo, expected one for each pose"),
+        lambda frame: InputError(
+            "no such photo", where=f"{path}/{frame.file('jpg')}", expected="one for each pose"
+        ),
     )
     measured = [frame for frame in there if frame.file("depth") in files]
     if measured and len(measured) < len(there):
         remark(path, f"{len(there) - len(measured)} of {amount(len(there), 'frame')} have no depth")
     posed = [frame for frame in there if frame.T_world_camera is not None]
     if not posed:
-        raise metadata.error("no pose is finite, expected qx qy qz qw tx ty tz of each frame")
+        raise metadata.error("no pose is finite", expected="qx qy qz qw tx ty tz of each frame")
     if len(posed) < len(there):
         remark(
             path, f"{len(there) - len(posed)} of {amount(len(there), 'frame')} have no pose and are left out"
@@ -241,7 +251,7 @@ def _frames(path: Path, metadata: Record, files: _Files) -> list[Record3DFrame]:
 def _pose(metadata: Record, number: int, numbers: Any) -> SE3 | None:
     where = f"{metadata.where}: pose {number}"
     if not isinstance(numbers, list) or len(numbers) != 7 or not all(_is_number(value) for value in numbers):
-        raise InputError(f"{where}: is not 7 numbers, expected qx qy qz qw tx ty tz")
+        raise InputError("is not 7 numbers", where=where, expected="qx qy qz qw tx ty tz")
     return pose_of_numbers(where, numbers, opengl=True)
 
 
@@ -262,25 +272,25 @@ def _cameras(metadata: Record, count: int) -> list[Intrinsics]:
     """Return the cameras of the frames: their own, or the first frame's for all."""
     width, height = metadata.size("w"), metadata.size("h")
     if width is None or height is None:
-        raise metadata.error("no w and h, expected the size of the photos")
+        raise metadata.error("no w and h", expected="the size of the photos")
     own, shared = metadata.items("perFrameIntrinsicCoeffs"), metadata.items("K")
     if own is not None and len(own) >= count:
         rows = [row if isinstance(row, list) else [] for row in own[:count]]
     elif shared is not None and len(shared) == 9:
         rows = [[shared[0], shared[4], shared[6], shared[7]]] * count  # column by column
     else:
-        raise metadata.error("no K with 9 numbers, expected the intrinsics")
+        raise metadata.error("no K with 9 numbers", expected="the intrinsics")
     return [_camera(metadata, row, width, height) for row in rows]
 
 
 def _camera(metadata: Record, row: list[Any], width: int, height: int) -> Intrinsics:
     if len(row) < 4:
-        raise metadata.error(f"perFrameIntrinsicCoeffs has {row}, expected fx fy cx cy")
+        raise metadata.error(f"perFrameIntrinsicCoeffs has {row}", expected="fx fy cx cy")
     fx, fy, cx, cy = (metadata.checked_number(value, "an entry of the intrinsics") for value in row[:4])
     try:
         return Intrinsics(fx, fy, cx + CENTRE_OF_PIXEL, cy + CENTRE_OF_PIXEL, width, height)
     except InputError as error:
-        raise metadata.error(str(error)) from error
+        raise metadata.error(error) from error
 
 
 reader = Record3DReader()

@@ -100,12 +100,12 @@ class FileSequence:
         chosen = [entry for entry in self._entries if entry.split == split]
         if not chosen:
             known = ", ".join(sorted({entry.split for entry in self._entries if entry.split is not None}))
-            expected = (
-                f"expected one of {known}"
-                if known
-                else "since only frames of a dataset with poses have a split"
+            why = "" if known else ", since only frames of a dataset with poses have a split"
+            raise InputError(
+                f"no frame belongs to a split {split!r}{why}",
+                where=self._path,
+                expected=f"one of {known}" if known else None,
             )
-            raise InputError(f"{self._path}: no frame belongs to a split {split!r}, {expected}")
         return FileSequence(self._path, chosen)
 
     def __len__(self) -> int:

@@ -114,7 +114,9 @@ class SevenScenesReader(Reader):
                 lambda frame: frame.pose.is_file(),
                 path,
                 lambda frame: frame.pose.relative_to(path),
-                lambda frame: InputError(f"{frame.pose}: no such file, although {frame.image.name} exists"),
+                lambda frame: InputError(
+                    f"no such file, although {frame.image.name} exists", where=frame.pose
+                ),
                 noun="pose",
             )
         )
@@ -193,19 +195,21 @@ def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
         if found is None:
             raise row.error(f": {row.text[:40]!r}")
         if int(found[1]) not in folders:
-            raise InputError(f"{row.where}: no folder for {row.text}, expected seq-{int(found[1]):02d}")
+            raise InputError(
+                f"no folder for {row.text}", where=row.where, expected=f"seq-{int(found[1]):02d}"
+            )
         if int(found[1]) in numbers:
-            raise InputError(f"{row.where}: {row.text} is repeated, expected each sequence once")
+            raise InputError(f"{row.text} is repeated", where=row.where, expected="each sequence once")
         numbers.append(int(found[1]))
     if not numbers:
-        raise InputError(f"{file}: lists no sequences, expected lines such as sequence1")
+        raise InputError("lists no sequences", where=file, expected="lines such as sequence1")
     return numbers
 
 
 def _frames(folder: Path) -> list[SceneFrame]:
     frames = [SceneFrame(file) for file in folder.iterdir() if COLOUR.fullmatch(file.name)]
     if not frames:
-        raise InputError(f"{folder}: has no frames, expected frame-000000.color.png ...")
+        raise InputError("has no frames", where=folder, expected="frame-000000.color.png ...")
     return sorted(frames, key=lambda frame: natural_order(frame.image.name))
 
 

@@ -93,7 +93,9 @@ class Splits(Generic[F]):
 
     def _known(self, split: str) -> None:
         if split not in self._frames:
-            raise InputError(f"{self.path}: no split {split!r}, expected one of {', '.join(self.splits)}")
+            raise InputError(
+                f"no split {split!r}", where=self.path, expected=f"one of {', '.join(self.splits)}"
+            )
 
 
 class SplitDataset(ABC, Generic[F]):

@@ -109,7 +109,7 @@ class StrayDataset(SplitDataset[StrayFrame]):
         measured = read_depth_image(depth, MILLIMETRE)
         sure = decode(files["confidence"]) if is_file(files["confidence"]) else None
         if sure is not None and sure.ndim != 2:
-            raise InputError(f"{files['confidence']}: has {sure.shape[-1]} channels, expected one")
+            raise InputError(f"has {sure.shape[-1]} channels", where=files["confidence"], expected="one")
         return Measured(self._sure(measured, sure, str(files["confidence"])), str(depth))
 
 
@@ -128,20 +128,20 @@ def _frames(path: Path, video: VideoFrames) -> list[StrayFrame]:
         rows = rows[:-1]
     frames = [_frame(row, names, shared) for row in rows]
     if not frames:
-        raise InputError(f"{path / ODOMETRY}: has no rows, expected one for each frame")
+        raise InputError("has no rows", where=path / ODOMETRY, expected="one for each frame")
     there = present(
         frames,
         lambda frame: frame.number < len(video),
         path / VIDEO,
         lambda frame: f"frame {frame.number}",
         lambda frame: InputError(
-            f"{video.path}: has {len(video)} frames, but frame {frame.number} is needed"
+            f"has {len(video)} frames, but frame {frame.number} is needed", where=video.path
         ),
         noun="frame",
     )
     posed = [frame for frame in there if frame.T_world_camera is not None]
     if not posed:
-        raise InputError(f"{path / ODOMETRY}: has no finite pose, expected one for each frame")
+        raise InputError("has no finite pose", where=path / ODOMETRY, expected="one for each frame")
     if len(posed) < len(there):
         remark(
             path / ODOMETRY,
@@ -169,7 +169,7 @@ def _matrix(file: Path, size: tuple[int, int]) -> Intrinsics:
         for row in read_rows(file, "Stray Scanner's camera matrix", "3 rows of 3 numbers")
     ]
     if len(rows) != 3:
-        raise InputError(f"{file}: has {len(rows)} rows, expected 3 of 3 numbers")
+        raise InputError(f"has {len(rows)} rows", where=file, expected="3 of 3 numbers")
     return _camera(str(file), [rows[0][0], rows[1][1], rows[0][2], rows[1][2]], size)
 
 
@@ -178,7 +178,7 @@ def _camera(where: str, numbers: list[float], size: tuple[int, int]) -> Intrinsi
     try:
         return Intrinsics(fx, fy, cx + CENTRE_OF_PIXEL, cy + CENTRE_OF_PIXEL, *size)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error, where=where) from error
 
 
 reader = StrayScannerReader()

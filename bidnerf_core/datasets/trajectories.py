@@ -75,7 +75,7 @@ def timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool 
     """
     count = 1 + len(columns.split())
     if not rows:
-        raise InputError(f"{path}: has no rows, expected lines of timestamp {columns}")
+        raise InputError("has no rows", where=path, expected=f"lines of timestamp {columns}")
     if len(rows) > 1 and len(_words(rows[-1])) < count:
         found = len(_words(rows[-1]))
         remark(rows[-1].where, f"the last row is truncated ({found} of {count} entries) and was left out")
@@ -108,7 +108,9 @@ def require_distinct_times(rows: list[TimedRow]) -> None:
         if row.time == following.time:
             first, second = sorted((row.row, following.row), key=lambda row: row.line)
             raise InputError(
-                f"{second.where}: the time stamp {row.time:.6f} repeats line {first.line}, expected each once"
+                f"the time stamp {row.time:.6f} repeats line {first.line}",
+                where=second.where,
+                expected="each once",
             )
 
 
@@ -180,7 +182,7 @@ def _timed_trajectory(path: Path, rows: Sequence[TimedRow], order: str) -> Traje
     numbers = [_pose_numbers(row, order) for row in rows]
     known = [place for place, found in enumerate(numbers) if found is not None]
     if not known:
-        raise InputError(f"{path}: has no finite pose, expected lines of timestamp {NUMBERS_A_LINE}")
+        raise InputError("has no finite pose", where=path, expected=f"lines of timestamp {NUMBERS_A_LINE}")
     if len(known) < len(rows):
         first = next(place for place, found in enumerate(numbers) if found is None)
         left = amount(len(rows) - len(known), "pose")
@@ -193,8 +195,9 @@ def _timed_trajectory(path: Path, rows: Sequence[TimedRow], order: str) -> Traje
         if kept and rows[kept[-1]].time == rows[place].time:
             if numbers[kept[-1]] != numbers[place]:
                 raise InputError(
-                    f"{rows[place].where}: another pose at the time {rows[place].time:.6f}, expected one pose"
-                    " per time"
+                    f"another pose at the time {rows[place].time:.6f}",
+                    where=rows[place].where,
+                    expected="one pose per time",
                 )
             continue
         kept.append(place)
@@ -207,7 +210,7 @@ def _timed_trajectory(path: Path, rows: Sequence[TimedRow], order: str) -> Traje
 def check_unit(length: float, where: str, names: str) -> None:
     """Raise ``InputError``, which begins with ``where``, unless the length of a quaternion is 1."""
     if abs(length - 1) > UNIT_TO:
-        raise InputError(f"{where}: the quaternion has length {length:.3g}, expected 1 ({names})")
+        raise InputError(f"the quaternion has length {length:.3g}", where=where, expected=f"1 ({names})")
 
 
 def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
@@ -223,10 +226,12 @@ def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
 
 def _kitti(path: Path, rows: Sequence[Row], times: Sequence[float] | None) -> Trajectory:
     """Return the poses in rows of 3x4 matrices, one for each of ``times``."""
-    kind = f"{path}: has rows of {KITTI_ROW} numbers, KITTI's 3x4 poses, which have no times"
+    kind = f"has rows of {KITTI_ROW} numbers, KITTI's 3x4 poses, which have no times"
     if times is None or len(times) != len(rows):
         images = "images with known times" if times is None else amount(len(times), "image")
-        raise InputError(f"{kind}; there are {len(rows)} for {images}, expected one for each image")
+        raise InputError(
+            f"{kind}; there are {len(rows)} for {images}", where=path, expected="one for each image"
+        )
     remark(
         path, f"rows of {KITTI_ROW} numbers are read as KITTI's 3x4 camera-to-world poses, one for each image"
     )
@@ -242,9 +247,9 @@ def _kitti_pose(row: Row) -> SE3:
     try:
         return rigid_pose(torch.tensor(row.numbers(_words(row)), dtype=torch.float64).reshape(3, 4))
     except InputError as error:
-        if str(error).startswith(str(row.path)):
+        if error.where is not None:
             raise
-        raise InputError(f"{row.where}: the rotation is {error}, expected a rigid transform") from error
+        raise InputError(f"the rotation is {error}", where=row.where, expected="a rigid transform") from error
 
 
 def read_matrices(path: Path) -> list[SE3]:
@@ -256,7 +261,7 @@ def read_matrices(path: Path) -> list[SE3]:
         remark(rows[-1].where, "the last row is truncated and was left out")
         rows = rows[:-1]
     if not rows:
-        raise InputError(f"{path}: has no rows, expected {KITTI_ROW} numbers in each")
+        raise InputError("has no rows", where=path, expected=f"{KITTI_ROW} numbers in each")
     for row in rows:
         if len(_words(row)) != KITTI_ROW:
             raise row.error(f" has {len(_words(row))} entries")

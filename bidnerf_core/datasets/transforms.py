@@ -165,7 +165,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
             return expected
         if (width, height) != expected:
             raise frame.record.error(
-                f"{path.name} is {width}x{height}, expected {expected[0]}x{expected[1]} as {whose}"
+                f"{path.name} is {width}x{height}", expected=f"{expected[0]}x{expected[1]} as {whose}"
             )
         return expected
 
@@ -208,13 +208,13 @@ class _Files:
     def _no_image(self, frame: FrameRecord) -> InputError:
         tried = self._folder / frame.file_path
         return frame.record.error(
-            f"no image {tried}, expected that file (also tried with image extensions added, in upper and"
-            " lower case)"
+            f"no image {tried}",
+            expected="that file (also tried with image extensions added, in upper and lower case)",
         )
 
     def _no_mask(self, frame: FrameRecord) -> InputError:
         return frame.record.error(
-            f"no mask {self._folder / str(frame.mask_path)}, expected that file (mask_path)"
+            f"no mask {self._folder / str(frame.mask_path)}", expected="that file (mask_path)"
         )
 
     def _remark_names(self) -> None:

@@ -60,7 +60,7 @@ class FrameRecord:
             return [self]
         if self.depth_path is not None:
             raise self.record.error(
-                "an equirectangular image has depth, expected none, or pinhole images with depth"
+                "an equirectangular image has depth", expected="none, or pinhole images with depth"
             )
         return [
             replace(self, camera=replace(self.camera, face=face), T_world_camera=T)
@@ -96,13 +96,13 @@ def read_frames(file: Record) -> list[FrameRecord]:
     entries = file.items("frames")
     if not entries:
         found = "no frames" if entries is None else "frames is empty"
-        raise file.error(f"{found}, expected a list of objects with file_path and transform_matrix")
+        raise file.error(found, expected="a list of objects with file_path and transform_matrix")
     frames = [_frame(file, number, entry) for number, entry in _posed(file, entries)]
     seen: dict[tuple[str, ...], int] = {}
     for number, frame in enumerate(frames):
         first = seen.setdefault(frame.parts, number)
         if first != number:
-            raise frame.record.error(f"has the same image as frame {first}, expected each image once")
+            raise frame.record.error(f"has the same image as frame {first}", expected="each image once")
     _remark_scales(file, frames)
     if file.value("enable_depth_loading") is False and any(
         "depth_path" in frame.record.values for frame in frames
@@ -166,7 +166,7 @@ def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[Fram
     if not splits:
         (key, listed), *_ = ((f"{split}_filenames", listed) for split, listed in lists.items() if listed)
         raise file.error(
-            f"{key} lists {listed[0]!r}, expected the file_path of one of its {len(by_path)} frames"
+            f"{key} lists {listed[0]!r}", expected=f"the file_path of one of its {len(by_path)} frames"
         )
     return splits
 
@@ -190,11 +190,11 @@ def _listed(
 def _frame(file: Record, number: int, entry: object) -> FrameRecord:
     where = f"{file.where}: frame {number}"
     if not isinstance(entry, dict):
-        raise InputError(f"{where}: is not an object, expected one with file_path and transform_matrix")
+        raise InputError("is not an object", where=where, expected="one with file_path and transform_matrix")
     own = Record(where, entry)
     path = own.text("file_path")
     if not path:
-        raise own.error("no file_path, expected the name of its image")
+        raise own.error("no file_path", expected="the name of its image")
     record = Record(f"{where} ({path})", entry, file)
     T_world_camera, scale = pose_and_scale(Record(record.where, entry))
     depth, unit = _depth(record, own)
@@ -227,7 +227,7 @@ def _unit(record: Record, keys: Iterable[str]) -> float:
     for key in keys:
         unit = record.number(key)
         if unit is not None and unit <= 0:
-            raise record.error(f"{key} is {unit:g}, expected a positive number of metres")
+            raise record.error(f"{key} is {unit:g}", expected="a positive number of metres")
         if unit is not None:
             return unit
     return METRES_PER_DEPTH_UNIT

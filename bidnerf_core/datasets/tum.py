@@ -111,7 +111,9 @@ class TumReader(Reader):
     def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Read the lists. Raises ``InputError`` if one is missing or malformed, and if no frame has a pose."""
         if not (path / TRUTH).is_file():
-            raise InputError(f"{path / TRUTH}: no such file, expected the poses of the frames of a dataset")
+            raise InputError(
+                "no such file", where=path / TRUTH, expected="the poses of the frames of a dataset"
+            )
         frames, trajectory = _recorded(path)
         posed = [frame for frame in frames if frame.truth is not None]
         if trajectory is not None and len(posed) < len(frames):
@@ -199,7 +201,7 @@ def _recorded(folder: Path) -> tuple[list[TumFrame], Trajectory | None]:
         lambda frame: frame.is_there,
         folder / COLOUR_LIST,
         lambda frame: frame.image.relative_to(folder),
-        lambda frame: InputError(f"{frame.where}: no image {frame.image}, expected that file"),
+        lambda frame: InputError(f"no image {frame.image}", where=frame.where, expected="that file"),
     )
     return there, path
 
@@ -241,8 +243,9 @@ def _remark_without_pose(path: Path, images: int, posed: int, trajectory: Trajec
     """
     if posed == 0:
         raise InputError(
-            f"{path / TRUTH}: covers no image of {COLOUR_LIST}, expected samples before and after their times, "
-            f"at most {LARGEST_GAP:g} s apart"
+            f"covers no image of {COLOUR_LIST}",
+            where=path / TRUTH,
+            expected=f"samples before and after their times, at most {LARGEST_GAP:g} s apart",
         )
     gap = float(trajectory.times.diff().median()) if len(trajectory) > 1 else 0.0
     why = (

@@ -114,7 +114,9 @@ def _cameras(info: Path) -> tuple[Intrinsics, DepthCamera | None]:
     colour, depth = (_camera(info, values, kind) for kind in ("Color", "Depth"))
     if colour is None:
         raise InputError(
-            f"{info}: no m_calibrationColorIntrinsic, expected 16 numbers, with m_colorWidth and m_colorHeight"
+            "no m_calibrationColorIntrinsic",
+            where=info,
+            expected="16 numbers, with m_colorWidth and m_colorHeight",
         )
     if depth is None or abs(depth.resized(colour.width, colour.height).fx / colour.fx - 1) < FOCAL_TOLERANCE:
         return colour, None
@@ -137,7 +139,7 @@ def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics
             int(size[1][0]),
         )
     except InputError as error:
-        raise InputError(f"{info}: {error}") from error
+        raise InputError(error, where=info) from error
 
 
 def _splits(path: Path, frames: list[ImageFrame]) -> dict[str, list[ImageFrame]]:
@@ -148,7 +150,7 @@ def _splits(path: Path, frames: list[ImageFrame]) -> dict[str, list[ImageFrame]]
     ranges = [RANGE.search(row.text) for row in read_rows(file, "a list of sequences", "start and end")]
     first = next((found for found in ranges if found is not None), None)
     if first is None:
-        raise InputError(f"{file}: has no [start=0 ; end=356], expected the frames of each sequence")
+        raise InputError("has no [start=0 ; end=356]", where=file, expected="the frames of each sequence")
     start, end = int(first[1]), int(first[2])
     test = [frame for frame in frames if start <= int(frame.stem.partition("-")[2]) <= end]
     train = [frame for frame in frames if frame not in test]

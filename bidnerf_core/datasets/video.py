@@ -96,7 +96,7 @@ def pictures(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
 
 def _broken(path: Path, number: int, error: Exception) -> InputError:
     return InputError(
-        f"{path}: breaks off at frame {number} ({reason(error)}), expected a complete video file"
+        f"breaks off at frame {number} ({reason(error)})", where=path, expected="a complete video file"
     )
 
 
@@ -145,7 +145,9 @@ def require_av(path: Path) -> None:
         import av  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"{path}: reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames to a folder"
+            "reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames"
+            " to a folder",
+            where=path,
         ) from error
 
 
@@ -167,7 +169,7 @@ def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _no_video(path: Path, why: str) -> InputError:
-    return InputError(f"{path}: not readable as a video ({why}), expected a video file")
+    return InputError(f"not readable as a video ({why})", where=path, expected="a video file")
 
 
 def _time(container: Any, picture: Any) -> float:

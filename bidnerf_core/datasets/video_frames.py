@@ -48,7 +48,7 @@ class VideoFrames:
     def read(self, number: int) -> UInt8[Tensor, "h w 3"]:
         """Return the pixels of a frame. Raises ``InputError`` if the file ends before it."""
         if not 0 <= number < len(self):
-            raise InputError(f"{self.path}: has {len(self)} frames, but frame {number} is needed")
+            raise InputError(f"has {len(self)} frames, but frame {number} is needed", where=self.path)
         try:
             if self._open is None or not self._next <= number <= self._next + FORWARD:
                 self._seek(number)
@@ -83,5 +83,7 @@ class VideoFrames:
 
     def _broken(self, number: int, error: Exception) -> InputError:
         return InputError(
-            f"{self.path}: breaks off at frame {number} ({reason(error)}), expected a complete video file"
+            f"breaks off at frame {number} ({reason(error)})",
+            where=self.path,
+            expected="a complete video file",
         )

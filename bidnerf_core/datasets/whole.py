@@ -68,7 +68,7 @@ class WholeDataset:
 
     def frame_names(self, split: str) -> list[str]:
         if split != ALL:
-            raise InputError(f"{self.path}: no split {split!r}, expected {ALL}")
+            raise InputError(f"no split {split!r}", where=self.path, expected=ALL)
         return list(self._names)
 
     def origin(self, name: str) -> tuple[str, str]:

@@ -36,11 +36,11 @@ def write_transforms(
     folder = Path(folder)
     for split, views in splits.items():
         if split not in SPLITS:
-            raise InputError(f"{folder}: split {split!r} cannot be written, expected {', '.join(SPLITS)}")
+            raise InputError(f"split {split!r} cannot be written", where=folder, expected=", ".join(SPLITS))
         names = [view.frame.name for view in views]
         if len(set(names)) != len(names):
             raise InputError(
-                f"{folder}: two frames of split {split!r} have the same name, expected different ones"
+                f"two frames of split {split!r} have the same name", where=folder, expected="different ones"
             )
         frames = [_written(folder, split, view, background) for view in views]
         if not frames:  # readers reject a file without any
@@ -86,7 +86,9 @@ def camera_entry(camera: Intrinsics, name: str) -> dict[str, float]:
     """Return the ``transforms.json`` entries of a camera. Raises ``InputError`` for a lens that the format cannot describe."""
     if len(camera.distortion) > len(LENS):
         found = len(camera.distortion)
-        raise InputError(f"frame {name}: the lens has {found} coefficients, expected at most {len(LENS)}")
+        raise InputError(
+            f"the lens has {found} coefficients", where=f"frame {name}", expected=f"at most {len(LENS)}"
+        )
     sizes = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     return {
         **sizes,

@@ -94,12 +94,14 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
     if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":
         found = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
-        raise InputError(f"{what} is {found}, expected one channel of integer or floating-point numbers")
+        raise InputError(f"{what} is {found}", expected="one channel of integer or floating-point numbers")
     if unit is None:
         unit = FLOAT_UNIT if values.dtype.kind == "f" else INTEGER_UNIT
     given: Any = unit
     if not isinstance(given, Real) or not 0 < unit <= FARTHEST:
-        raise InputError(f"{what}: depth_unit is {unit!r}, expected a positive number of metres per step")
+        raise InputError(
+            f"depth_unit is {unit!r}", where=what, expected="a positive number of metres per step"
+        )
     metres = values.astype(np.float64) * unit
     absent = _absent(values, metres)
     unmeasured = np.logical_or.reduce([metres == 0, *absent.values()])

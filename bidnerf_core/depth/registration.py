@@ -36,16 +36,16 @@ class DepthCamera:
         """
         record = read_record(path)
         if record.size("w") is None or record.size("h") is None:
-            raise record.error("no w and h, expected the size of the depth images")
+            raise record.error("no w and h", expected="the size of the depth images")
         rows = record.items(EXTRINSICS)
         if rows is None:
             raise record.error(
-                f"no {EXTRINSICS}, expected the 4x4 pose of the depth camera in the colour camera"
+                f"no {EXTRINSICS}", expected="the 4x4 pose of the depth camera in the colour camera"
             )
         camera = read_camera(path, (0, 0))
         if not isinstance(camera, Intrinsics):
             raise record.error(
-                "describes a lens that is not perspective, expected the intrinsics of the depth camera"
+                "describes a lens that is not perspective", expected="the intrinsics of the depth camera"
             )
         return DepthCamera(camera, rigid_of_rows(record, EXTRINSICS, rows))
 
@@ -64,15 +64,17 @@ class DepthCamera:
         if camera is None:
             given = f"{self.camera.width}x{self.camera.height}"
             raise InputError(
-                f"{file}: depth is {width}x{height}, expected the aspect ratio of its camera, {given}"
+                f"depth is {width}x{height}", where=file, expected=f"the aspect ratio of its camera, {given}"
             )
         coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
         found = register_depth(depth, camera, coarse, self.T_colour_depth)
         if int((depth > 0).sum()) >= ENOUGH_REGISTERED and not bool((found > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
             raise InputError(
-                f"{file}: no measurement falls into the colour image; {EXTRINSICS} puts the depth camera"
-                f" {away:.3g} m from the colour camera, expected metres and OpenCV axes"
+                f"no measurement falls into the colour image; {EXTRINSICS} puts the depth camera {away:.3g}"
+                " m from the colour camera",
+                where=file,
+                expected="metres and OpenCV axes",
             )
         return found if coarse == colour else resampled(found, colour.width, colour.height)
 

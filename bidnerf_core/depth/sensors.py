@@ -27,7 +27,7 @@ class DepthNoise:
 
     def __post_init__(self) -> None:
         if not all(0 <= value < math.inf for value in (self.constant, self.linear, self.quadratic)):
-            raise InputError(f"the depth noise is {self}, expected finite coefficients of 0 or more")
+            raise InputError(f"the depth noise is {self}", expected="finite coefficients of 0 or more")
 
     @overload
     def deviation(self, depth: float) -> float: ...
@@ -53,8 +53,8 @@ class DepthSensorModel:
     def __post_init__(self) -> None:
         if not all(0 <= value < math.inf for value in (self.scale, self.offset)):
             raise InputError(
-                f"the depth sensor has scale {self.scale} and offset {self.offset}, expected finite numbers"
-                " of 0 or more"
+                f"the depth sensor has scale {self.scale} and offset {self.offset}",
+                expected="finite numbers of 0 or more",
             )
 
 

@@ -91,10 +91,10 @@ class Plan:
         for name, allowed in LIMITS.items():
             value = getattr(self, name)
             if value is not None and (value not in allowed or (name != "angle" and type(value) is not int)):
-                raise InputError(f"{name} is {value}, expected {allowed}")
+                raise InputError(f"{name} is {value}", expected=allowed)
         twice = [name for name, count in Counter(self.frames or ()).items() if count > 1]
         if twice:
-            raise InputError(f"frames names {twice[0]} more than once, expected each once")
+            raise InputError(f"frames names {twice[0]} more than once", expected="each once")
         object.__setattr__(self, "faults", expand_faults(self.faults) or (NO_FAULT,))
 
 
@@ -113,7 +113,7 @@ def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
     sizes = protocol.sizes if plan.sizes is None else plan.sizes
     if protocol.fixed and (plan.frames is not None or len(rigs) < len(names)):
         raise InputError(
-            f"protocol {plan.protocol!r} defines its own frames, expected one image and all frames"
+            f"protocol {plan.protocol!r} defines its own frames", expected="one image and all frames"
         )
     count = protocol.trials if plan.trials is None else plan.trials
     cases = protocol.cases(len(rigs), count, protocol.seed if plan.seed is None else plan.seed)
@@ -225,7 +225,7 @@ def run_trials(
 def shard_of(trials: Sequence[Trial], number: int, shards: int) -> list[Trial]:
     """Return part ``number`` of ``shards``, for one of several machines: every ``shards``-th trial."""
     if not 0 <= number < shards:
-        raise InputError(f"shard is {number}, expected 0 to {shards - 1}")
+        raise InputError(f"shard is {number}", expected=f"0 to {shards - 1}")
     return list(trials[number::shards])
 
 
@@ -238,8 +238,9 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None
         advice = "name another --out, or remove the file to start again"
         if known.weights != stored.training:
             raise InputError(
-                f"{file.path}: holds results of another training run of map {trial.map} ({known.weights},"
-                f" expected {stored.training}); {advice}"
+                f"holds results of another training run of map {trial.map} ({known.weights}, expected"
+                f" {stored.training}); {advice}",
+                where=file.path,
             )
         _check_settings(trial, known, f"{file.path}: was made with {{}} {{}}, expected {{}}; {advice}")
         if known.inputs is None:  # not recorded by an earlier version
@@ -254,7 +255,7 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None
             if digest != digests[read][name]:
                 what = CHANGED[name].format(trial=trial)
                 raise InputError(
-                    f"{file.path}: holds results of frame {trial.frame} made with other {what}; {advice}"
+                    f"holds results of frame {trial.frame} made with other {what}; {advice}", where=file.path
                 )
 
 
@@ -276,7 +277,7 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
         if name not in names:
             others = {split: dataset.frame_names(split) for split in dataset.splits}
             elsewhere = in_other_split(name, others) or f"no frame {name!r}"
-            raise InputError(f"{plan.data}: split {plan.split!r}: {elsewhere}")
+            raise InputError(f"split {plan.split!r}: {elsewhere}", where=plan.data)
     kept = names if plan.frames is None else [name for name in names if name in plan.frames]
     kept = _visible(plan, dataset, kept)
     if plan.images == 1:
@@ -286,8 +287,9 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
     rigs = list(_found_sequences(plan, dataset, kept))
     if not rigs:
         raise InputError(
-            f"{plan.data}: no frame of split {plan.split!r} ends a sequence of {plan.images} frames "
-            f"{plan.angle:g} degrees apart around what the cameras look at"
+            f"no frame of split {plan.split!r} ends a sequence of {plan.images} frames {plan.angle:g}"
+            " degrees apart around what the cameras look at",
+            where=plan.data,
         )
     return rigs
 
@@ -300,7 +302,7 @@ def _visible(plan: Plan, dataset: Dataset, kept: list[str]) -> list[str]:
         listed = ", ".join(hidden[:4]) + (", ..." if len(hidden) > 4 else "")
         text = f"masks hide {amount(len(hidden), 'whole frame')} of {len(kept)}, not tried: {listed}"
         if len(hidden) == len(kept):
-            raise InputError(f"{plan.masks or plan.data}: {text}; {INVERTED}")
+            raise InputError(f"{text}; {INVERTED}", where=plan.masks or plan.data)
         warnings.warn(f"{plan.masks or plan.data}: {text}", InputWarning, stacklevel=2)
     return [name for name in kept if name not in every]
 
@@ -315,8 +317,8 @@ def check_points(plan: Plan, trials: Sequence[Trial], scene: Opened) -> None:
     if blind:
         listed = ", ".join(blind[:4]) + (", ..." if len(blind) > 4 else "")
         raise InputError(
-            f"{plan.depth_points}: has no points for {len(blind)} of {len(rigs)} frames ({listed}); "
-            "choose others with --frame"
+            f"has no points for {len(blind)} of {len(rigs)} frames ({listed}); choose others with --frame",
+            where=plan.depth_points,
         )
 
 

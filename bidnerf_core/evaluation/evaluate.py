@@ -93,7 +93,8 @@ def evaluate(
     in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
     if in_memory and workers not in (1, None):
         raise InputError(
-            f"workers is {workers}, expected 1: other processes read the map and the data from folders, and these are in memory"
+            f"workers is {workers}",
+            expected="1: other processes read the map and the data from folders, and these are in memory",
         )
     opened = _opened(scene, data, plan) if in_memory else None
     return run_plan(
@@ -200,11 +201,11 @@ def run_comparison(
     """
     if isinstance(scenes, str | Path | Map):
         raise InputError(
-            f"scenes is the one map {_name(scenes)}, expected a list of maps, or a dictionary of them"
+            f"scenes is the one map {_name(scenes)}", expected="a list of maps, or a dictionary of them"
         )
     named = dict(scenes) if isinstance(scenes, Mapping) else _named(scenes)
     if not named:
-        raise InputError("no maps to compare, expected at least one")
+        raise InputError("no maps to compare", expected="at least one")
     data = plan.data if data is None else data
     opened = {
         name: _opened(scene, data, plan) if isinstance(scene, Map) or not isinstance(data, str | Path) else None
@@ -288,10 +289,12 @@ def _in_memory(data: Dataset | Sequence[View]) -> Dataset:
         return data
     views = tuple(view for view in data if isinstance(view, View)) if isinstance(data, Sequence) else ()
     if not views or len(views) < len(data):
-        raise InputError(f"data is a {type(data).__name__}, expected a folder, a dataset or a list of views")
+        raise InputError(
+            f"data is a {type(data).__name__}", expected="a folder, a dataset or a list of views"
+        )
     name, count = Counter(view.frame.name for view in views).most_common(1)[0]
     if count > 1:  # trials identify their frames by name
-        raise InputError(f"data holds {count} frames named {name!r}, expected different names")
+        raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
     return _GivenViews(views)
 
 
@@ -313,7 +316,7 @@ def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:
     """Return the maps by the shortest names that distinguish them; maps in memory with the same backend are numbered."""
     folders = [str(scene) for scene in scenes if not isinstance(scene, Map)]
     if len({Path(folder).resolve() for folder in folders}) != len(folders):
-        raise InputError(f"maps: {', '.join(folders)}: one is named twice, expected different ones")
+        raise InputError(f"{', '.join(folders)}: one is named twice", where="maps", expected="different ones")
     labels = iter(map_labels(folders))
     found: dict[str, Scene] = {}
     for scene in scenes:
@@ -334,7 +337,9 @@ def _sizes(given: Sequence[float | Sequence[float]] | None) -> tuple[Size, ...] 
             tuple(map(float, size)) if isinstance(size, Sequence) else (float(size),) for size in given
         )
     except (TypeError, ValueError) as error:
-        raise InputError(f"sizes is {given!r}, expected a list of numbers or of lists of numbers") from error
+        raise InputError(
+            f"sizes is {given!r}", expected="a list of numbers or of lists of numbers"
+        ) from error
 
 
 def _config(method: str, config: Any) -> str:

@@ -119,8 +119,9 @@ class JsonLinesFile:
             same = False
         if not same:
             raise InputError(
-                f"{self.path}: was removed or replaced while it was being written, so its content is lost;"
-                " start again, or move the file back"
+                "was removed or replaced while it was being written, so its content is lost; start again, or"
+                " move the file back",
+                where=self.path,
             )
 
     def _opened(self) -> BinaryIO:
@@ -137,10 +138,12 @@ class JsonLinesFile:
                 ).close()  # not a pipe, which would wait for a reader
             file = self.path.open("a+b")
         except OSError as error:
-            raise InputError(f"{self.path}: cannot be written ({error.strerror}), expected a file") from error
+            raise InputError(
+                f"cannot be written ({error.strerror})", where=self.path, expected="a file"
+            ) from error
         if not take_lock(file.fileno()):
             file.close()
-            raise FileInUse(f"{self.path}: another process is writing to it; name another --out")
+            raise FileInUse("another process is writing to it; name another --out", where=self.path)
         file.seek(0)
         return file
 
@@ -162,7 +165,7 @@ class RowStore:
         for where, plain in self._file.open():
             if not isinstance(plain, dict) or plain.keys() != {"key", "row"}:
                 self._file.close()
-                raise InputError(f"{where}: no key and row, expected {self.FORMAT.expected}")
+                raise InputError("no key and row", where=where, expected=self.FORMAT.expected)
             self._rows[plain["key"]] = plain["row"]
         self._file.repair()
         return self

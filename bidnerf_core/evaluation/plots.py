@@ -461,7 +461,7 @@ def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
     Entry 0 of a trace is the start. Values without a logarithm leave a gap. Raises ``InputError`` without matplotlib.
     """
     if not traces:
-        raise InputError(f"{path}: no traces to plot")
+        raise InputError("no traces to plot", where=path)
     with styled():
         figure = new_figure(9, 3.6)
         left, right = figure.subplots(1, 2)

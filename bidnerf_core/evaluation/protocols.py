@@ -78,7 +78,7 @@ def _bid(T_true: SE3, size: float, widest: float, seed: int) -> SE3:
 
 def _require_length(what: str, value: float) -> None:
     if not (math.isfinite(value) and value >= 0):
-        raise InputError(f"perturbation: {what} is {value}, expected a finite number, 0 or more")
+        raise InputError(f"{what} is {value}", where="perturbation", expected="a finite number, 0 or more")
 
 
 # The 25 starts of Lin et al. 2023, "Parallel Inversion of Neural Radiance Fields for Robust Pose Estimation", from the
@@ -108,8 +108,9 @@ def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]
     """Return the frame index and the seed of each trial; 1234 is the first of the 25."""
     if seed != PARALLEL_SEED or trials > PARALLEL_TRIALS:
         raise InputError(
-            f"parallel: {trials} trials from seed {seed}, expected at most {PARALLEL_TRIALS} from seed"
-            f" {PARALLEL_SEED}, since the list is fixed"
+            f"{trials} trials from seed {seed}",
+            where="parallel",
+            expected=f"at most {PARALLEL_TRIALS} from seed {PARALLEL_SEED}, since the list is fixed",
         )
     chosen = draw_starts(frames)[0]
     return [(int(chosen[i // STARTS]), PARALLEL_SEED + i) for i in range(trials)]
@@ -119,7 +120,9 @@ def parallel_start(T_true: SE3, seed: int, frames: int) -> SE3:
     """Return T_world_camera of the trial with ``seed`` (1234 to 1258) in a split of ``frames`` frames."""
     if not PARALLEL_SEED <= seed < PARALLEL_SEED + PARALLEL_TRIALS:
         raise InputError(
-            f"parallel: seed is {seed}, expected {PARALLEL_SEED} to {PARALLEL_SEED + PARALLEL_TRIALS - 1}"
+            f"seed is {seed}",
+            where="parallel",
+            expected=f"{PARALLEL_SEED} to {PARALLEL_SEED + PARALLEL_TRIALS - 1}",
         )
     _, angles, moves = draw_starts(frames)
     place = divmod(seed - PARALLEL_SEED, STARTS)
@@ -168,9 +171,9 @@ class Protocol:
     def cases(self, frames: int, trials: int, seed: int) -> list[Case]:
         """Return the cases for one size. A larger number of trials begins with the same cases."""
         if frames < 1:
-            raise InputError("nothing to try: expected at least one frame")
+            raise InputError("nothing to try:", expected="at least one frame")
         if trials > MOST_TRIALS:
-            raise InputError(f"{trials} trials, expected at most {MOST_TRIALS} per size")
+            raise InputError(f"{trials} trials", expected=f"at most {MOST_TRIALS} per size")
         return (self.plan or each_in_turn)(frames, trials, seed)
 
     def check_size(self, size: Size) -> None:
@@ -180,7 +183,7 @@ class Protocol:
             expected = " : ".join(self.units) or "none, since it has no sizes"
             limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
             raise InputError(
-                f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}, expected {expected}{limits}"
+                f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}", expected=f"{expected}{limits}"
             )
 
 

@@ -88,7 +88,7 @@ def read_runs(results: Path) -> list[Provenance]:
     expected = "the list that 'bidnerf evaluate' writes next to its results"
     runs = read_record(path, expected).items("runs")
     if runs is None:
-        raise InputError(f"{path}: not a list of runs, expected {expected}")
+        raise InputError("not a list of runs", where=path, expected=expected)
     return [from_plain(Provenance, run, str(path)) for run in runs]
 
 

@@ -94,11 +94,11 @@ def chosen_criterion(asked: str | None, groups: Sequence[Group]) -> str:
     if asked is None:
         return usual_criterion([result for group in groups for result in group.results])
     if asked not in CRITERIA:
-        raise InputError(f"criterion is {asked!r}, expected one of {', '.join(CRITERIA)}")
+        raise InputError(f"criterion is {asked!r}", expected=f"one of {', '.join(CRITERIA)}")
     if not any(applies(asked, group.results) for group in groups):
         raise InputError(
-            f"criterion is {asked}, relative to the start's error, but no trial had a start; expected 5deg"
-            " 0.05 or 1deg 0.02"
+            f"criterion is {asked}, relative to the start's error, but no trial had a start;",
+            expected="5deg 0.05 or 1deg 0.02",
         )
     return asked
 
@@ -248,5 +248,5 @@ def _check_ours(folder: Path) -> None:
         written = False
     if folder.is_dir() and not written and not all(is_temporary(file.name) for file in folder.iterdir()):
         raise InputError(
-            f"{folder}: holds something other than a bidnerf report; name another --out or remove it"
+            "holds something other than a bidnerf report; name another --out or remove it", where=folder
         )

@@ -57,7 +57,7 @@ class Trial:
     def __post_init__(self) -> None:
         for name in ("map", "data", "depth_points", "masks", "camera", "register_depth"):
             if "\0" in str(getattr(self, name)):
-                raise InputError(f"{name} holds a NUL character, expected the name of a file or folder")
+                raise InputError(f"{name} holds a NUL character", expected="the name of a file or folder")
 
     @property
     def frame(self) -> str:
@@ -190,7 +190,7 @@ def folder_digest(folder: str) -> str:
                 content = hashlib.file_digest(file, "blake2b").digest()
             hashed.update(path.name.encode(errors="surrogateescape") + b"\n" + content)
     except OSError as error:
-        raise InputError(f"{error.filename or folder}: cannot be read ({error.strerror})") from error
+        raise InputError(f"cannot be read ({error.strerror})", where=error.filename or folder) from error
     return hashed.hexdigest()
 
 

@@ -161,7 +161,8 @@ class Reading:
         files = self.camera, self.register_depth, self.depth_unit
         if any(option is not None for option in files):
             raise InputError(
-                f"{dataset.path}: has its own cameras and depth; leave out camera, register_depth and depth_unit"
+                "has its own cameras and depth; leave out camera, register_depth and depth_unit",
+                where=dataset.path,
             )
         return self._masked(dataset)
 
@@ -197,7 +198,7 @@ def _opened(
 def opened_points(folder: str, stored: Map) -> SparsePoints:
     """Return the points of the COLMAP model in ``folder``, scaled to the map with the poses of its training cameras."""
     if not stored.info.cameras:
-        raise InputError(f"{folder}: the map has no training cameras to determine the scale from")
+        raise InputError("the map has no training cameras to determine the scale from", where=folder)
     return SparsePoints(Path(folder), places_of(stored.info), SparseChoice())
 
 

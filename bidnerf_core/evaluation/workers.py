@@ -85,7 +85,7 @@ def workers_for(
     with their trials. Raises ``InputError`` for a number below 1, and as ``dask_executor`` does.
     """
     if workers is not None and workers < 1:
-        raise InputError(f"workers is {workers}, expected 1 or more, or None for one per core")
+        raise InputError(f"workers is {workers}", expected="1 or more, or None for one per core")
     if dask is not None:
         with dask_executor(dask) as (cluster, threads):
             yield cluster, 2 * threads, f"dask, {threads} threads"
@@ -121,12 +121,12 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
         raise InputError(
-            f"no dask scheduler at {address} ({error}), expected one such as tcp://host:8786"
+            f"no dask scheduler at {address} ({error})", expected="one such as tcp://host:8786"
         ) from error
     with client:
         threads = sum(client.nthreads().values())
         if threads == 0:
-            raise InputError(f"the dask scheduler at {address} has no workers, expected at least one")
+            raise InputError(f"the dask scheduler at {address} has no workers", expected="at least one")
         yield client.get_executor(), threads
 
 
@@ -189,8 +189,9 @@ class TrialProcess:
             line = ""
         if not line:
             raise InputError(
-                f"{trial.map}: the process that localized frame {trial.frame} ended with status {self._process.wait()},"
-                " expected a result; was memory short?"
+                f"the process that localized frame {trial.frame} ended with status {self._process.wait()}",
+                where=trial.map,
+                expected="a result; was memory short?",
             )
         answer = parse_json(line, trial.map, "a result")
         if "refused" in answer:

@@ -174,16 +174,18 @@ class SceneBounds:
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
             raise InputError(
-                f"scene bounds: lower corner {self.lower} is not below upper corner {self.upper}"
+                f"lower corner {self.lower} is not below upper corner {self.upper}", where="scene bounds"
             )
         if not 0 <= self.near < self.far:
-            raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
+            raise InputError(
+                f"expected 0 <= near < far, got near {self.near}, far {self.far}", where="scene bounds"
+            )
         if not self.footprint >= 0:
-            raise InputError(f"scene bounds: footprint is {self.footprint}, expected 0 or more")
+            raise InputError(f"footprint is {self.footprint}", where="scene bounds", expected="0 or more")
         largest = max(map(abs, (*self.lower, *self.upper, self.far, self.footprint)))
         if not largest <= LARGEST_LENGTH:
             raise InputError(
-                f"scene bounds: {largest:g} m is too large, expected at most {LARGEST_LENGTH:g} m"
+                f"{largest:g} m is too large", where="scene bounds", expected=f"at most {LARGEST_LENGTH:g} m"
             )
 
     @property

@@ -48,7 +48,9 @@ class Observations:
     ) -> Observations:
         """Return rays along which only a distance (metres, > 0) was measured. Raises ``InputError`` if there are none."""
         if len(distance) == 0:
-            raise InputError("depth rays: nothing was measured, expected at least one finite point in front")
+            raise InputError(
+                "nothing was measured", where="depth rays", expected="at least one finite point in front"
+            )
         coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
         return Observations(origins, directions, torch.zeros_like(directions), distance, coloured)
 

@@ -69,7 +69,7 @@ class Frame:
     def __post_init__(self) -> None:
         where, camera = f"frame {self.name}", self.intrinsics
         if not isinstance(camera, Intrinsics):
-            raise InputError(f"{where}: intrinsics is a {type(camera).__name__}, expected Intrinsics")
+            raise InputError(f"intrinsics is a {type(camera).__name__}", where=where, expected="Intrinsics")
         _require_rays(where, camera)
         for what, image, channels in (
             ("rgb", self.held_rgb, 3),
@@ -85,11 +85,11 @@ class Frame:
             self._hide(self.hidden)
 
     def _hide(self, hidden: Bool[Tensor, "h w"]) -> None:
-        expected = "expected booleans that leave something visible"
+        where, expected = f"frame {self.name}", "booleans that leave something visible"
         if hidden.dtype != torch.bool:
-            raise InputError(f"frame {self.name}: hidden has dtype {hidden.dtype}, {expected}")
+            raise InputError(f"hidden has dtype {hidden.dtype}", where=where, expected=expected)
         if bool(hidden.all()):
-            raise WhollyHidden(f"frame {self.name}: hidden is all true, {expected}")
+            raise WhollyHidden("hidden is all true", where=where, expected=expected)
         if self.depth is not None and bool((self.depth[hidden.to(self.depth.device)] != 0).any()):
             depth = torch.where(hidden.to(self.depth.device), 0, self.depth)
             object.__setattr__(self, "depth", depth)
@@ -228,15 +228,18 @@ class Frame:
         if not isinstance(given, Intrinsics):
             found = type(given).__name__
             raise InputError(
-                f"{where}: camera is a {found}, expected Intrinsics(fx=..., fy=..., cx=..., cy=...,"
-                " width=..., height=...) or, from a matrix, Intrinsics.from_opencv(K, distortion, (width,"
-                " height))"
+                f"camera is a {found}",
+                where=where,
+                expected=(
+                    "Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...) or, from a matrix,"
+                    " Intrinsics.from_opencv(K, distortion, (width, height))"
+                ),
             )
         colour, cover = split_alpha(pixel_array(rgb, f"{where}: rgb"))
         if alpha is not None:
             if cover is not None:
                 raise InputError(
-                    f"{where}: rgb has an alpha channel, and alpha is given; expected only one of them"
+                    "rgb has an alpha channel, and alpha is given;", where=where, expected="only one of them"
                 )
             cover = _mask(alpha, (colour.shape[1], colour.shape[0]), where)
         raster = Raster(colour.shape[1], colour.shape[0])
@@ -244,8 +247,8 @@ class Frame:
         if intrinsics is None:
             found, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"
             raise InputError(
-                f"{where}: rgb is {found}, but its camera expects {expected} or a size of the same aspect"
-                " ratio"
+                f"rgb is {found}, but its camera expects {expected} or a size of the same aspect ratio",
+                where=where,
             )
         metres = None
         if depth is not None:
@@ -324,30 +327,36 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, chann
     """
     if not isinstance(image, Tensor):
         raise InputError(
-            f"{where}: {what} is a {type(image).__name__}, expected a tensor; Frame.from_numpy takes arrays"
+            f"{what} is a {type(image).__name__}",
+            where=where,
+            expected="a tensor; Frame.from_numpy takes arrays",
         )
     found, size = tuple(image.shape), (camera.height, camera.width)
     if len(found) != (2 if channels is None else 3) or found[2:] != (() if channels is None else (channels,)):
         expected = "(height, width)" if channels is None else f"(height, width, {channels})"
         hint = "; Frame.from_numpy takes grey and RGBA" if what == "rgb" else ""
-        raise InputError(f"{where}: {what} has shape {found}, expected {expected}{hint}")
+        raise InputError(f"{what} has shape {found}", where=where, expected=f"{expected}{hint}")
     if found[:2] != size:
         raise InputError(
-            f"{where}: {what} is {found[1]}x{found[0]}, but its camera expects {size[1]}x{size[0]}"
+            f"{what} is {found[1]}x{found[0]}, but its camera expects {size[1]}x{size[0]}", where=where
         )
     if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
-        raise InputError(f"{where}: {what} is a sparse tensor or has no values, expected a dense one")
+        raise InputError(f"{what} is a sparse tensor or has no values", where=where, expected="a dense one")
     if what == "hidden" or (what == "rgb" and image.dtype == torch.uint8):
         return
     if not image.is_floating_point():
         scale = "bytes or floats in [0, 1]" if what == "rgb" else "floats"
         raise InputError(
-            f"{where}: {what} has dtype {str(image.dtype).removeprefix('torch.')}, expected {scale}"
+            f"{what} has dtype {str(image.dtype).removeprefix('torch.')}", where=where, expected=scale
         )
     if image.requires_grad:
-        raise InputError(f"{where}: {what} requires a gradient, expected measured values; detach() them")
+        raise InputError(
+            f"{what} requires a gradient", where=where, expected="measured values; detach() them"
+        )
     if what != "depth" and not _is_finite(image):
-        raise InputError(f"{where}: {what} has values that are NaN or infinite, expected finite numbers")
+        raise InputError(
+            f"{what} has values that are NaN or infinite", where=where, expected="finite numbers"
+        )
 
 
 def _is_finite(image: Tensor) -> bool:
@@ -359,8 +368,9 @@ def _is_finite(image: Tensor) -> bool:
 def _require_rays(where: str, camera: Intrinsics) -> None:
     if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
         raise InputError(
-            f"{where}: distortion is {camera.distortion}, which maps no ray to some of its pixels; expected"
-            " coefficients of a real lens"
+            f"distortion is {camera.distortion}, which maps no ray to some of its pixels;",
+            where=where,
+            expected="coefficients of a real lens",
         )
 
 
@@ -375,7 +385,9 @@ def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Floa
     values = pixel_array(alpha, f"{where}: alpha")
     if values.shape[2] != 1 or (values.shape[1], values.shape[0]) != size:
         found = "x".join(map(str, values.shape))
-        raise InputError(f"{where}: alpha is {found}, expected {size[1]}x{size[0]} as rgb (rows x columns)")
+        raise InputError(
+            f"alpha is {found}", where=where, expected=f"{size[1]}x{size[0]} as rgb (rows x columns)"
+        )
     return values[..., 0]
 
 

@@ -54,7 +54,7 @@ def read_mask(
         white = resampled(white, *size)
     hidden = white if hides == "white" else ~white
     if bool(hidden.all()):
-        raise WhollyHidden(f"{path}: mask is all {hides}, which hides the whole image; {INVERTED}")
+        raise WhollyHidden(f"mask is all {hides}, which hides the whole image; {INVERTED}", where=path)
     return hidden
 
 
@@ -79,7 +79,9 @@ def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[
         return stored
     expected = "x".join(map(str, raster.upright_size))
     raise InputError(
-        f"{path}: mask is {given[0]}x{given[1]}, but its image is {expected}; expected the same aspect ratio"
+        f"mask is {given[0]}x{given[1]}, but its image is {expected};",
+        where=path,
+        expected="the same aspect ratio",
     )
 
 
@@ -109,13 +111,15 @@ class MaskFolder:
     def __init__(self, path: str | Path, hides: HiddenColour = "black") -> None:
         self.path, self.hides = Path(path), hides
         if hides not in get_args(HiddenColour):
-            raise InputError(f"mask_hides is {hides!r}, expected one of {', '.join(get_args(HiddenColour))}")
+            raise InputError(
+                f"mask_hides is {hides!r}", expected=f"one of {', '.join(get_args(HiddenColour))}"
+            )
         if not self.path.is_dir():
             what = "is a file" if self.path.exists() else "no such folder"
-            raise InputError(f"{self.path}: {what}, expected a folder of masks")
+            raise InputError(what, where=self.path, expected="a folder of masks")
         files = sorted(f for f in self.path.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file())
         if not files:
-            raise InputError(f"{self.path}: contains no images, expected masks")
+            raise InputError("contains no images", where=self.path, expected="masks")
         self._by_name = defaultdict[str, list[Path]](list)
         for file in files:
             parts = (*file.relative_to(self.path).parts[:-1], photo_of(file.name))
@@ -128,15 +132,16 @@ class MaskFolder:
         """
         found = self._by_name.get(name, [])
         if len(found) > 1:
-            raise InputError(f"{found[0]} and {found[1]} both match {name} by name, expected one mask")
+            raise InputError(f"{found[0]} and {found[1]} both match {name} by name", expected="one mask")
         return found[0] if found else None
 
     def require_any(self, names: Sequence[str]) -> None:
         """Raise ``InputError`` if none of the frames ``names`` has a mask."""
         if names and all(self.file_of(name) is None for name in names):
             raise InputError(
-                f"{self.path}: no mask in it matches any of {amount(len(names), 'image')} by name; expected"
-                f" {names[0]}.png or the like, found {next(iter(self._by_name))}"
+                f"no mask in it matches any of {amount(len(names), 'image')} by name;",
+                where=self.path,
+                expected=f"{names[0]}.png or the like, found {next(iter(self._by_name))}",
             )
 
     def hides_all(self, name: str) -> bool:

@@ -77,7 +77,7 @@ def pinhole_of(camera: Camera, depth: Path) -> Intrinsics:
     """Return a camera to which depth can be registered. Raises ``InputError`` for a lens whose images are resampled."""
     if not isinstance(camera, Intrinsics):
         raise InputError(
-            f"{depth}: depth cannot be registered to {camera.sentence}, expected undistorted images"
+            f"depth cannot be registered to {camera.sentence}", where=depth, expected="undistorted images"
         )
     return camera
 
@@ -95,7 +95,7 @@ def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what:
     elif not same_aspect(given, raster.upright_size):
         expected = "x".join(map(str, raster.upright_size))
         raise InputError(
-            f"{what} is {given[0]}x{given[1]}, but its image is {expected}; expected the same aspect ratio"
+            f"{what} is {given[0]}x{given[1]}, but its image is {expected};", expected="the same aspect ratio"
         )
     return metres if tuple(metres.shape) == size[::-1] else resampled(metres, *size)
 
@@ -114,10 +114,10 @@ def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
             key=lambda file: natural_order(file.name),
         )
     except FileNotFoundError as error:
-        raise InputError(f"{folder}: no such folder") from error
+        raise InputError("no such folder", where=folder) from error
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{folder}: {reason}, expected a folder of photos") from error
+        raise InputError(reason, where=folder, expected="a folder of photos") from error
     photos = [file for file in files if _is_photo(file)]
     return photos, [file for file in files if not _is_photo(file)]
 

@@ -70,8 +70,9 @@ class PixelStore:
         except OSError as error:
             place = self._folder or tempfile.gettempdir()
             raise InputError(
-                f"{place}: no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}),"
-                " free that much, or read them smaller (--largest, largest=)"
+                f"no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}), free that"
+                " much, or read them smaller (--largest, largest=)",
+                where=place,
             ) from error
 
 

@@ -23,7 +23,7 @@ def look_at(
     position = torch.as_tensor(eye, dtype=torch.float64)
     forward = torch.as_tensor(target, dtype=torch.float64) - position
     if not torch.linalg.vector_norm(forward) > 0:
-        raise InputError(f"look_at: the camera position {position.tolist()} equals its target")
+        raise InputError(f"the camera position {position.tolist()} equals its target", where="look_at")
     forward = torch.nn.functional.normalize(forward, dim=0)
     right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=torch.float64))
     if torch.linalg.vector_norm(right) < 1e-6:  # straight up or down: any right will do

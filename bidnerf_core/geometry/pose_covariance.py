@@ -34,7 +34,7 @@ def covariance_in(
     """
     if convention not in get_args(CovarianceConvention):
         raise InputError(
-            f"convention is {convention!r}, expected one of {', '.join(get_args(CovarianceConvention))}"
+            f"convention is {convention!r}", expected=f"one of {', '.join(get_args(CovarianceConvention))}"
         )
     found = covariance.detach().cpu().double()
     if convention == "gtsam":

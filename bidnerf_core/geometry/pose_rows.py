@@ -63,7 +63,7 @@ def _rigid(record: Record, key: str, matrix: Float[Tensor, "3 4"]) -> SE3:
     try:
         return rigid_pose(matrix)
     except InputError as error:
-        raise record.error(f"the rotation of {key} is {error}, expected a rigid transform") from error
+        raise record.error(f"the rotation of {key} is {error}", expected="a rigid transform") from error
 
 
 def rigid_pose(matrix: Float[Tensor, "3 4"]) -> SE3:
@@ -82,20 +82,20 @@ def _matrix(record: Record, key: str, rows: list[Any] | None) -> Float[Tensor, "
     """Return the first three rows of a 3x4 or 4x4 matrix of finite numbers; a fourth row must be 0 0 0 1."""
     matrix, scale = _homogeneous(record, key, rows)
     if scale != 1.0:
-        raise record.error(f"the last row of {key} is [0, 0, 0, {scale:g}], expected [0, 0, 0, 1]")
+        raise record.error(f"the last row of {key} is [0, 0, 0, {scale:g}]", expected="[0, 0, 0, 1]")
     return matrix
 
 
 def _homogeneous(record: Record, key: str, rows: list[Any] | None) -> tuple[Float[Tensor, "3 4"], float]:
     """Return the first three rows, divided by the last entry of a fourth row 0 0 0 w, and w (1 up to rounding)."""
     if rows is None:
-        raise record.error(f"no {key}, expected a 4x4 camera-to-world matrix")
+        raise record.error(f"no {key}", expected="a 4x4 camera-to-world matrix")
     if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise record.error(f"{key} is not 3x4 or 4x4, expected a 4x4 matrix")
+        raise record.error(f"{key} is not 3x4 or 4x4", expected="a 4x4 matrix")
     numbers = [[record.checked_number(x, f"an entry of {key}") for x in row] for row in rows]
     last = numbers[3] if len(numbers) == 4 else [0.0, 0.0, 0.0, 1.0]
     if not last[3] > 0 or max(map(abs, last[:3])) > 1e-6 * last[3]:
-        raise record.error(f"the last row of {key} is {last}, expected [0, 0, 0, 1]")
+        raise record.error(f"the last row of {key} is {last}", expected="[0, 0, 0, 1]")
     scale = last[3] if abs(last[3] - 1) > 1e-6 else 1.0
     return torch.tensor(numbers[:3], dtype=torch.float64) / scale, scale
 
@@ -108,10 +108,10 @@ def read_pose_matrix(path: Path) -> SE3:
     expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
     rows = [row.numbers(count=4) for row in read_rows(path, "a file of a pose", expected, LARGEST_POSE)]
     if len(rows) != 4:
-        raise InputError(f"{path}: has {len(rows)} rows, expected {expected}")
+        raise InputError(f"has {len(rows)} rows", where=path, expected=expected)
     if max(abs(x - y) for x, y in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
-        raise InputError(f"{path}: the last row is {rows[3]}, expected {expected}")
+        raise InputError(f"the last row is {rows[3]}", where=path, expected=expected)
     try:
         return rigid_pose(torch.tensor(rows[:3], dtype=torch.float64))
     except InputError as error:
-        raise InputError(f"{path}: the rotation is {error}, expected a rigid transform") from error
+        raise InputError(f"the rotation is {error}", where=path, expected="a rigid transform") from error

@@ -104,7 +104,7 @@ class Robust:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.scale) and self.scale > 0):
-            raise InputError(f"the scale of the robust loss is {self.scale}, expected a positive number")
+            raise InputError(f"the scale of the robust loss is {self.scale}", expected="a positive number")
 
     def __call__(self, residual: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
         return LOSSES[self.name](residual, self.scale)

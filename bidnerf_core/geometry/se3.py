@@ -52,10 +52,10 @@ class SE3:
         """
         if not isinstance(matrix, Tensor):
             raise InputError(
-                f"matrix is a {type(matrix).__name__}, expected a tensor; torch.as_tensor makes one"
+                f"matrix is a {type(matrix).__name__}", expected="a tensor; torch.as_tensor makes one"
             )
         if matrix.shape[-2:] != (4, 4):
-            raise InputError(f"the matrix has shape {tuple(matrix.shape)}, expected (..., 4, 4)")
+            raise InputError(f"the matrix has shape {tuple(matrix.shape)}", expected="(..., 4, 4)")
         return SE3(matrix[..., :3, :3], matrix[..., :3, 3])
 
     @staticmethod
@@ -81,7 +81,7 @@ class SE3:
         Blender, nerfstudio). Raises ``InputError`` for any other value.
         """
         if order not in get_args(QuaternionOrder):
-            raise InputError(f"order is {order!r}, expected one of {', '.join(get_args(QuaternionOrder))}")
+            raise InputError(f"order is {order!r}", expected=f"one of {', '.join(get_args(QuaternionOrder))}")
         found = torch.nn.functional.normalize(rotation_matrix_to_quaternion(self.rotation), dim=-1)
         found = torch.where(found[..., :1] < 0, -found, found)
         return found if order == "wxyz" else found.roll(-1, dims=-1)
@@ -95,10 +95,10 @@ class SE3:
         Raises ``InputError`` for a quaternion whose length is 0 or not finite.
         """
         if order not in get_args(QuaternionOrder):
-            raise InputError(f"order is {order!r}, expected one of {', '.join(get_args(QuaternionOrder))}")
+            raise InputError(f"order is {order!r}", expected=f"one of {', '.join(get_args(QuaternionOrder))}")
         length = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
         if not bool((length.isfinite() & (length > 0)).all()):
-            raise InputError("a quaternion has length 0 or is not finite, expected a rotation")
+            raise InputError("a quaternion has length 0 or is not finite", expected="a rotation")
         unit = (quaternion if order == "wxyz" else quaternion.roll(1, dims=-1)) / length
         w, v = unit[..., :1, None], unit[..., 1:]
         cross = skew(v)
@@ -273,16 +273,16 @@ def pose_from_matrix(matrix: Float[Tensor, "..."], what: str) -> SE3:
     orthonormal rotation.
     """
     if matrix.shape != (4, 4):
-        raise InputError(f"{what} has shape {tuple(matrix.shape)}, expected a 4x4 matrix T_world_camera")
+        raise InputError(f"{what} has shape {tuple(matrix.shape)}", expected="a 4x4 matrix T_world_camera")
     last = matrix[3].tolist()
     if not _is_last_row(last):
         transposed = _is_last_row(matrix[:, 3].tolist())
         hint = "; its last column is, so the matrix is column-major: transpose it" if transposed else ""
-        raise InputError(f"{what} has the last row {last}, expected [0, 0, 0, 1]{hint}")
+        raise InputError(f"{what} has the last row {last}", expected=f"[0, 0, 0, 1]{hint}")
     pose = SE3.from_matrix(matrix.to(torch.float64))
     if not bool(pose.is_rigid()):
         raise InputError(
-            f"{what} is not a rigid transform, expected an orthonormal rotation of determinant 1"
+            f"{what} is not a rigid transform", expected="an orthonormal rotation of determinant 1"
         )
     return pose.normalized()
 

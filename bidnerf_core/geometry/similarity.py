@@ -43,9 +43,11 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
     source, target = source.double(), target.double()
     largest = max((float(x.abs().max()) for x in (source, target) if x.numel()), default=0.0)
     if not largest <= FARTHEST_CAMERA:
-        raise InputError(f"a point is {largest:g} away from the origin, expected at most {FARTHEST_CAMERA:g}")
+        raise InputError(
+            f"a point is {largest:g} away from the origin", expected=f"at most {FARTHEST_CAMERA:g}"
+        )
     if len(source) < 2 or spread(source) == 0 or spread(target) == 0:
-        raise InputError(f"{len(source)} pairs of points, expected 2 or more distinct ones")
+        raise InputError(f"{len(source)} pairs of points", expected="2 or more distinct ones")
     from_mean, to_mean = source - source.mean(0), target - target.mean(0)
     u, values, vh = torch.linalg.svd(to_mean.mT @ from_mean / len(source))  # eqs. 38, 39
     sign = torch.ones_like(values)

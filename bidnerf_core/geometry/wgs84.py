@@ -41,7 +41,7 @@ class Geodetic:
         for name, most in bounds:
             value = getattr(self, name)
             if not abs(value) <= most:
-                raise InputError(f"{name} is {value}, expected {-most:g} to {most:g}")
+                raise InputError(f"{name} is {value}", expected=f"{-most:g} to {most:g}")
 
     @property
     def ecef(self) -> Float[Tensor, "3"]:

@@ -28,10 +28,10 @@ class Archive:
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError) as error:
             cut = begins == b"PK"
             why = "ends too early, probably an incomplete copy" if cut else f"is not a zip archive ({error})"
-            raise InputError(f"{path}: {why}, expected {expected}") from error
+            raise InputError(why, where=path, expected=expected) from error
         if len(members) > MOST_MEMBERS:
             raise InputError(
-                f"{path}: holds {len(members)} files, expected {expected} of at most {MOST_MEMBERS}"
+                f"holds {len(members)} files", where=path, expected=f"{expected} of at most {MOST_MEMBERS}"
             )
         self._members = {member.filename: member for member in members}
 
@@ -52,7 +52,7 @@ class Archive:
         where, member = f"{self.path}/{name}", self._members.get(name)
         if member is None:
             raise InputError(
-                f"{where}: not found in the archive, which holds {amount(len(self._members), 'file')}"
+                f"not found in the archive, which holds {amount(len(self._members), 'file')}", where=where
             )
         if member.file_size > LARGEST_MEMBER:
             raise self._too_large(where, member.file_size)
@@ -68,11 +68,11 @@ class Archive:
             RuntimeError,
             ValueError,
         ) as error:
-            raise InputError(f"{where}: cannot be unpacked ({error}), expected {self._expected}") from error
+            raise InputError(f"cannot be unpacked ({error})", where=where, expected=self._expected) from error
         if len(content) > LARGEST_MEMBER:
             raise self._too_large(where, len(content))
         return content
 
     def _too_large(self, where: str, size: int) -> InputError:
         found, most = (f"{count / 2**20:,.0f} MiB" for count in (size, LARGEST_MEMBER))
-        return InputError(f"{where}: unpacks to {found}, expected at most {most}")
+        return InputError(f"unpacks to {found}", where=where, expected=f"at most {most}")

@@ -63,14 +63,14 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
         if stat.S_ISREG(mode):
             return path.open("rb")
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, expected {expected}") from error
+        raise InputError("no such file", where=path, expected=expected) from error
     except PermissionError as error:
-        raise InputError(f"{path}: permission denied, expected a readable file: {expected}") from error
+        raise InputError("permission denied", where=path, expected=f"a readable file: {expected}") from error
     except (OSError, ValueError) as error:  # a NUL in the name raises ValueError
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be opened ({reason}), expected {expected}") from error
+        raise InputError(f"cannot be opened ({reason})", where=path, expected=expected) from error
     kind = FILE_KINDS.get(stat.S_IFMT(mode), "no regular file")
-    raise InputError(f"{path}: is {kind}, expected {expected}")
+    raise InputError(f"is {kind}", where=path, expected=expected)
 
 
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
@@ -86,11 +86,11 @@ def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGES
     size = os.fstat(file.fileno()).st_size
     if size > most:
         found, limit = (f"{count / 2**20:,.0f} MiB" for count in (size, most))
-        raise InputError(f"{path}: has {found}, expected {expected} of at most {limit}")
+        raise InputError(f"has {found}", where=path, expected=f"{expected} of at most {limit}")
     try:
         return file.read()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}), expected {expected}") from error
+        raise InputError(f"cannot be read ({error.strerror})", where=path, expected=expected) from error
 
 
 def is_file(path: Path) -> bool:
@@ -140,7 +140,7 @@ def locked(path: Path) -> Iterator[None]:
     Raises ``FileInUse`` if another process holds it, or held it and removed the file or folder.
     """
     used = FileInUse(
-        f"{path}: another bidnerf process is writing here; name another place, or wait until it ends"
+        "another bidnerf process is writing here; name another place, or wait until it ends", where=path
     )
     try:
         number = os.open(path, os.O_RDONLY)

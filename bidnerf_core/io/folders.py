@@ -28,11 +28,11 @@ def output_folder(
 
     def check() -> None:
         if out.exists() and not out.is_dir():
-            raise InputError(f"{out}: is a file, expected the name of a folder")
+            raise InputError("is a file", where=out, expected="the name of a folder")
         files = out.iterdir() if out.is_dir() and not overwrite else ()
         if not all(is_temporary(file.name) or is_leftover(file) for file in files):
             what = described(out) or "exists already and is not empty"
-            raise InputError(f"{out}: {what}; name another folder, or overwrite it (--overwrite)")
+            raise InputError(f"{what}; name another folder, or overwrite it (--overwrite)", where=out)
 
     @contextlib.contextmanager
     def removed_on_failure() -> Iterator[None]:
@@ -62,5 +62,7 @@ def _make_writable(out: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise InputError(
-            f"{out}: cannot be written ({error.strerror}), expected a folder that can be created and written"
+            f"cannot be written ({error.strerror})",
+            where=out,
+            expected="a folder that can be created and written",
         ) from error

@@ -160,7 +160,7 @@ def channels(
     count = raw.shape[2] if raw.ndim == 3 else 1
     if raw.ndim not in (2, 3) or not 1 <= count <= 4 or raw.dtype.name not in FULL_SCALE:
         found = f"{'x'.join(map(str, raw.shape))} of {raw.dtype.name}"
-        raise InputError(f"{finding} {found}, expected grey, RGB or RGBA with 8 or 16 bits per channel")
+        raise InputError(f"{finding} {found}", expected="grey, RGB or RGBA with 8 or 16 bits per channel")
     scaled = raw.reshape(*raw.shape[:2], count).astype(np.float32)
     scaled /= full or FULL_SCALE[raw.dtype.name]
     return split_alpha(torch.from_numpy(scaled))
@@ -186,11 +186,12 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
     if raw.ndim not in (2, 3) or 0 in raw.shape or (raw.ndim == 3 and raw.shape[2] > 4):
         hint = "; move the channels last" if raw.ndim == 3 and raw.shape[0] <= 4 else ""
         raise InputError(
-            f"{what} has shape {tuple(raw.shape)}, expected (height, width) or (height, width, 1 to 4){hint}"
+            f"{what} has shape {tuple(raw.shape)}",
+            expected=f"(height, width) or (height, width, 1 to 4){hint}",
         )
     if raw.dtype.kind != "f" and raw.dtype.name not in FULL_SCALE:
         raise InputError(
-            f"{what} has dtype {raw.dtype.name}, expected uint8 in [0, 255], uint16 or floats in [0, 1]"
+            f"{what} has dtype {raw.dtype.name}", expected="uint8 in [0, 255], uint16 or floats in [0, 1]"
         )
     if raw.dtype.kind == "f":
         _check_unit_range(raw, what)
@@ -205,7 +206,7 @@ def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
             return np.asarray(array)
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(
-                f"got an object of type {type(array).__name__}, expected an array of numbers"
+                f"got an object of type {type(array).__name__}", expected="an array of numbers"
             ) from error
     values = array.detach().cpu()
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
@@ -214,11 +215,11 @@ def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
 def _check_unit_range(raw: np.ndarray, what: str) -> None:
     if not np.isfinite(raw).all():
         count = int((~np.isfinite(raw)).sum())
-        raise InputError(f"{what} has {count} values that are NaN or infinite, expected floats in [0, 1]")
+        raise InputError(f"{what} has {count} values that are NaN or infinite", expected="floats in [0, 1]")
     low, high = float(raw.min()), float(raw.max())
     if low < -COLOUR_ROUNDING or high > 1 + COLOUR_ROUNDING:
         hint = "; divide by 255, or give uint8" if 1 < high <= 255 and low >= 0 else ""
-        raise InputError(f"{what} has floats from {low:g} to {high:g}, expected [0, 1]{hint}")
+        raise InputError(f"{what} has floats from {low:g} to {high:g}", expected=f"[0, 1]{hint}")
 
 
 def over(
@@ -233,14 +234,14 @@ def over(
 
 def background_colour(background: Background) -> tuple[float, float, float]:
     """Return the rgb triple for ``background``. Raises ``InputError`` if it is not a colour."""
-    expected = 'expected "white", "black" or three numbers in [0, 1]'
+    expected = '"white", "black" or three numbers in [0, 1]'
     if isinstance(background, str):
         if background not in NAMED_BACKGROUNDS:
-            raise InputError(f"background is {background!r}, {expected}")
+            raise InputError(f"background is {background!r}", expected=expected)
         return NAMED_BACKGROUNDS[background]
     values = tuple(float(value) for value in background)
     if len(values) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in values):
-        raise InputError(f"background is {values}, {expected}")
+        raise InputError(f"background is {values}", expected=expected)
     return values[0], values[1], values[2]
 
 
@@ -322,7 +323,7 @@ def _deep_colours(path: ImageSource) -> np.ndarray:
         found = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
         raise InputError(
-            f"{path}: not readable as an image with 16 bits per channel, expected a complete image file"
+            "not readable as an image with 16 bits per channel", where=path, expected="a complete image file"
         )
     return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
@@ -330,7 +331,7 @@ def _deep_colours(path: ImageSource) -> np.ndarray:
 def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the first row and the pixels of each strip of an open image, from top to bottom."""
     if image.mode == "LAB":
-        raise InputError(f"{path}: image is {image.mode}, expected grey, RGB, RGBA or CMYK")
+        raise InputError(f"image is {image.mode}", where=path, expected="grey, RGB, RGBA or CMYK")
     rows = max(1, STRIP // image.width)
     for top in range(0, image.height, rows):
         last = min(top + rows, image.height)
@@ -377,8 +378,9 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
             raise _too_large(path, "more than 178 megapixels") from error
         except Exception as error:  # decoders may raise anything, even SyntaxError
             raise InputError(
-                f"{path}: not readable as an image ({_why_unreadable(file, error)}), expected a complete"
-                " image file"
+                f"not readable as an image ({_why_unreadable(file, error)})",
+                where=path,
+                expected="a complete image file",
             ) from error
 
 
@@ -404,7 +406,7 @@ def _check_pixels(path: ImageSource, width: int, height: int) -> None:
 
 
 def _too_large(path: ImageSource, size: str) -> InputError:
-    return InputError(f"{path}: image is {size}, expected at most {LARGEST_IMAGE // 10**6} megapixels")
+    return InputError(f"image is {size}", where=path, expected=f"at most {LARGEST_IMAGE // 10**6} megapixels")
 
 
 def is_heif(head: bytes) -> bool:
@@ -430,7 +432,9 @@ def _register_heif(path: ImageSource) -> None:
         import pillow_heif
     except ImportError as error:
         raise InputError(
-            f"{path}: is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG"
+            "is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to"
+            " JPEG",
+            where=path,
         ) from error
     pillow_heif.register_heif_opener()
 

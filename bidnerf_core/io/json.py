@@ -52,7 +52,7 @@ def parse_json(content: bytes | str, where: str, expected: str) -> Any:
 
 
 def _not_json(where: str, reason: str, expected: str) -> InputError:
-    return InputError(f"{where}{': ' if where else ''}not JSON ({reason}), expected {expected}")
+    return InputError(f"not JSON ({reason})", where=where, expected=expected)
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Record:
     values: Mapping[str, Any]
     defaults: Record | None = None
 
-    def error(self, finding: str) -> InputError:
-        return InputError(f"{self.where}: {finding}")
+    def error(self, found: object, expected: object = None) -> InputError:
+        return InputError(found, where=self.where, expected=expected)
 
     def scopes(self) -> Iterator[Record]:
         """Yield this object without its defaults, then the defaults without theirs, and so on."""
@@ -87,25 +87,25 @@ class Record:
         """
         found = self.number(key)
         if found is not None and (found < 1 or found != int(found)):
-            raise self.error(f"{key} is {found:g}, expected a positive whole number of pixels")
+            raise self.error(f"{key} is {found:g}", expected="a positive whole number of pixels")
         return None if found is None else int(found)
 
     def text(self, key: str) -> str | None:
         found = self.value(key)
         if found is not None and not isinstance(found, str):
-            raise self.error(f"{key} is {_short(found)}, expected text")
+            raise self.error(f"{key} is {_short(found)}", expected="text")
         return found
 
     def items(self, key: str) -> list[Any] | None:
         found = self.value(key)
         if found is not None and not isinstance(found, list):
-            raise self.error(f"{key} is {_short(found)}, expected a list")
+            raise self.error(f"{key} is {_short(found)}", expected="a list")
         return found
 
     def checked_number(self, found: Any, what: str) -> float:
         is_number = isinstance(found, int | float) and not isinstance(found, bool)
         if not is_number or not abs(found) < LARGEST_NUMBER:
-            raise self.error(f"{what} is {_short(found)}, expected a finite number")
+            raise self.error(f"{what} is {_short(found)}", expected="a finite number")
         return float(found)
 
 
@@ -118,7 +118,7 @@ def parse_record(where: str, content: bytes | str, expected: str = "a JSON objec
     """Parse a JSON object. Malformed text raises ``InputError``, whose message begins with ``where``."""
     values = parse_json(content, where, expected)
     if not isinstance(values, dict):
-        raise InputError(f"{where}: holds {_short(values)}, expected {expected}")
+        raise InputError(f"holds {_short(values)}", where=where, expected=expected)
     return Record(where, values)
 
 
@@ -140,10 +140,10 @@ def to_plain(value: Any, where: str = "") -> Any:
     if isinstance(value, tuple | list):
         return [to_plain(item, f"{where}[{place}]") for place, item in enumerate(value)]
     if isinstance(value, float) and not math.isfinite(value):
-        raise InputError(f"{where or 'value'} is {value}, expected a finite number")
+        raise InputError(f"{where or 'value'} is {value}", expected="a finite number")
     if value is None or type(value) in (bool, int, float, str):
         return value
-    raise InputError(f"{where or 'value'} is a {type(value).__name__}, expected a JSON-serializable value")
+    raise InputError(f"{where or 'value'} is a {type(value).__name__}", expected="a JSON-serializable value")
 
 
 def from_plain(kind: type[_T], value: Any, where: str) -> _T:
@@ -155,7 +155,7 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
     """
     if not isinstance(value, dict):
         raise InputError(
-            f"{where}: found {_shown(value)}, expected an object with the fields of {kind.__name__}"
+            f"found {_shown(value)}", where=where, expected=f"an object with the fields of {kind.__name__}"
         )
     _check_keys(kind, value, where)
     hints = _hints(typing.cast(Any, kind))
@@ -163,7 +163,7 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
     try:
         return kind(**fields)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(error, where=where) from error
 
 
 @functools.cache
@@ -181,12 +181,13 @@ def _check_keys(kind: type, value: dict[str, Any], where: str) -> None:
     known = {f.name: _is_required(f) for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in known:
-            hint = spelling_hint(key, known, f", expected any of {', '.join(known)}")
-            raise InputError(f"{where}: {kind.__name__} has no field {key!r}{hint}")
+            hint = spelling_hint(key, known)
+            expected = None if hint else f"any of {', '.join(known)}"
+            raise InputError(f"{kind.__name__} has no field {key!r}{hint}", where=where, expected=expected)
     missing = [key for key, required in known.items() if required and key not in value]
     if missing:
         raise InputError(
-            f"{where}: {', '.join(map(repr, missing))} missing, expected all fields of {kind.__name__}"
+            f"{', '.join(map(repr, missing))} missing", where=where, expected=f"all fields of {kind.__name__}"
         )
 
 
@@ -220,10 +221,10 @@ def converted(kind: Any, value: Any, where: str) -> Any:
     elif kind is int and type(value) is int:
         if abs(value) <= LARGEST_INTEGER:
             return value
-        raise InputError(f"{where}: found {_shown(value)}, expected an integer of at most 64 bits")
+        raise InputError(f"found {_shown(value)}", where=where, expected="an integer of at most 64 bits")
     elif type(value) is kind or (value is None and kind is type(None)):
         return value
-    raise InputError(f"{where}: found {_shown(value)}, expected {_name(kind)}")
+    raise InputError(f"found {_shown(value)}", where=where, expected=_name(kind))
 
 
 def _are_numbers(values: list[Any] | tuple[Any, ...]) -> bool:
@@ -247,7 +248,7 @@ def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
             return converted(kind, value, where)
         except InputError:
             continue
-    raise InputError(f"{where}: found {_shown(value)}, expected {' or '.join(map(_name, kinds))}")
+    raise InputError(f"found {_shown(value)}", where=where, expected=" or ".join(map(_name, kinds)))
 
 
 def _name(kind: Any) -> str:
@@ -270,5 +271,5 @@ def _inside(where: str, name: Any) -> str:
 
 def _key(key: Any, where: str) -> str:
     if not isinstance(key, str):
-        raise InputError(f"{where or 'value'} has the key {key!r}, expected text")
+        raise InputError(f"{where or 'value'} has the key {key!r}", expected="text")
     return key

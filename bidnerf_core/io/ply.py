@@ -79,8 +79,9 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
             size = SHORTEST_NUMBER * len(element.properties) if is_text else kind.itemsize
             if element.count * size > left + is_text:
                 raise InputError(
-                    f"{path}: declares {element.count:,} elements {element.name!r}, but its {left:,} bytes"
-                    " of data are too few for them; is the file truncated?"
+                    f"declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of data"
+                    " are too few for them; is the file truncated?",
+                    where=path,
                 )
             found[element.name] = (
                 _text_rows(file, element.count, kind, path)
@@ -96,7 +97,7 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
     end = start.find(b"end_header")
     stop = start.find(b"\n", end)
     if not start.startswith(b"ply") or end < 0 or stop < 0:
-        raise InputError(f"{path}: no PLY header, expected {expected}")
+        raise InputError("no PLY header", where=path, expected=expected)
     order, elements = "", list[PlyElement]()
     for line in start[:end].decode("latin-1").splitlines()[1:]:
         words = line.split()
@@ -115,12 +116,16 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
             else:
                 raise ValueError
         except (ValueError, KeyError, IndexError) as error:
-            raise InputError(f"{path}: its header has the line {line[:60]!r}, expected {expected}") from error
+            raise InputError(
+                f"its header has the line {line[:60]!r}", where=path, expected=expected
+            ) from error
     if not order:
-        raise InputError(f"{path}: its header names no format, expected {expected}")
+        raise InputError("its header names no format", where=path, expected=expected)
     for element in elements:  # otherwise any number of them would fit into no bytes
         if element.count and not element.properties and not element.has_lists:
-            raise InputError(f"{path}: the elements {element.name!r} have no properties, expected {expected}")
+            raise InputError(
+                f"the elements {element.name!r} have no properties", where=path, expected=expected
+            )
     file.seek(stop + 1)
     return PlyHeader(order, tuple(elements), stop + 1)
 
@@ -149,7 +154,7 @@ def _text_rows(file: BinaryIO, count: int, kind: np.dtype, path: Path) -> np.nda
         if rows.shape != (count, width):
             raise ValueError(f"{rows.shape[0]} rows of {rows.shape[1]}")
     except ValueError as error:
-        raise InputError(f"{path}: expected {count:,} rows of {width} numbers ({error})") from error
+        raise InputError(where=path, expected=f"{count:,} rows of {width} numbers ({error})") from error
     found = np.empty(count, kind)
     for number, name in enumerate(kind.names or ()):
         found[name] = rows[:, number]

@@ -36,7 +36,7 @@ class Row:
 
     def error(self, finding: str) -> InputError:
         """Return the error for this row; ``finding`` begins with a space or a colon."""
-        return InputError(f"{self.where}{finding}, expected {self.columns}")
+        return InputError(f"line {self.line}{finding}", where=self.path, expected=self.columns)
 
     def numbers(self, words: Sequence[str] | None = None, count: int | None = None) -> list[float]:
         """Parse the ``words`` (by default the whole row) as finite numbers, exactly ``count`` of them if
@@ -84,7 +84,7 @@ def parse_rows(content: bytes, path: Path, expected: str, columns: str) -> list[
     try:
         lines = content.decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not text ({error.reason}), expected {expected}") from error
+        raise InputError(f"is not text ({error.reason})", where=path, expected=expected) from error
     rows = (
         Row(path, number, line.partition("#")[0].strip(), columns)
         for number, line in enumerate(lines, start=1)

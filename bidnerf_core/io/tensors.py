@@ -77,7 +77,7 @@ def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
 
 def _unreadable(path: Path, error: Exception, expected: str) -> InputError:
     reason = str(error).strip().partition("\n")[0][:120] or type(error).__name__
-    return InputError(f"{path}: not readable as an array ({reason}), expected {expected}")
+    return InputError(f"not readable as an array ({reason})", where=path, expected=expected)
 
 
 def read_tensors(path: Path, expected: str = TENSOR_FILE) -> dict[str, Tensor]:
@@ -99,7 +99,7 @@ def read_tensors_and_metadata(
         except InputError:
             raise
         except (SafetensorError, KeyError, ValueError, RuntimeError, OverflowError, OSError) as error:
-            raise InputError(f"{path}: not readable ({error}), expected {expected}") from error
+            raise InputError(f"not readable ({error})", where=path, expected=expected) from error
 
 
 def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]:
@@ -107,16 +107,16 @@ def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]
     size = os.fstat(file.fileno()).st_size
     length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
     if not length <= min(size - 8, LARGEST_HEADER):
-        raise InputError(f"{path}: not readable (its header is truncated), expected {expected}")
+        raise InputError("not readable (its header is truncated)", where=path, expected=expected)
     try:
         header: dict[str, Any] = parse_json(file.read(length), str(path), expected)
         ends = [part["data_offsets"][1] for name, part in header.items() if name != "__metadata__"]
         described = 8 + length + max(ends, default=0)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-        raise InputError(f"{path}: not readable (its header is damaged), expected {expected}") from error
+        raise InputError("not readable (its header is damaged)", where=path, expected=expected) from error
     if described != size:
         raise InputError(
-            f"{path}: has {size} bytes, but its header describes {described}; expected {expected}"
+            f"has {size} bytes, but its header describes {described};", where=path, expected=expected
         )
     file.seek(0)
     return header
@@ -131,7 +131,7 @@ def load_part(
         return make(tensors)
     except (KeyError, ValueError) as error:
         why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path}: not {what} ({why}), expected {expected}") from error
+        raise InputError(f"not {what} ({why})", where=path, expected=expected) from error
 
 
 def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -56,7 +56,7 @@ def outline_of(path: Path, expected: str) -> Any:
 
 def _read(path: Path, expected: str, mapped: bool) -> Any:
     if not path.is_file():
-        raise InputError(f"{path}: no such file, expected {expected}")
+        raise InputError("no such file", where=path, expected=expected)
     path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
     try:
         with torch.serialization.safe_globals([(_Ignored, name) for name in STAND_INS]):
@@ -65,10 +65,10 @@ def _read(path: Path, expected: str, mapped: bool) -> Any:
         code = CODE.search(str(error))
         if isinstance(error, pickle.UnpicklingError) and code:
             raise InputError(
-                f"{path}: would run code ({code[1]}) and was not read, expected {expected}"
+                f"would run code ({code[1]}) and was not read", where=path, expected=expected
             ) from error
         raise InputError(
-            f"{path}: not written by torch.save, or damaged ({type(error).__name__}); expected {expected}"
+            f"not written by torch.save, or damaged ({type(error).__name__});", where=path, expected=expected
         ) from error
     return found
 
@@ -84,8 +84,9 @@ def check_sizes(path: Path, found: Any, expected: str) -> None:
         held = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
         if needed > min(held, size):
             raise InputError(
-                f"{path}: a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only"
-                f" {size:,}; expected {expected}"
+                f"a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only {size:,};",
+                where=path,
+                expected=expected,
             )
 
 

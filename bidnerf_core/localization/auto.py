@@ -213,7 +213,7 @@ def _measured_points(problem: Problem) -> int:
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:
     if problem.start is None:
-        raise InputError(f"{why}: method 'auto' then needs a start; give one")
+        raise InputError("method 'auto' then needs a start; give one", where=why)
     found = bid(problem, BidConfig(), seed)
     return replace(found, reason=f"{why}; {found.reason}")
 

@@ -105,7 +105,7 @@ class Localizer:
         found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
             raise InputError(
-                f"method {self.method!r} returned a {type(found).__name__}, expected a Localization"
+                f"method {self.method!r} returned a {type(found).__name__}", expected="a Localization"
             )
         found = replace(found, unit=unit_of(self.scene))
         return found if self.scene.has_distances else direction_only(found)
@@ -142,7 +142,7 @@ def map_with_distances(localizer: Localizer) -> SceneMap:
     """Return the localizer's map. Raises ``InputError`` if its photos are from one place, as it then has no positions."""
     if not localizer.scene.has_distances:
         raise InputError(
-            f"tracking needs positions, but {NO_DISTANCES}; expected a map of photos from several places"
+            f"tracking needs positions, but {NO_DISTANCES};", expected="a map of photos from several places"
         )
     return localizer.scene
 
@@ -153,7 +153,7 @@ def checked_map(given: object, where: str) -> SceneMap:
         return given
     is_path = isinstance(given, str | bytes) or hasattr(given, "__fspath__")
     hint = "; load_map(folder) gives one" if is_path else ""
-    raise InputError(f"{where}: got a {type(given).__name__}, expected a Map{hint}")
+    raise InputError(f"got a {type(given).__name__}", where=where, expected=f"a Map{hint}")
 
 
 def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:
@@ -166,14 +166,14 @@ def _checked_config(method: Method, name: str, config: Any, preset: str | None) 
         raise InputError(f"method {name!r} takes a {expected} or a dictionary, got a {found}")
     if preset is not None:
         raise InputError(
-            f"got both preset {preset!r} and a {found}, expected one, or a dictionary of what differs"
+            f"got both preset {preset!r} and a {found}", expected="one, or a dictionary of what differs"
         )
     return config
 
 
 def _checked_seed(seed: Any) -> int:
     if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= LARGEST_INTEGER:
-        raise InputError(f"seed is {seed!r}, expected a whole number from 0 to 2**63 - 1")
+        raise InputError(f"seed is {seed!r}", expected="a whole number from 0 to 2**63 - 1")
     return int(seed)
 
 
@@ -189,11 +189,11 @@ def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
         return [View(items[0], SE3.identity())]
     if any(isinstance(item, Frame) for item in items):
         raise InputError(
-            f"{len(query)} frames without relative poses, expected views: View(frame, T_ref_camera)"
+            f"{len(query)} frames without relative poses", expected="views: View(frame, T_ref_camera)"
         )
     raise InputError(
-        f"query is a {type(query).__name__}, expected a Frame (Frame.open reads a file, Frame.from_numpy takes an"
-        " array), a View, or a list of views"
+        f"query is a {type(query).__name__}",
+        expected="a Frame (Frame.open reads a file, Frame.from_numpy takes an array), a View, or a list of views",
     )
 
 
@@ -205,11 +205,11 @@ def start_pose(start: Start, what: str = "start") -> SE3:
     if isinstance(start, SE3):
         found, count = start.translation.shape, start.translation.numel() // 3
         if len(found) > 1 and found[-1] == 3:
-            raise InputError(f"{what} holds {count} poses, expected one")
+            raise InputError(f"{what} holds {count} poses", expected="one")
         if found != (3,) or start.rotation.shape != (3, 3):
             shapes = f"{tuple(start.rotation.shape)} and {tuple(found)}"
             raise InputError(
-                f"{what} has a rotation and a translation of shapes {shapes}, expected (3, 3) and (3)"
+                f"{what} has a rotation and a translation of shapes {shapes}", expected="(3, 3) and (3)"
             )
         return SE3(start.rotation.detach(), start.translation.detach()).to("cpu", torch.float64)
     if isinstance(start, torch.Tensor):
@@ -217,7 +217,7 @@ def start_pose(start: Start, what: str = "start") -> SE3:
     try:
         matrix = torch.as_tensor(np.asarray(start, dtype=np.float64))
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what} is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
+        raise InputError(f"{what} is a {type(start).__name__}", expected="an SE3 or a 4x4 matrix") from error
     return pose_from_matrix(matrix, what)
 
 

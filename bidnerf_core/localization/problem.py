@@ -68,7 +68,7 @@ def on_device(scene: _Map, device: torch.device | str) -> _Map:
     field = scene.field
     if not isinstance(field, nn.Module):
         raise InputError(
-            f"device {device}: the map's field is a {type(field).__name__}, expected an nn.Module"
+            f"the map's field is a {type(field).__name__}", where=f"device {device}", expected="an nn.Module"
         )
     parts = {"field": field, "surface": scene.surface, "landmarks": scene.landmarks}
     there = moved(parts, working_device(device))
@@ -103,7 +103,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         if not self.views:
-            raise InputError("nothing to localize: expected at least one view")
+            raise InputError("nothing to localize:", expected="at least one view")
         known = [] if self.start is None else [("start", self.start)]
         for what, pose in (*known, *((v.frame.name, v.T_ref_camera) for v in self.views)):
             if not bool(pose.is_rigid().all()):
@@ -135,7 +135,7 @@ class Problem:
             return self.field
         offered = levels(self.field)
         if not -len(offered) <= number < len(offered):
-            raise InputError(f"level is {number}, expected 0 (coarsest) to {len(offered) - 1}")
+            raise InputError(f"level is {number}", expected=f"0 (coarsest) to {len(offered) - 1}")
         return offered[number]
 
     def on_device(self) -> Problem:
@@ -172,7 +172,7 @@ def rig(
     ``start`` and ``depth_rays`` belong to the last view.
     """
     if not views:
-        raise InputError("nothing to localize: expected at least one view")
+        raise InputError("nothing to localize:", expected="at least one view")
     T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
     relative = tuple(
         View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
@@ -189,7 +189,7 @@ def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> 
     Views in temporal order give the paper's moving window. Raises ``InputError`` if there is no such item.
     """
     if size < 1 or stride < 1:
-        raise InputError(f"the window has size {size} and stride {stride}, expected 1 or more for both")
+        raise InputError(f"the window has size {size} and stride {stride}", expected="1 or more for both")
     if not 0 <= last < len(sequence):
         raise InputError(f"the window ends at item {last} of {len(sequence)}, which does not exist")
     return tuple(sequence[i] for i in range(last, -1, -stride)[:size][::-1])

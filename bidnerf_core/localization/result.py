@@ -142,7 +142,7 @@ class Localization:
         where = str(path)
         saved = from_plain(_Saved, dict(read_record(Path(path)).values), where)
         if saved.T_world_camera is None:
-            raise InputError(f"{where}: T_world_camera is null, expected a finite pose")
+            raise InputError("T_world_camera is null", where=where, expected="a finite pose")
         T = pose_from_matrix(
             _matrix(saved.T_world_camera, 4, f"{where}: T_world_camera"), f"{where}: T_world_camera"
         )
@@ -183,7 +183,7 @@ class _Saved:
 
 def _matrix(rows: list[list[float]], size: int, what: str) -> Float[Tensor, "n n"]:
     if {len(row) for row in rows} != {size} or len(rows) != size:
-        raise InputError(f"{what} has {len(rows)} rows, expected {size} rows of {size} numbers")
+        raise InputError(f"{what} has {len(rows)} rows", expected=f"{size} rows of {size} numbers")
     return torch.tensor(rows, dtype=torch.float64)
 
 

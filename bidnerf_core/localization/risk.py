@@ -32,7 +32,9 @@ def least_confidence(risk: float) -> float:
         raise InputError(f"risk is {risk!r}, but no risk was calibrated for this confidence; leave it out")
     calibrated = Range(levels()[0][0], levels()[-1][0])
     if risk not in calibrated:
-        raise InputError(f"risk is {risk!r}, expected {calibrated}, for which the confidence was calibrated")
+        raise InputError(
+            f"risk is {risk!r}", expected=f"{calibrated}, for which the confidence was calibrated"
+        )
     return min(confidence for level, confidence in levels() if level <= risk)
 
 

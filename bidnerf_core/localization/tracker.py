@@ -305,4 +305,4 @@ def _checked_localizer(given: object) -> Localizer:
     if isinstance(given, Localizer):
         return given
     hint = "; Localizer(map) makes one" if isinstance(given, SceneMap) else ""
-    raise InputError(f"Tracker: got a {type(given).__name__}, expected a Localizer{hint}")
+    raise InputError(f"got a {type(given).__name__}", where="Tracker", expected=f"a Localizer{hint}")

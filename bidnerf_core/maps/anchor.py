@@ -58,9 +58,9 @@ class Anchor:
         """
         self._T_ecef_world  # noqa: B018 (it checks the place and the matrix)
         if not 0 < self.metres_per_unit < math.inf:
-            raise InputError(f"metres_per_unit is {self.metres_per_unit}, expected a positive number")
+            raise InputError(f"metres_per_unit is {self.metres_per_unit}", expected="a positive number")
         if not (0 <= self.position_sigma < math.inf and 0 <= self.orientation_sigma < math.inf):
-            raise InputError("position_sigma and orientation_sigma: expected 0 or more")
+            raise InputError(where="position_sigma and orientation_sigma", expected="0 or more")
 
     def plain(self) -> dict[str, Any]:
         """Return the anchor as JSON values."""
@@ -72,7 +72,7 @@ class Anchor:
         """The map's frame, in metres, in the earth-centred frame."""
         rows = [list(row) for row in self.T_enu_world]
         if [len(row) for row in rows] != [4] * 4:
-            raise InputError("T_enu_world: expected 4 rows of 4 numbers")
+            raise InputError(where="T_enu_world", expected="4 rows of 4 numbers")
         T_enu_world = pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_enu_world")
         return Geodetic(self.latitude, self.longitude, self.height).T_ecef_enu @ T_enu_world
 
@@ -101,11 +101,8 @@ def load_anchor(folder: Path, newer: str | None = None) -> Anchor | None:
     path = folder / ANCHOR if newer is None or not (folder / newer).exists() else folder / newer
     if not path.exists():
         return None
-    try:
-        found = read_json(path, "the anchor of a map")
-        return None if found is None and path.name == newer else from_plain(Anchor, found, str(path))
-    except InputError as error:
-        raise InputError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
+    found = read_json(path, "the anchor of a map")
+    return None if found is None and path.name == newer else from_plain(Anchor, found, str(path))
 
 
 def save_anchor(folder: Path, anchor: Anchor) -> None:

@@ -55,7 +55,9 @@ def bake_surface(
     began = time.monotonic()
     cameras = cameras_of(info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     if not cameras:
-        raise InputError(f"{where}: holds no cameras to render from; give a dataset of its views with --data")
+        raise InputError(
+            "holds no cameras to render from; give a dataset of its views with --data", where=where
+        )
     measured = [view for view in views if view.frame.has_depth]
     if any(view.frame.has_dense_depth for view in measured):
         cameras = []

@@ -97,7 +97,7 @@ class MapCollection:
         two have the same name, and ``Cancelled`` once ``cancel`` returns True.
         """
         if asked < 1:
-            raise InputError(f"asked is {asked}, expected 1 or more")
+            raise InputError(f"asked is {asked}", expected="1 or more")
         self.method, self.config, self.asked = method, config, asked
         self._maps = _named([scenes] if isinstance(scenes, str | Path) else scenes)
         self._localizers: OrderedDict[str, Localizer] = OrderedDict()
@@ -125,7 +125,7 @@ class MapCollection:
         for an unknown name.
         """
         if name not in self._maps:
-            raise InputError(f"no map {name!r}, expected one of {', '.join(self._maps)}")
+            raise InputError(f"no map {name!r}", expected=f"one of {', '.join(self._maps)}")
         if name in self._given_localizers:
             return self._given_localizers[name]
         if name not in self._localizers:
@@ -228,16 +228,16 @@ def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str,
     for given in maps:
         scenes: list[Map | Path] = [given] if isinstance(given, Map) else [*maps_in(Path(given))]
         if not scenes:
-            raise InputError(f"{given}: no map in it, expected a map or a folder of maps")
+            raise InputError("no map in it", where=given, expected="a map or a folder of maps")
         for scene in scenes:
             name = (
                 scene.info.data or "map" if isinstance(scene, Map) and scene.folder is None else _name(scene)
             )
             if name in found:
-                raise InputError(f"two maps are named {name!r}, expected folders with different names")
+                raise InputError(f"two maps are named {name!r}", expected="folders with different names")
             found[name] = scene
     if not found:
-        raise InputError("no maps, expected at least one")
+        raise InputError("no maps", expected="at least one")
     return found
 
 

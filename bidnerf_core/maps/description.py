@@ -33,7 +33,7 @@ class FieldFrame:
 
     def __post_init__(self) -> None:
         if not 0 < self.scale < math.inf:
-            raise InputError(f"scale is {self.scale}, expected a positive number")
+            raise InputError(f"scale is {self.scale}", expected="a positive number")
 
 
 @dataclass(frozen=True)
@@ -94,20 +94,22 @@ def load_info(folder: Path) -> MapInfo:
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
-        raise InputError(f"{folder}: {what}, expected a map: a folder as written by 'bidnerf train'")
+        raise InputError(what, where=folder, expected="a map: a folder as written by 'bidnerf train'")
     if not path.exists():
-        raise InputError(f"{folder}: no {DESCRIPTION} found, expected a map as written by 'bidnerf train'")
+        raise InputError(
+            f"no {DESCRIPTION} found", where=folder, expected="a map as written by 'bidnerf train'"
+        )
     found = read_json(path, "the description of a map")
     if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
+        raise InputError("not the description of a map", where=path, expected=f'"format": "{FORMAT}"')
     if found.get("version") != VERSION:
         newer = isinstance(found.get("version"), int) and found["version"] > VERSION
         advice = "it was written by a newer bidnerf; upgrade bidnerf" if newer else "retrain the map"
-        raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
+        raise InputError(f"version {found.get('version')!r}", where=path, expected=f"{VERSION}; {advice}")
     info = from_plain(MapInfo, found, str(path))
     for name in (info.weights, info.training, info.surface, info.landmarks, info.capture, info.anchor):
         if name is not None and (not name or Path(name).name != name):
-            raise InputError(f"{path}: names {name!r}, expected the name of a file next to it")
+            raise InputError(f"names {name!r}", where=path, expected="the name of a file next to it")
     for name in with_wrong_pose(info.cameras):
-        raise InputError(f"{path}: pose of camera {name!r} is not a rigid transform, expected 4x4 rows")
+        raise InputError(f"pose of camera {name!r} is not a rigid transform", where=path, expected="4x4 rows")
     return info

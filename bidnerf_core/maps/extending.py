@@ -104,7 +104,7 @@ def extend(
     process is killed.
     """
     if steps is not None and (isinstance(steps, bool) or steps < 1):
-        raise InputError(f"steps is {steps!r}, expected a positive whole number")
+        raise InputError(f"steps is {steps!r}", expected="a positive whole number")
     folder = scene.folder if isinstance(scene, Map) else Path(scene)
     if folder is not None:
         load_info(folder)  # raises if there is no map
@@ -112,7 +112,7 @@ def extend(
         scene = scene if isinstance(scene, Map) else load_map(scene)
         where = scene.name
         if scene.info.interruption is not None:
-            raise InputError(f"{where}: cannot be extended: {scene.info.interruption}")
+            raise InputError(f"cannot be extended: {scene.info.interruption}", where=where)
         frames, unread = _frames(photos, scene, split)
         located = locate(scene, frames, where, progress, cancel, unread)
         if not located.views:
@@ -135,7 +135,7 @@ def locate(
     """
     if scene.landmarks is None:
         raise InputError(
-            f"{where}: has no landmarks for localizing photos; 'bidnerf bake MAP --data DATA' builds them"
+            "has no landmarks for localizing photos; 'bidnerf bake MAP --data DATA' builds them", where=where
         )
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
     near = SAME_PLACE * scene.bounds.side
@@ -165,8 +165,9 @@ def locate(
         log.info(f"{name}: left out: {why}")
     if len(views) + len(known) < max(1.0, LEAST_LOCATED * len(frames)):
         raise InputError(
-            f"{where}: localizes {len(views) + len(known)} of {amount(len(frames), 'photo')}, expected"
-            " photos of its scene"
+            f"localizes {len(views) + len(known)} of {amount(len(frames), 'photo')}",
+            where=where,
+            expected="photos of its scene",
         )
     log.info(
         f"{where}: {len(views)} of {amount(len(frames) + len(unread), 'photo')} localized, {len(known)}"
@@ -185,11 +186,11 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
         frames = [item.frame if isinstance(item, View) else item for item in source]
     for frame in frames:
         if not isinstance(frame, Frame):
-            raise InputError(f"photos holds a {type(frame).__name__}, expected frames, views, or a path")
+            raise InputError(f"photos holds a {type(frame).__name__}", expected="frames, views, or a path")
     if not frames and unread:
         raise InputError(f"none of {amount(len(unread), 'photo')} can be read: {unread[0][1]}")
     if not frames:
-        raise InputError("no photos to add, expected at least one")
+        raise InputError("no photos to add", expected="at least one")
     return [frame if side is None else frame.at_most(side) for frame in frames], unread
 
 
@@ -229,7 +230,7 @@ def _old_views(
         own = {camera.name for camera in scene.info.cameras}
         if not any(view.frame.name in own for view in views):
             raise InputError(
-                f"{where}: data has none of the images that the map was built from, expected these"
+                "data has none of the images that the map was built from", where=where, expected="these"
             )
         return views
     count, cameras = counter("rendering", "images", progress, cancel), cameras_of(scene.info)
@@ -297,7 +298,7 @@ def _extended(
     if scene.folder is None:
         return grown
     if load_info(scene.folder).weights != scene.info.weights:
-        raise InputError(f"{where}: was retrained meanwhile; extend it again")
+        raise InputError("was retrained meanwhile; extend it again", where=where)
     check_cancelled(cancel, "extending")
     state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
     here = grown.to("cpu")
@@ -343,7 +344,9 @@ def _trained_on(
     elif steps is not None:
         raise InputError(f"steps is {steps}, but backend {info.backend!r} has no such setting; leave it out")
     if not isinstance(trained := trained_field(scene.field), nn.Module):
-        raise InputError(f"the map's field is a {type(trained).__name__}, expected an nn.Module of a backend")
+        raise InputError(
+            f"the map's field is a {type(trained).__name__}", expected="an nn.Module of a backend"
+        )
     field = copy.deepcopy(trained).requires_grad_(True).train()
     scale = 1.0 if info.field_frame is None else info.field_frame.scale
     own = [_in_field_unit(view, 1 / scale) for view in views] if scale != 1 else list(views)

@@ -129,14 +129,14 @@ def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:
 
 def _check_features(landmarks: LandmarkMap, folder: Path) -> None:
     if not landmarks.features:
-        raise InputError(f"{folder}: the landmarks' detector has no name; expected a registered one")
+        raise InputError("the landmarks' detector has no name;", where=folder, expected="a registered one")
 
 
 def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: Any) -> MapInfo:
     """Add a file to a map under the name of a part of its description."""
     info = load_info(folder)
     if info.weights != of.weights:
-        raise InputError(f"{folder}: was retrained while its {part} was built; bake it again")
+        raise InputError(f"was retrained while its {part} was built; bake it again", where=folder)
     name = _file_name(part, of.step)
     info = replace(info, **(facts | {part: name}))
     description = _json(info)
@@ -165,7 +165,9 @@ def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
     """Return the state from which the interrupted training of ``field`` can be resumed."""
     if info.training is None:
-        raise InputError(f"{folder}: training is complete ({amount(info.step, 'step')}), nothing to resume")
+        raise InputError(
+            f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder
+        )
     path = folder / info.weights
     weights = checked_weights(trained_field(field), read_tensors(path, EXPECTED_PART), path)
     return TrainingState(info.step, weights, read_tensors(folder / info.training, EXPECTED_PART))

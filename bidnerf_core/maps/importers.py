@@ -90,7 +90,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     Raises ``InputError`` if there is no such file, and if none or several recognize it.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder, expected a trained field")
+        raise InputError("no such file or folder", where=path, expected="a trained field")
     if name is not None:
         return name, IMPORTERS.load(name)
     found = [(each, IMPORTERS.load(each)) for each in IMPORTERS]
@@ -99,7 +99,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
         return able[0]
     if able:
         names = enumeration([each for each, _ in able])
-        raise InputError(f"{path}: {names} can each read it; choose one of them (--as)")
+        raise InputError(f"{names} can each read it; choose one of them (--as)", where=path)
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
     raise InputError(
         f"{path}: no installed importer recognizes it"

@@ -78,7 +78,7 @@ def import_map(
     """
     path = Path(path)
     if not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"scale is {scale}, expected a number above 0")
+        raise InputError(f"scale is {scale}", expected="a number above 0")
     find_features(features)
     name, chosen = importer_of(path, importer)
     settings = config

@@ -167,13 +167,13 @@ class Map:
         """
         if not isinstance(view, View):
             raise InputError(
-                f"{self.name}: view is a {type(view).__name__}, expected a View(frame, T_world_camera)"
+                f"view is a {type(view).__name__}", where=self.name, expected="a View(frame, T_world_camera)"
             )
         field = self.field
         if level is not None:
             offered = levels(field)
             if not 0 <= level < len(offered):
-                raise InputError(f"{self.name}: no level {level}, expected 0 to {len(offered) - 1}")
+                raise InputError(f"no level {level}", where=self.name, expected=f"0 to {len(offered) - 1}")
             field = offered[level]
         return render_image(field, view.frame.intrinsics, view.T_ref_camera, self.bounds, motion=view.motion)
 
@@ -201,14 +201,15 @@ class Map:
         """
         if rendered_landmarks and data is not None:
             raise InputError(
-                "rendered_landmarks uses no photos, but data gives some; expected only one of them"
+                "rendered_landmarks uses no photos, but data gives some;", expected="only one of them"
             )
         if features is not None and features != self.info.landmark_features:
             find_features(features)
             if data is None and not rendered_landmarks and self.info.landmark_source == "photos":
                 raise InputError(
-                    f"{self.name}: its landmarks are from photos and detector {self.info.landmark_features!r};"
-                    f" for {features!r}, give the photos again (--data) or use --rendered-landmarks"
+                    f"its landmarks are from photos and detector {self.info.landmark_features!r}; for"
+                    f" {features!r}, give the photos again (--data) or use --rendered-landmarks",
+                    where=self.name,
                 )
             return replace(self, info=replace(self.info, landmark_features=features)).bake(
                 data, split, config, rendered_landmarks=rendered_landmarks, largest=largest, progress=progress,
@@ -295,7 +296,9 @@ class Map:
         field = trained_field(self.field)
         if not isinstance(field, nn.Module):
             found = type(field).__name__
-            raise InputError(f"{folder}: the map's field is a {found}, expected an nn.Module of a backend")
+            raise InputError(
+                f"the map's field is a {found}", where=folder, expected="an nn.Module of a backend"
+            )
         state = TrainingState(self.info.step, field.state_dict(), {})
         if not self.info.complete and self.folder is not None:
             state = load_state(self.folder, self.info, self.field)
@@ -356,11 +359,13 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
     try:
         field = backend.build(config, info.bounds if info.field_frame is None else info.field_frame.bounds)
     except ValueError as error:
-        raise InputError(f"{where}: backend {info.backend!r} rejects its config: {error}") from error
+        raise InputError(f"backend {info.backend!r} rejects its config: {error}", where=where) from error
     if not (isinstance(field, nn.Module) and isinstance(field, RadianceField)):
         found = type(field).__name__
         raise InputError(
-            f"{where}: backend {info.backend!r} built a {found}, expected an nn.Module with query and sampler"
+            f"backend {info.backend!r} built a {found}",
+            where=where,
+            expected="an nn.Module with query and sampler",
         )
     return field, config
 

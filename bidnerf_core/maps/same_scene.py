@@ -35,7 +35,8 @@ def check_alike(info: MapInfo, field: RadianceField, views: Sequence[View], wher
     off, usual = colour_noise(field, info.bounds, views), info.colour_noise
     if off > (UNLIKE_ANY if usual is None else max(UNLIKE, UNLIKE_ITS_OWN * usual)):
         raise InputError(
-            f"{where}: built from {info.data or 'other views'!r}, and its renderings differ from the photos"
-            f" by {off:.0%} of the range of colours; expected photos of the same scene, with poses in the"
-            " coordinates of the map"
+            f"built from {info.data or 'other views'!r}, and its renderings differ from the photos by"
+            f" {off:.0%} of the range of colours;",
+            where=where,
+            expected="photos of the same scene, with poses in the coordinates of the map",
         )

@@ -72,10 +72,10 @@ def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
     training is not complete.
     """
     if isinstance(factor, bool) or not (isinstance(factor, int | float) and 0 < factor < math.inf):
-        raise InputError(f"factor is {factor!r}, expected a positive number")
+        raise InputError(f"factor is {factor!r}", expected="a positive number")
     where = scene.name
     if scene.info.interruption is not None:
-        raise InputError(f"{where}: cannot be scaled: {scene.info.interruption}")
+        raise InputError(f"cannot be scaled: {scene.info.interruption}", where=where)
     if scene.unit == unit == "metres" and factor != 1:
         log.info("%s: was in metres before; its lengths are multiplied by %.6g all the same", where, factor)
     whole = scene.whole()
@@ -159,10 +159,10 @@ def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -
     positive.
     """
     if not 0 < metres < math.inf:
-        raise InputError(f"distance is {metres} m, expected a positive length")
+        raise InputError(f"distance is {metres} m", expected="a positive length")
     apart = float(torch.linalg.vector_norm(place_of(scene, first) - place_of(scene, second)))
     if not apart > 0:
-        raise InputError(f"{first} and {second} are the same place, expected two different places")
+        raise InputError(f"{first} and {second} are the same place", expected="two different places")
     return metres / apart
 
 
@@ -175,13 +175,13 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     """
     found = {name: camera for name in known if (camera := _camera_of(scene, name)) is not None}
     if len({camera.name for camera in found.values()}) < len(found):
-        raise InputError("two known poses belong to the same camera of the map, expected one for each")
+        raise InputError("two known poses belong to the same camera of the map", expected="one for each")
     if len(found) < LEAST_CAMERAS:
         cameras = scene.info.cameras
         example = f" such as {cameras[0].name!r}" if cameras else ""
         raise InputError(
-            f"{len(found)} of {len(known)} known poses belong to cameras of the map, expected at least"
-            f" {LEAST_CAMERAS}, matched by name{example}"
+            f"{len(found)} of {len(known)} known poses belong to cameras of the map",
+            expected=f"at least {LEAST_CAMERAS}, matched by name{example}",
         )
     source = torch.stack([camera.pose.translation for camera in found.values()])
     target = torch.stack([_position(known[name]) for name in found])
@@ -189,8 +189,9 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     off = float((fit.apply(source) - target).square().sum(-1).mean().sqrt())
     if off > WORST_FIT * spread(target):
         raise InputError(
-            f"the cameras are {off:.3g} m (root mean square) from their known positions after the best scaling, expected known"
-            " positions of the same capture"
+            f"the cameras are {off:.3g} m (root mean square) from their known positions after the best"
+            " scaling",
+            expected="known positions of the same capture",
         )
     return ScaleFit(fit.scale, len(found), off)
 
@@ -215,7 +216,7 @@ def _position(place: SE3 | Position) -> Float[Tensor, "3"]:
     given = place.translation if isinstance(place, SE3) else place
     point = torch.as_tensor(given, dtype=torch.float64).cpu()
     if point.shape != (3,) or not bool(point.isfinite().all()):
-        raise InputError(f"place is {place!r}, expected three coordinates")
+        raise InputError(f"place is {place!r}", expected="three coordinates")
     return point
 
 
@@ -256,7 +257,7 @@ def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tens
     shown = render(scene.field, rays, scene.bounds.background)
     if float(shown.opacity[0]) < 0.5:
         raise InputError(
-            f"{camera.name}@{u:g},{v:g} shows the background, expected a pixel that shows the scene"
+            f"{camera.name}@{u:g},{v:g} shows the background", expected="a pixel that shows the scene"
         )
     return origin[0] + float(shown.distance[0] / shown.opacity[0]) * direction[0]
 

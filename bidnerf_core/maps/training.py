@@ -113,7 +113,7 @@ def train(
     settings = _settings(chosen, backend, config)
     if refine_poses not in get_args(RefinementChoice):
         choices = ", ".join(get_args(RefinementChoice))
-        raise InputError(f"refine_poses is {refine_poses!r}, expected one of {choices}")
+        raise InputError(f"refine_poses is {refine_poses!r}", expected=f"one of {choices}")
     work = _work(out, bake, device, checkpoint_seconds, progress, cancel)
     with (
         contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite),
@@ -204,7 +204,7 @@ def interrupted(folder: Path, baking: bool = True) -> MapInfo:
     if info.complete and not (baking and info.surface is None):
         baked = " and baked" if info.surface is not None else ""
         raise InputError(
-            f"{folder}: training is complete ({amount(info.step, 'step')}){baked}, nothing to resume"
+            f"training is complete ({amount(info.step, 'step')}){baked}, nothing to resume", where=folder
         )
     return info
 
@@ -215,7 +215,7 @@ def _settings(chosen: Backend, name: str, config: Any) -> Any:
         return from_plain(kind, config or {}, f"settings of backend {name!r}")
     if not isinstance(config, kind):
         found = type(config).__name__
-        raise InputError(f"config is a {found}, expected a {kind.__name__} or a dict of its settings")
+        raise InputError(f"config is a {found}", expected=f"a {kind.__name__} or a dict of its settings")
     return config
 
 
@@ -224,12 +224,12 @@ def _work(
     progress: ProgressCallback | None, cancel: Cancel | None,
 ) -> _Work:  # fmt: skip
     if not seconds >= 0:
-        raise InputError(f"checkpoint_seconds is {seconds}, expected 0 or more")
+        raise InputError(f"checkpoint_seconds is {seconds}", expected="0 or more")
     if not isinstance(bake, bool | BakeConfig):
-        raise InputError(f"bake is {bake!r}, expected True, False or a BakeConfig")
+        raise InputError(f"bake is {bake!r}", expected="True, False or a BakeConfig")
     if progress is not None and not callable(progress):
         raise InputError(
-            f"progress is a {type(progress).__name__}, expected a function that takes a Progress"
+            f"progress is a {type(progress).__name__}", expected="a function that takes a Progress"
         )
     config = bake if isinstance(bake, BakeConfig) else USUAL_BAKE if bake else None
     place = None if out is None else Path(out)
@@ -240,23 +240,26 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
     """Raise ``InputError`` for views (or their depth or background) that differ from those the training began with."""
     if read.source and read.background != info.bounds.background:
         raise OtherSettings(
-            f"{out}: was started with background {info.bounds.background}, got {read.background}"
+            f"was started with background {info.bounds.background}, got {read.background}", where=out
         )
     if stored_cameras(read.views) != as_given(info.cameras):
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
-            f"{read.place}: {part} frames or poses that differ from those {out} was started with, expected"
-            f" those of {info.data!r} unchanged"
+            f"{part} frames or poses that differ from those {out} was started with",
+            where=read.place,
+            expected=f"those of {info.data!r} unchanged",
         )
     if read.hidden != info.hidden:
         raise OtherSettings(
-            f"{out}: was started with {info.hidden} pixels hidden by masks, got {read.hidden}; resuming"
-            " keeps the masks (--masks)"
+            f"was started with {info.hidden} pixels hidden by masks, got {read.hidden}; resuming keeps the"
+            " masks (--masks)",
+            where=out,
         )
     if read.sparse_depth != info.sparse_depth:
         raise OtherSettings(
-            f"{out}: was started with the depth of {info.sparse_depth} pixels from points, got"
-            f" {read.sparse_depth}; resuming keeps the points (--depth-points) and their selection"
+            f"was started with the depth of {info.sparse_depth} pixels from points, got {read.sparse_depth};"
+            " resuming keeps the points (--depth-points) and their selection",
+            where=out,
         )
 
 

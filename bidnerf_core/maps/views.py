@@ -92,17 +92,21 @@ def read_views(
         )
     if isinstance(data, Dataset):
         if background is not None and background_colour(background) != data.background:
-            raise InputError(f"{data.path}: was opened with background {data.background}, got {background!r}")
+            raise InputError(
+                f"was opened with background {data.background}, got {background!r}", where=data.path
+            )
         if isinstance(data, Georeferenced):
             stated, up = data.unit, data.up
         step, data = getattr(data, "depth_unit", None), with_all(data, split)
         if not data.frame_names(split):
-            raise InputError(f"{data.path}: split {split!r} has no frames")
+            raise InputError(f"split {split!r} has no frames", where=data.path)
         views = _read(data, split, largest, folder, counter("reading", "images", progress, cancel))
         if left_out := len(data.frame_names(split)) - len(views):
             log.info(f"{data.path}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
         if not views:
-            raise InputError(f"{data.path}: masks hide every image in split {split!r} entirely; {INVERTED}")
+            raise InputError(
+                f"masks hide every image in split {split!r} entirely; {INVERTED}", where=data.path
+            )
         source, place, colour = data.path.resolve().name, str(data.path), data.background
     else:
         views, source, place = _checked(data), "", "views in memory"
@@ -194,10 +198,10 @@ def _checked(views: Sequence[View]) -> list[View]:
     for view in found:
         if not isinstance(view, View):
             raise InputError(
-                f"data is or holds a {type(view).__name__}, expected a dataset, a path, or views with poses"
+                f"data is or holds a {type(view).__name__}", expected="a dataset, a path, or views with poses"
             )
     if not found:
-        raise InputError("data holds no views, expected at least one")
+        raise InputError("data holds no views", expected="at least one")
     return found
 
 
@@ -210,8 +214,9 @@ def _with_depth(views: list[View], model: Path, choice: SparseChoice, split: str
     count = sum(int((view.frame.depth > 0).sum()) for view in new if view.frame.depth is not None)
     if count == 0:
         raise InputError(
-            f"{model}: gives no depth to split {split!r}, expected points that its images observe"
-            " and images without depth"
+            f"gives no depth to split {split!r}",
+            where=model,
+            expected="points that its images observe and images without depth",
         )
     log.info(f"{sparse.summary}; depth at {count} pixels of {len(new)} of {len(views)} images")
     return changed, count

@@ -27,22 +27,26 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
     expected = module.state_dict()
     for name, value in expected.items():
         if name not in tensors:
-            raise InputError(f"{path}: no tensor {name!r}, expected one of shape {list(value.shape)}")
+            raise InputError(f"no tensor {name!r}", where=path, expected=f"one of shape {list(value.shape)}")
         if tensors[name].shape != value.shape:
             found, wanted = list(tensors[name].shape), list(value.shape)
-            raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
+            raise InputError(f"tensor {name!r} has shape {found}", where=path, expected=wanted)
         if tensors[name].is_floating_point() != value.is_floating_point():
             kinds = (str(kind).removeprefix("torch.") for kind in (tensors[name].dtype, value.dtype))
-            raise InputError(f"{path}: tensor {name!r} has dtype {next(kinds)}, expected {next(kinds)}")
+            raise InputError(f"tensor {name!r} has dtype {next(kinds)}", where=path, expected=next(kinds))
     surplus = sorted(tensors.keys() - expected.keys())
     if surplus:
-        raise InputError(f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes")
+        raise InputError(
+            f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path
+        )
     for name, _ in module.named_parameters():
         if name in tensors and not bool((tensors[name].abs() <= LARGEST_WEIGHT).all()):
             raise InputError(
-                f"{path}: tensor {name!r} holds NaN, infinity or numbers above {LARGEST_WEIGHT:g}, expected trained weights"
+                f"tensor {name!r} holds NaN, infinity or numbers above {LARGEST_WEIGHT:g}",
+                where=path,
+                expected="trained weights",
             )
     for name, _ in module.named_buffers():
         if name in tensors and bool(tensors[name].isnan().any()):
-            raise InputError(f"{path}: tensor {name!r} holds NaN, expected numbers")
+            raise InputError(f"tensor {name!r} holds NaN", where=path, expected="numbers")
     return tensors

@@ -260,7 +260,7 @@ def localize_each(
         found = localizer(query.views, None if start is None else start(query), query.depth_rays, seed)
         if not bool(found.T_world_camera.matrix().isfinite().all()):
             raise InputError(
-                f"{query.name}: {found.method} diverged to a pose that is not finite; is the map valid?"
+                f"{found.method} diverged to a pose that is not finite; is the map valid?", where=query.name
             )
         frame = replace(query.frame, name=query.name)
         return Answer.of(frame, number, found, truth=query.truth, file=query.file)

@@ -59,7 +59,7 @@ def draw_capture(
             out.parent.mkdir(parents=True, exist_ok=True)
             write_figure(figure, out, dpi=150)
         except OSError as error:
-            raise InputError(f"{out}: cannot be written ({error.strerror})") from error
+            raise InputError(f"cannot be written ({error.strerror})", where=out) from error
 
 
 def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:

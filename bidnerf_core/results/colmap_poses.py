@@ -78,5 +78,7 @@ def _check_beside(path: Path) -> None:
     beside = path.with_name("cameras.txt")
     if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
         raise InputError(
-            f"{beside}: would be replaced, since a COLMAP model has one; expected {path.name} in a folder without another model"
+            "would be replaced, since a COLMAP model has one;",
+            where=beside,
+            expected=f"{path.name} in a folder without another model",
         )

@@ -135,7 +135,7 @@ def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
     if trace.translation.dim() != 1 or len(trace.translation) == 0:
         shape = tuple(trace.translation.shape)
         raise InputError(
-            f"steps to success: expected errors of the start and of each step, got shape {shape}"
+            f"expected errors of the start and of each step, got shape {shape}", where="steps to success"
         )
     failures = (~criterion(trace, trace[0])).nonzero()
     first = int(failures[-1]) + 1 if len(failures) else 0
@@ -165,7 +165,9 @@ class Rate:
 def success_rate(successes: int, trials: int, confidence: float = 0.95) -> Rate:
     """Return the success rate of independent trials with Wilson's interval (Wilson 1927)."""
     if not (trials >= 1 and 0 <= successes <= trials):
-        raise InputError(f"success rate: {successes} of {trials}, expected 0 to n of at least one trial")
+        raise InputError(
+            f"{successes} of {trials}", where="success rate", expected="0 to n of at least one trial"
+        )
     low, high = wilson_interval(successes / trials, trials, confidence)
     return Rate(successes, trials, low, high)
 

@@ -58,7 +58,7 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     export, and for a folder that is not empty unless ``overwrite`` is set.
     """
     if to not in EXPORTERS:
-        raise UsageError(f"format {to!r}, expected one of {', '.join(EXPORTERS)}")
+        raise UsageError(f"format {to!r}", expected=f"one of {', '.join(EXPORTERS)}")
     write, scene, out = EXPORTERS[to], scene.whole(), Path(out)
     surface = None if scene.surface is None else scene.surface.to("cpu")
     landmarks = None if scene.landmarks is None else scene.landmarks.to("cpu")
@@ -70,7 +70,7 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
     """The surface, the landmarks and the cameras as point clouds and meshes."""
     images = _images(scene)
     if not images and scene.surface is None and scene.landmarks is None:
-        raise InputError(f"{scene.name}: has no surface, landmarks or cameras to export")
+        raise InputError("has no surface, landmarks or cameras to export", where=scene.name)
     files = []
     if scene.surface is not None:
         parts = scene.surface.surfels
@@ -117,7 +117,7 @@ def _images(scene: Map) -> list[PosedImage]:
 def _needed_images(scene: Map, to: str) -> list[PosedImage]:
     images = _images(scene)
     if not images:
-        raise InputError(f"{scene.name}: has no cameras, but {to} needs some; ply does not")
+        raise InputError(f"has no cameras, but {to} needs some; ply does not", where=scene.name)
     return images
 
 

@@ -48,7 +48,7 @@ def overlay(
     scene = checked_map(scene, "overlay")
     if not isinstance(frame, Frame):
         raise InputError(
-            f"overlay: frame is a {type(frame).__name__}, expected a Frame, such as that of a View"
+            f"frame is a {type(frame).__name__}", where="overlay", expected="a Frame, such as that of a View"
         )
     if isinstance(found, Localization):
         frame, found = found.frame_as_taken(frame), found.T_world_camera
@@ -124,7 +124,7 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
     if array.ndim == 2:
         array = np.repeat(array[..., None], 3, axis=-1)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
-        raise InputError(f"{what}: expected an image (height, width, 3), got shape {array.shape}")
+        raise InputError(f"expected an image (height, width, 3), got shape {array.shape}", where=what)
     if array.dtype == np.uint8:
         return array
     finite = np.nan_to_num(array.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
@@ -142,7 +142,7 @@ def depth_to_rgb(
     """
     array = as_array(depth).astype(np.float64)
     if array.ndim != 2 or array.size == 0:
-        raise InputError(f"depth: expected an image (height, width), got shape {array.shape}")
+        raise InputError(f"expected an image (height, width), got shape {array.shape}", where="depth")
     measured = np.isfinite(array) & (array > 0)
     if not measured.any():
         return np.full((*array.shape, 3), NO_DEPTH, dtype=np.uint8)
@@ -208,16 +208,16 @@ def require_same_size(images: Sequence[np.ndarray], names: Sequence[str]) -> Non
     for image, name in zip(images, names, strict=True):
         if image.shape != images[0].shape:
             found, expected = (f"{x.shape[1]}x{x.shape[0]}" for x in (image, images[0]))
-            raise InputError(f"{name} is {found} pixels, but {names[0]} is {expected}: expected the same")
+            raise InputError(f"{name} is {found} pixels, but {names[0]} is {expected}:", expected="the same")
 
 
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
     """Write a looping animation of images (h w 3) of the same size."""
     if not (math.isfinite(fps) and fps > 0):
-        raise InputError(f"{path}: {fps} frames a second, expected a positive number")
+        raise InputError(f"{fps} frames a second", where=path, expected="a positive number")
     pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
     if not pictures:
-        raise InputError(f"{path}: the animation has no frames")
+        raise InputError("the animation has no frames", where=path)
     require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     import imageio.v3 as iio  # imported here, since few commands draw

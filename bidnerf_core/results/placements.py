@@ -83,7 +83,9 @@ def place_each(
     def place(query: Query, number: int) -> PlacedAnswer:
         if len(query.views) != 1 or query.depth_rays is not None:
             raise InputError(
-                f"{query.name}: is a rig or has points from a sensor, expected single images for several maps"
+                "is a rig or has points from a sensor",
+                where=query.name,
+                expected="single images for several maps",
             )
         placement = maps(query.views[0].frame, seed)
         backend = getattr(getattr(maps.localizer(placement.map).scene, "info", None), "backend", "")

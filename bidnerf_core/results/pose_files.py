@@ -79,7 +79,7 @@ def require_finite(images: Sequence[PosedImage]) -> None:
     for image in images:
         if not bool(image.T_world_camera.matrix().isfinite().all()):
             raise InputError(
-                f"the pose of {image.name} is not finite, expected to leave it out, or a .json file"
+                f"the pose of {image.name} is not finite", expected="to leave it out, or a .json file"
             )
 
 
@@ -156,7 +156,7 @@ def as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, 
     axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if orientation.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
     turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
     if float(torch.linalg.det(turn)) < 0:
-        raise InputError(f"{image.file}: is stored mirrored, which transforms.json cannot describe")
+        raise InputError("is stored mirrored, which transforms.json cannot describe", where=image.file)
     inverse = Orientation(orientation.mirrors_columns, orientation.mirrors_rows)
     if orientation.transposes:
         inverse = Orientation(orientation.mirrors_rows, orientation.mirrors_columns, True)
@@ -199,7 +199,7 @@ def pose_format(path: Path) -> str:
     """
     found = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
     if found is None:
-        raise UsageError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")
+        raise UsageError(where=path, expected=f"a name that ends with {', '.join(POSE_WRITERS)}")
     return found
 
 
@@ -217,7 +217,9 @@ def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
     if strange:
         found = type(strange[0]).__name__
         raise InputError(
-            f"{path}: got a {found}, expected a list of PosedImage(name, number, intrinsics, T_world_camera)"
+            f"got a {found}",
+            where=path,
+            expected="a list of PosedImage(name, number, intrinsics, T_world_camera)",
         )
     POSE_WRITERS[pose_format(path)](path, images)
 
@@ -230,7 +232,7 @@ def read_pose(path: str | Path) -> SE3:
     """
     found = read_poses(path)
     if len(found) != 1:
-        raise InputError(f"{path}: holds {len(found)} poses, expected one")
+        raise InputError(f"holds {len(found)} poses", where=path, expected="one")
     return next(iter(found.values()))
 
 
@@ -252,13 +254,13 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
             continue
         if not isinstance(name, str) or (not name and len(entries) > 1):
             raise InputError(
-                f'{path}: holds {len(entries)} poses, expected one, or a name under "frame" for each'
+                f"holds {len(entries)} poses", where=path, expected='one, or a name under "frame" for each'
             )
         if name in found:
-            raise InputError(f"{path}: holds two poses of frame {name!r}, expected one")
+            raise InputError(f"holds two poses of frame {name!r}", where=path, expected="one")
         found[name] = _pose(str(path), rows, EXPECTED_POSE)
     if not found:
-        raise InputError(f"{path}: holds no pose, expected {EXPECTED_POSE}")
+        raise InputError("holds no pose", where=path, expected=EXPECTED_POSE)
     return found
 
 
@@ -266,7 +268,7 @@ def _pose(where: str, rows: Any, expected: str) -> SE3:
     try:
         matrix = torch.tensor(rows, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{where}: contains no matrix of numbers, expected {expected}") from error
+        raise InputError("contains no matrix of numbers", where=where, expected=expected) from error
     return pose_from_matrix(matrix, f"{where}: T_world_camera")
 
 
@@ -284,9 +286,7 @@ def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
         try:
             return {name: pose.translation for name, pose in read_poses(path).items()}
         except InputError as error:
-            raise InputError(
-                f"{str(error).partition(', expected')[0]}, expected {EXPECTED_POSITIONS}"
-            ) from error
+            raise InputError(error, expected=EXPECTED_POSITIONS) from error
     return {name: _position(f"{path}: {name!r}", value) for name, value in found.items()}
 
 
@@ -295,7 +295,7 @@ def _position(where: str, value: Any) -> Float[Tensor, "3"]:
     if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
         return _pose(where, value, EXPECTED_POSITIONS).translation
     if not isinstance(value, list) or len(value) != 3 or any(type(x) not in (int, float) for x in value):
-        raise InputError(f"{where} has no three coordinates, expected {EXPECTED_POSITIONS}")
+        raise InputError(f"{where} has no three coordinates", expected=EXPECTED_POSITIONS)
     return torch.tensor(value, dtype=torch.float64)
 
 
@@ -307,7 +307,9 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
     if len(poses) == 1:
         return next(iter(poses.values()))
     if name not in poses:
-        raise InputError(f"{path}: no pose named {name!r} among its {len(poses)}{spelling_hint(name, poses)}")
+        raise InputError(
+            f"no pose named {name!r} among its {len(poses)}{spelling_hint(name, poses)}", where=path
+        )
     return poses[name]
 
 

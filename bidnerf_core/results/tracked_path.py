@@ -71,7 +71,7 @@ def track(
     ``InputError`` if none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.
     """
     if every < 1:
-        raise InputError(f"every is {every}, expected 1 or more")
+        raise InputError(f"every is {every}", expected="1 or more")
     localizer = scene if isinstance(scene, Localizer) else Localizer(scene)
     if not isinstance(sequence, FrameSequence):
         sequence = opened_for(localizer.scene, sequence)
@@ -207,7 +207,7 @@ class TrackedPath(Answers):
         """
         drawn = [a for a in self.answers if bool(a.found.T_world_camera.matrix().isfinite().all())]
         if not drawn:
-            raise InputError(f"{file}: not drawn, since no frame was tracked")
+            raise InputError("not drawn, since no frame was tracked", where=file)
         path = PlottedPath(
             SE3.stack([answer.found.T_world_camera for answer in drawn]),
             torch.tensor([answer.accepted for answer in drawn]),

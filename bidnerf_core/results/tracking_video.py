@@ -36,11 +36,11 @@ def check_video(file: Path) -> None:
         import av  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"{file}: writing a video needs the extra 'video' (pip install 'bidnerf[video]')"
+            "writing a video needs the extra 'video' (pip install 'bidnerf[video]')", where=file
         ) from error
     if file.suffix.lower() not in WRITTEN_SUFFIXES or not file.parent.is_dir():
         endings = ", ".join(WRITTEN_SUFFIXES)
-        raise InputError(f"{file}: expected a name that ends with {endings}, in an existing folder")
+        raise InputError(where=file, expected=f"a name that ends with {endings}, in an existing folder")
 
 
 class TrackingVideo:

@@ -36,7 +36,7 @@ class ErrorSummary:
     def of(errors: PoseError) -> ErrorSummary:
         """Return the summary of a batch of errors. Raises ``InputError`` for an empty one."""
         if not errors.translation.numel():
-            raise InputError("no errors to summarize, expected those of at least one pose")
+            raise InputError("no errors to summarize", expected="those of at least one pose")
         return ErrorSummary(*_three(errors.translation), *_three(errors.rotation_deg))
 
 

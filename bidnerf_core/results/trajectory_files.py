@@ -55,5 +55,7 @@ def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
 def _matrix(image: PosedImage) -> torch.Tensor:
     matrix = image.T_world_camera.matrix().detach().to("cpu", torch.float64)
     if not bool(matrix.isfinite().all()):
-        raise InputError(f"the pose of {image.name} is not finite, expected to leave it out, or a .json file")
+        raise InputError(
+            f"the pose of {image.name} is not finite", expected="to leave it out, or a .json file"
+        )
     return matrix

@@ -65,7 +65,7 @@ class ClosedFormScene:
     ) -> Frame:
         """Render an image from a pose: colour and coverage are averaged over each pixel, depth is exact at its centre."""
         if supersample < 1:
-            raise InputError(f"supersample is {supersample}, expected at least 1")
+            raise InputError(f"supersample is {supersample}", expected="at least 1")
         steps = (torch.arange(supersample) + 0.5) / supersample - 0.5
         offsets = torch.cartesian_prod(steps, steps).reshape(-1, 1, 1, 2)
         rays, _ = _world_rays(intrinsics, T_world_camera, intrinsics.pixel_centres() + offsets)

@@ -68,7 +68,7 @@ class ClosedFormData:
 
     def _poses(self, split: str) -> tuple[SE3, ...]:
         if split not in self.splits:
-            raise InputError(f"{self.path}: no split {split!r}, expected {' or '.join(self.splits)}")
+            raise InputError(f"no split {split!r}", where=self.path, expected=" or ".join(self.splits))
         return self.poses if split == "test" else self.training
 
     def views(
@@ -92,7 +92,9 @@ class ClosedFormData:
         if found is None or int(found["place"]) >= len(poses):
             last = len(poses) - 1
             raise InputError(
-                f"{self.path}: no frame {name!r}, expected 0000 to {last:04d} or a name such as 0000@15"
+                f"no frame {name!r}",
+                where=self.path,
+                expected=f"0000 to {last:04d} or a name such as 0000@15",
             )
         pose, up = poses[int(found["place"])], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         return turned_about(
@@ -121,9 +123,9 @@ def _found(name: str, known: dict[str, Callable[[], Scene]], what: str) -> Calla
         return known[own]
     listed = " or ".join(PREFIX + one for one in known)
     if own in DATA:
-        raise InputError(f"{name}: has no map; train one with 'bidnerf demo', or use {listed}")
+        raise InputError(f"has no map; train one with 'bidnerf demo', or use {listed}", where=name)
     near = difflib.get_close_matches(own, known, n=1)
-    raise InputError(f"no closed-form {what} {name!r}, expected {PREFIX + near[0] if near else listed}")
+    raise InputError(f"no closed-form {what} {name!r}", expected=PREFIX + near[0] if near else listed)
 
 
 def _object() -> ClosedFormData:

@@ -173,4 +173,4 @@ def _tilted(directions: Tensor) -> Tensor:
 
 def _require_positive(what: str, *values: float) -> None:
     if not all(value > 0 and value < float("inf") for value in values):
-        raise InputError(f"{what}: expected positive numbers of metres, got {values}")
+        raise InputError(f"expected positive numbers of metres, got {values}", where=what)

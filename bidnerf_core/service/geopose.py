@@ -135,16 +135,16 @@ def _reading(request: Record) -> _Reading:
     """Return the single image of a request."""
     records = _records(_object(request, "sensorReadings"), "cameraReadings")
     if len(records) != 1:
-        raise InputError(f"request: {len(records)} cameraReadings, expected one")
+        raise InputError(f"{len(records)} cameraReadings", where="request", expected="one")
     (record,) = records
     orientation = _object(record, "imageOrientation")
     if orientation.value("mirrored") or orientation.number("rotation"):
         raise record.error(
-            "imageOrientation does not match the image, expected an upright image that is not mirrored"
+            "imageOrientation does not match the image", expected="an upright image that is not mirrored"
         )
     text = record.text("imageBytes")
     if not text:
-        raise record.error("no imageBytes, expected a base64 image")
+        raise record.error("no imageBytes", expected="a base64 image")
     try:
         content = base64.b64decode(
             text.partition("base64,")[2] if text.startswith("data:") else text, validate=True
@@ -159,7 +159,7 @@ def _object(record: Record, key: str) -> Record:
     """Return an object inside another one; an empty one if it is missing."""
     found = record.value(key)
     if found is not None and not isinstance(found, dict):
-        raise record.error(f"{key} is a {type(found).__name__}, expected an object")
+        raise record.error(f"{key} is a {type(found).__name__}", expected="an object")
     return Record(f"{record.where}: {key}", found or {})
 
 
@@ -180,7 +180,7 @@ def _size(record: Record) -> tuple[int, int] | None:
         return None
     size = _numbers(record, "size")
     if len(size) != 2 or not all(1 <= value <= 1e6 and value == int(value) for value in size):
-        raise record.error("size: expected width and height")
+        raise record.error("size:", expected="width and height")
     return int(size[0]), int(size[1])
 
 
@@ -188,7 +188,7 @@ def _encoded(record: Record, content: bytes, size: tuple[int, int] | None) -> by
     """Return an image file: ``content`` itself, or raw pixels as PNG."""
     kind = (record.text("imageFormat") or "").upper()
     if kind == "DEPTH":
-        raise record.error("imageFormat is DEPTH, expected a colour image; /localize accepts depth as well")
+        raise record.error("imageFormat is DEPTH", expected="a colour image; /localize accepts depth as well")
     if kind not in RAW_CHANNELS:
         return content
     channels = RAW_CHANNELS[kind]
@@ -196,7 +196,7 @@ def _encoded(record: Record, content: bytes, size: tuple[int, int] | None) -> by
         if content[:2] == b"\xff\xd8" or content[:4] == b"\x89PNG":
             return content  # the pixel format within a file
         raise record.error(
-            f"{len(content)} bytes of {kind}, expected size and width x height x {channels} bytes"
+            f"{len(content)} bytes of {kind}", expected=f"size and width x height x {channels} bytes"
         )
     pixels = np.frombuffer(content, np.uint8).reshape(size[1], size[0], channels)
     return png_bytes(pixels[..., :3] if channels > 1 else pixels[..., 0])
@@ -209,10 +209,10 @@ def _camera(reading: _Reading) -> dict[str, bytes]:
     if model == "UNKNOWN_CAMERA" or not numbers:
         return {}
     if model not in MODELS:
-        raise params.error(f"model is {model!r}, expected one of {', '.join(MODELS)}")
+        raise params.error(f"model is {model!r}", expected=f"one of {', '.join(MODELS)}")
     if reading.size is None:
         raise reading.record.error(
-            "a camera model without a size, expected the width and height of its image"
+            "a camera model without a size", expected="the width and height of its image"
         )
     width, height = reading.size
     return {"camera": f"1 {model} {width} {height} {' '.join(map(repr, numbers))}\n".encode()}
@@ -231,7 +231,7 @@ def _geographic_prior(prior: Record) -> GeographicPose:
     q = torch.tensor([_required(quaternion, key) for key in "xyzw"], dtype=torch.float64)
     length = float(torch.linalg.vector_norm(q))
     if not 0.9 < length < 1.1:
-        raise quaternion.error(f"has length {length:.3g}, expected 1")
+        raise quaternion.error(f"has length {length:.3g}", expected="1")
     rotation = SE3.from_quaternion(q, q.new_zeros(3), "xyzw").rotation @ R_CAMERA_BODY.mT
     return GeographicPose(Geodetic(lat, lon, h), rotation)
 
@@ -239,7 +239,7 @@ def _geographic_prior(prior: Record) -> GeographicPose:
 def _required(record: Record, key: str) -> float:
     found = record.number(key)
     if found is None:
-        raise record.error(f"no {key!r}, expected a number")
+        raise record.error(f"no {key!r}", expected="a number")
     return found
 
 

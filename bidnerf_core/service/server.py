@@ -130,16 +130,17 @@ def named(scenes: Scenes) -> dict[str, Path]:
         [*scenes.items()] if isinstance(scenes, Mapping) else [(Path(m).resolve().name, m) for m in scenes]
     )
     if not pairs:
-        raise InputError("no map to serve, expected folders of maps")
+        raise InputError("no map to serve", expected="folders of maps")
     for name, folder in pairs:
         if not NAME.fullmatch(name) or name in (".", ".."):
             raise InputError(
-                f"{folder}: its name is {name!r}, expected letters, digits, '.', '-' and '_'; give it a"
-                " name: NAME=MAP"
+                f"its name is {name!r}",
+                where=folder,
+                expected="letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
             )
         if [other for other, _ in pairs].count(name) > 1:
             raise InputError(
-                f"{folder}: another map is also named {name!r}; give it a different name: NAME=MAP"
+                f"another map is also named {name!r}; give it a different name: NAME=MAP", where=folder
             )
     return {name: Path(folder) for name, folder in pairs}
 
@@ -149,14 +150,16 @@ def _bound(host: str, port: int) -> socket.socket:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         bound = socket.socket(family, kind, protocol)
     except (OSError, OverflowError) as error:
-        raise InputError(f"{host}:{port}: no such address ({error})") from error
+        raise InputError(f"no such address ({error})", where=f"{host}:{port}") from error
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound.bind(address)
     except (OSError, OverflowError) as error:
         bound.close()
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{host}:{port}: cannot listen there ({reason}); choose another port") from error
+        raise InputError(
+            f"cannot listen there ({reason}); choose another port", where=f"{host}:{port}"
+        ) from error
     return bound
 
 

@@ -38,11 +38,11 @@ class ServiceLimits:
     def __post_init__(self) -> None:
         """Raise ``InputError`` for numbers out of range."""
         if self.workers < 0 or self.queue < 0:
-            raise InputError(f"workers is {self.workers} and queue {self.queue}, expected 0 or more")
+            raise InputError(f"workers is {self.workers} and queue {self.queue}", expected="0 or more")
         for name in ("timeout", "upload_timeout", "max_megabytes", "max_megapixels"):
             value = getattr(self, name)
             if not 0 < value < 1e6:
-                raise InputError(f"{name} is {value}, expected a positive number")
+                raise InputError(f"{name} is {value}", expected="a positive number")
 
     @property
     def processes(self) -> int:
@@ -75,7 +75,7 @@ class ChosenMethod:
         """Return a method with its settings as given to Python's functions: an instance of their type, a dictionary, or None."""
         if config is not None and not isinstance(config, Mapping) and not is_dataclass(config):
             raise InputError(
-                f"config is a {type(config).__name__}, expected settings of {name}, or a dictionary"
+                f"config is a {type(config).__name__}", expected=f"settings of {name}, or a dictionary"
             )
         return ChosenMethod(name, dict(to_flat(config) if is_dataclass(config) else config or {}), device)
 
@@ -84,7 +84,7 @@ def checked_token(token: str | None) -> str | None:
     """Return a token. Raises ``InputError`` for one that is short or that a header cannot hold."""
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
         raise InputError(
-            f"the token has {len(token)} characters, expected at least {LEAST_TOKEN} printable ASCII"
-            " characters"
+            f"the token has {len(token)} characters",
+            expected=f"at least {LEAST_TOKEN} printable ASCII characters",
         )
     return token

@@ -49,7 +49,7 @@ class Upload:
         unit = self.parameters.get("depth_unit")
         if unit is not None and depth is None:
             raise InputError(
-                "depth_unit was given without depth, expected the depth image that it belongs to"
+                "depth_unit was given without depth", expected="the depth image that it belongs to"
             )
         focal, hfov = self.parameters.get("focal"), self.parameters.get("hfov")
         own = CameraSource(self._file(folder, "camera"), focal, hfov, usual.assumed)
@@ -84,5 +84,7 @@ def _check_size(file: Path, max_pixels: float) -> None:
     header = read_header(file)
     if header.width * header.height > max_pixels:
         raise InputError(
-            f"{file}: image is {header.width}x{header.height}, expected at most {max_pixels / 1e6:g} megapixels"
+            f"image is {header.width}x{header.height}",
+            where=file,
+            expected=f"at most {max_pixels / 1e6:g} megapixels",
         )

@@ -132,7 +132,7 @@ class Worker:
         """Localize a photo in the map that it shows; return the answer and its JSON values, with that map."""
         photos, start = upload.read(CameraSource(assumed=maps.cameras), BLACK, folder, self.max_pixels)
         if start is not None:
-            raise InputError(f"start was given without map, expected map as one of {', '.join(self.maps)}")
+            raise InputError("start was given without map", expected=f"map as one of {', '.join(self.maps)}")
         answers = place_each(maps, photos, seed=upload.seed)
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}

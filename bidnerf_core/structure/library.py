@@ -17,11 +17,13 @@ def pycolmap_for(what: str) -> Any:
         import pycolmap
     except ImportError as error:
         raise InputError(
-            f"{what}: finding the poses of photos needs the extra 'sfm' (pip install 'bidnerf[sfm]')"
+            "finding the poses of photos needs the extra 'sfm' (pip install 'bidnerf[sfm]')", where=what
         ) from error
     if not hasattr(pycolmap, NEWEST_NEEDED):
         raise InputError(
-            f"{what}: pycolmap is {pycolmap.__version__}, expected 4.2 or later (pip install -U 'bidnerf[sfm]')"
+            f"pycolmap is {pycolmap.__version__}",
+            where=what,
+            expected="4.2 or later (pip install -U 'bidnerf[sfm]')",
         )
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     return pycolmap
@@ -42,5 +44,7 @@ def from_colmap(camera: Any) -> Intrinsics:
     """Return the intrinsics of a pycolmap camera with a perspective lens."""
     found = colmap_camera("COLMAP", camera.model.name, camera.width, camera.height, list(camera.params))
     if not isinstance(found, Intrinsics):
-        raise InputError(f"COLMAP: camera model {camera.model.name}, expected one of a perspective lens")
+        raise InputError(
+            f"camera model {camera.model.name}", where="COLMAP", expected="one of a perspective lens"
+        )
     return found

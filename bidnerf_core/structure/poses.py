@@ -124,7 +124,7 @@ def found_before(folder: Path, inputs: str, overwrite: bool) -> FoundPoses | Non
 
 def _video(path: Path) -> Path:
     if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a video or a folder of photos")
+        raise InputError("no such file", where=path, expected="a video or a folder of photos")
     return path
 
 
@@ -175,7 +175,7 @@ class _Search:
         with self._pycolmap.Database.open(self._database) as database:
             overlaps = Overlaps(database, self._pycolmap)
         if not models.all:
-            raise InputError(f"{self._source}: {_unplaced(found, overlaps)}; expected {GOOD_PHOTOS}")
+            raise InputError(f"{_unplaced(found, overlaps)};", where=self._source, expected=GOOD_PHOTOS)
         return self._written(images, found, models, left_out(found, models, overlaps, keypoints))
 
     def _counter(self, stage: str, unit: str) -> Callable[[int, int], None]:
@@ -218,8 +218,9 @@ class _Search:
         first = next(iter(found.unusable.items()), None)
         why = "" if first is None else f" that can be read, of {total} ({first[0]}: {first[1]})"
         raise InputError(
-            f"{self._source}: {amount(len(found.photos), 'photo')}{why}, expected at least {LEAST_PHOTOS} of one scene,"
-            " taken from different places"
+            f"{amount(len(found.photos), 'photo')}{why}",
+            where=self._source,
+            expected=f"at least {LEAST_PHOTOS} of one scene, taken from different places",
         )
 
     def _keypoints(self, found: Described) -> dict[int, int]:

@@ -191,8 +191,8 @@ def begin(folder: Path, inputs: str, video: bool) -> Path:
         clear(folder)
         if video and (folder / FRAMES).exists():
             raise InputError(
-                f"{folder / FRAMES}: exists already, and the video's frames would be written into it; name"
-                " another folder"
+                "exists already, and the video's frames would be written into it; name another folder",
+                where=folder / FRAMES,
             )
         work.mkdir(parents=True, exist_ok=True)
     write_file(work / "begun.json", json.dumps({"inputs": inputs, "video": video}).encode())

@@ -39,20 +39,21 @@ def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
     ``out``. Raises ``InputError`` if there is no such folder, if there are no photos, and if poses are known.
     """
     if not folder.exists():
-        raise InputError(f"{folder}: no such file or folder, expected photos or a video")
+        raise InputError("no such file or folder", where=folder, expected="photos or a video")
     if not folder.is_dir():
         raise InputError(
-            f"{folder}: is a file, expected a folder of photos or a video ({', '.join(VIDEO_SUFFIXES)})"
+            "is a file", where=folder, expected=f"a folder of photos or a video ({', '.join(VIDEO_SUFFIXES)})"
         )
     reader = find_reader(folder)
     if reader is not None:
         raise InputError(
-            f"{folder}: is a dataset whose poses are known ({reader.expected}); train with it directly, or"
-            " give only the folder of the photos to find their poses again"
+            f"is a dataset whose poses are known ({reader.expected}); train with it directly, or give only"
+            " the folder of the photos to find their poses again",
+            where=folder,
         )
     files = _listed(folder, out)
     if not files:
-        raise InputError(f"{folder}: {no_dataset(folder)}")
+        raise InputError(no_dataset(folder), where=folder)
     names = unique_names([(*file.relative_to(folder).parts[:-1], file.stem) for file in files])
     return [SourceImage(name, file) for name, file in zip(names, files, strict=True)]
 

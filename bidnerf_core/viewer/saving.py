@@ -39,7 +39,7 @@ def save_page(state: PageState, path: str | Path) -> Path:
     """Write the page to a file atomically. Raises ``InputError`` for a file extension other than .html or .htm."""
     path = Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{path}: a page, expected a name that ends with .html")
+        raise InputError("a page", where=path, expected="a name that ends with .html")
     write_file(path, page_html(state).encode())
     return path
 

@@ -53,7 +53,7 @@ def shown_trajectory(path: Path, unit: LengthUnit | None = None) -> ShownTraject
     """
     found = _from_json(path) if path.suffix.lower() in (".json", ".jsonl") else _from_rows(path)
     if not found:
-        raise InputError(f"{path}: holds no pose, expected those of a trajectory")
+        raise InputError("holds no pose", where=path, expected="those of a trajectory")
     other = {each.unit for each in found} - {unit, None}
     if unit is not None and other:
         log.info(
@@ -101,7 +101,7 @@ def _posed(entry: dict[str, Any], path: Path) -> _Posed:
         time = None if time is None else float(time)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(
-            f"{path}: {entry.get('frame')!r} has no matrices of numbers, expected poses"
+            f"{entry.get('frame')!r} has no matrices of numbers", where=path, expected="poses"
         ) from error
     unit = entry.get("unit")
     finite = sigma is not None and math.isfinite(sigma)

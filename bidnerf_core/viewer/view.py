@@ -62,7 +62,7 @@ def view(
     scene_map = scene.scene if isinstance(scene, Localizer) else scene
     if not isinstance(scene_map, Map):
         raise InputError(
-            f"view: scene is a {type(scene_map).__name__}, expected a Map, such as load_map returns"
+            f"scene is a {type(scene_map).__name__}", where="view", expected="a Map, such as load_map returns"
         )
     answers = list[ShownAnswer]()
     if localization is not None:

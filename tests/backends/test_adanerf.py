@@ -19,14 +19,18 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, render, rendering_weights
 from bidnerf_core.frames import View
-from bidnerf_core.scenes import demo_object
+from bidnerf_core.scenes import demo_object, demo_room, look_around
 from bidnerf_core.scenes import views as seen_from
-from bidnerf_core.scenes.demo import demo_room
-from bidnerf_core.scenes.trajectories import look_around
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import BackendContract, Recorder
-from bidnerf_core.testing.recipes import colour_error
-from bidnerf_core.testing.scene import SIDE, awkward_rays, points, rgbd_views
+from bidnerf_core.testing import (
+    SIDE,
+    BackendContract,
+    Recorder,
+    awkward_rays,
+    colour_error,
+    points,
+    rgbd_views,
+)
 from bidnerf_core.training import RayBank, TrainingBatch
 from tiny import black_batch
 

@@ -35,8 +35,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.maps import MapInfo, load_map, save_map
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import BackendContract, Recorder, rgb_views
-from bidnerf_core.testing.scene import SIDE, points, rgbd_views
+from bidnerf_core.testing import SIDE, BackendContract, Recorder, points, rgb_views, rgbd_views
 from bidnerf_core.training import RayBank, Supervision, TrainingState, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig

@@ -34,8 +34,7 @@ from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.mapping import HeldOutTrial, LandmarkConfig, tracked_views
 from bidnerf_core.results import draw_capture
 from bidnerf_core.scenes import demo_object, orbit, views
-from bidnerf_core.testing import BOUNDS
-from bidnerf_core.testing.textured_field import TexturedGround
+from bidnerf_core.testing import BOUNDS, TexturedGround
 from landmark_scene import Points, looking_in, ring
 
 CAMERA = Intrinsics(162.0, 162.0, 80.0, 60.0, 160, 120)

@@ -25,8 +25,7 @@ from bidnerf_core.captures.cameras import moved_from
 from bidnerf_core.captures.shutter_evidence import common_motion
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
 from bidnerf_core.fields import render, render_image
-from bidnerf_core.frames import observe
-from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.frames import all_pixels, observe
 from bidnerf_core.localization import LandmarkMatcher, Motion, propose
 from bidnerf_core.localization.landmarks.hypotheses import (
     SHARE_AS_MAP,
@@ -46,8 +45,7 @@ from bidnerf_core.mapping import (
     resect,
     tracked_views,
 )
-from bidnerf_core.testing import BOUNDS, CAMERA, ground
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.training import RayBank
 from landmark_scene import PINHOLE, Points, looking_in
 

@@ -19,9 +19,8 @@ from bidnerf_core.captures.training_poses import TrainingPoses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import TrackedViews, tracked_views
-from bidnerf_core.maps import cameras_of, load_info
+from bidnerf_core.maps import cameras_of, load_info, read_views
 from bidnerf_core.maps.files import load_capture
-from bidnerf_core.maps.views import read_views
 from commands import Run
 from landmark_scene import Points, ring
 from test_cli import assert_same_map, stop_at

@@ -24,8 +24,7 @@ from bidnerf_core.cli.watch_folder import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, read_trajectory, write_transforms
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.maps import MapInfo
-from bidnerf_core.testing import CAMERA, textured_map
-from bidnerf_core.testing.textured_field import MapWithLandmarks
+from bidnerf_core.testing import CAMERA, MapWithLandmarks, textured_map
 from commands import Run
 from flights import covered, flight
 

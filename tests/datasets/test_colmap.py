@@ -23,8 +23,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import rig
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import demo_object, orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, demo_object, orbit
 from bidnerf_core.training import RayBank, Silent, ray_termination
 from bidnerf_hashgrid import backend as hashgrid
 from problems import FieldMap, localize

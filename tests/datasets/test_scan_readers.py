@@ -19,7 +19,7 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import View
-from bidnerf_core.maps.views import read_views
+from bidnerf_core.maps import read_views
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.testing import ReaderContract, training_views
 from scan_layouts import LAYOUTS, PERIOD

@@ -17,9 +17,8 @@ from bidnerf_core.evaluation import FAULTS, NO_FAULT, expand_faults, faulty, par
 from bidnerf_core.evaluation.protocols import random_units
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import demo_object, look_at, orbit
+from bidnerf_core.scenes import demo_object, demo_room, look_at, orbit
 from bidnerf_core.scenes import views as seen_from
-from bidnerf_core.scenes.demo import demo_room
 
 CAMERA = Intrinsics(70.0, 72.0, 41.0, 29.5, 80, 60)
 LENS = dataclasses.replace(CAMERA, distortion=(0.05, -0.01, 0.001, 0.002))

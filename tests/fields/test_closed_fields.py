@@ -9,8 +9,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import RadianceField, Rays, RaySampler, SceneBounds, Stratified, levels, render
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import HomogeneousBall, orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall, orbit
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)
 

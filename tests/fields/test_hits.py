@@ -22,7 +22,7 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.linearization import linearize
-from bidnerf_core.testing.samples import check_hits
+from bidnerf_core.testing import check_hits
 
 SOFT = 0.01  # metres: standard deviation of the density about a sheet
 HEIGHTS = (0.4, -0.3)  # metres

@@ -22,8 +22,7 @@ from bidnerf_core.fields import (
     Stratified,
     render,
 )
-from bidnerf_core.scenes import HomogeneousBall
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall
 from bidnerf_core.testing import samples as laws
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from voxels import cell_centres

@@ -18,8 +18,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import BOUNDS, CAMERA, textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen
 from commands import Run
 
 

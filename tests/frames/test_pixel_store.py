@@ -32,8 +32,8 @@ from bidnerf_core.frames import (
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import memory
 from bidnerf_core.mapping.landmarks import tracks
+from bidnerf_core.maps import read_views
 from bidnerf_core.maps import views as views_of_map
-from bidnerf_core.maps.views import read_views
 from bidnerf_core.training import RayBank, ray_bank
 from photo_files import noise
 

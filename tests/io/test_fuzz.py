@@ -26,8 +26,7 @@ from safetensors.torch import save
 import tiny
 from bidnerf_core import Frame, load_map
 from bidnerf_core.camera import read_camera
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.datasets.points import read_depth_points
+from bidnerf_core.datasets import open_dataset, read_depth_points
 from bidnerf_core.depth import read_depth_image
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation import read_results

@@ -22,7 +22,7 @@ from bidnerf_core.localization.acceptance import (
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.settings import RenderedThresholds
-from bidnerf_core.scenes.demo import demo_room
+from bidnerf_core.scenes import demo_room
 
 
 def rejection(T: SE3, cloud: PointCloud, margin: float = math.inf) -> Verdict | None:

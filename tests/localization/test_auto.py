@@ -29,9 +29,7 @@ from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.mapping import bake
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import orbit
-from bidnerf_core.scenes.demo import demo_room
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, demo_room, orbit
 from problems import FieldMap, localize
 from tiny import depth_rays_of
 

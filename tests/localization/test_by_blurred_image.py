@@ -33,8 +33,7 @@ from bidnerf_core.localization.costs.images import (
 )
 from bidnerf_core.mapping import build_landmarks
 from bidnerf_core.results import normalized_error_squared, pose_error
-from bidnerf_core.scenes import orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, orbit
 from landmark_scene import Points, ring
 from problems import FieldMap
 

@@ -19,8 +19,7 @@ from bidnerf_core.localization.acceptance import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.mapping import SurfaceMap, bake, build_landmarks
 from bidnerf_core.results import normalized_error_squared, pose_error
-from bidnerf_core.scenes import orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, orbit
 from landmark_scene import Points, ring
 from problems import FieldMap, localize
 

@@ -37,8 +37,7 @@ from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.fusion import FusedPose, Measurements
 from bidnerf_core.localization.landmarks.propose import Confirmation
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import CAMERA, textured_field, textured_map
-from bidnerf_core.testing.textured_field import MapWithLandmarks, unseen
+from bidnerf_core.testing import CAMERA, MapWithLandmarks, textured_field, textured_map, unseen
 
 TRUTH = unseen().T_ref_camera
 RAYS = 256

@@ -25,8 +25,7 @@ from bidnerf_core.localization.landmarks.consensus import Candidate
 from bidnerf_core.localization.landmarks.far_cameras import UNSUSPECTED, camera_fit
 from bidnerf_core.mapping import GIVEN, Calibration, ObservedPoints, build_landmarks
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import CAMERA, textured_map, training_views
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import CAMERA, textured_map, training_views, unseen
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from problems import localize
 

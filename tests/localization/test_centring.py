@@ -7,8 +7,7 @@ import math
 import torch
 
 from bidnerf_core.fields import Observations
-from bidnerf_core.frames import View, observe
-from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.frames import View, all_pixels, observe
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.images import FieldRenderer
 from bidnerf_core.localization.refinement import centred, rendered_middle

@@ -7,8 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.fields import Observations, RaySamples, Rendering
-from bidnerf_core.fields.residuals import depth_residual, first_surface_residual, truncated_depth_residual
+from bidnerf_core.fields import (
+    Observations,
+    RaySamples,
+    Rendering,
+    depth_residual,
+    first_surface_residual,
+    truncated_depth_residual,
+)
 from bidnerf_core.localization import ColourSettings, DepthSettings, objective_of
 
 

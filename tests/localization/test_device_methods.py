@@ -26,9 +26,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.localization.landmarks import matching
 from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import textured_field
-from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
-from bidnerf_core.testing.textured_field import MapWithLandmarks
+from bidnerf_core.testing import DEVICE, Elsewhere, MapWithLandmarks, textured_field
 from flights import INTERVAL, flight_frame, flight_pose
 from module_fields import AsModule
 from problems import FieldMap

@@ -16,8 +16,7 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.localization import AutoConfig, mirror_image
 from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, FoundOnce, Keypoints, Sift, tracked_views
-from bidnerf_core.testing import CAMERA, textured_map, training_views
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import CAMERA, textured_map, training_views, unseen
 
 Seen = list[Tensor]
 QUICK = AutoConfig(fused_rays=256)

@@ -37,8 +37,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.localization.solvers.history import WINDOW
 from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, orbit
 from bidnerf_hashgrid import backend as hashgrid
 from problems import FieldMap, localize, single
 

@@ -25,8 +25,7 @@ from bidnerf_core.localization.covariance import finest_cost, position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, PoseAndDepth, ScaledPoints
 from bidnerf_core.localization.fusion import Fit, FusedPose, Measurements, fused_pose
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import textured_map, unseen
 
 TRUTH = unseen().T_ref_camera
 OFF = torch.tensor([0.02, -0.01, 0.03, 0.004, -0.006, 0.003], dtype=torch.float64)

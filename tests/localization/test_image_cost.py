@@ -29,8 +29,7 @@ from bidnerf_core.localization.costs.images import (
     thumbnail,
 )
 from bidnerf_core.localization.search.by_images import WIDE_SCALES
-from bidnerf_core.scenes import orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, orbit
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 BLOBS = GaussianBlobs.random(density=60.0)

@@ -21,7 +21,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import METHODS, AutoConfig, pose_from_matrix, settings_of
 from bidnerf_core.localization.tracking.motion import Clock
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
+from bidnerf_core.testing import DEVICE, Elsewhere
 from bidnerf_hashgrid import backend as hashgrid
 from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap

@@ -10,8 +10,7 @@ import torch
 from bidnerf_core import Localizer, Outcome, View
 from bidnerf_core.localization import LandmarkMatcher, confirm, mirror_image, propose, rig
 from bidnerf_core.localization.alternatives import decide, mirror_evidence
-from bidnerf_core.testing import textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import textured_map, unseen
 
 
 def matcher() -> LandmarkMatcher:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets.points import read_depth_points
+from bidnerf_core.datasets import read_depth_points
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import Observations, SceneBounds, render, render_image
@@ -28,8 +28,7 @@ from bidnerf_core.localization import (
     window,
 )
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, orbit
 from problems import localize, single
 from tiny import depth_rays_of
 

@@ -16,8 +16,7 @@ from bidnerf_core.localization.landmarks.guided import projected_landmarks
 from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
 from bidnerf_core.mapping import GIVEN, SIFT, image_keypoints
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import textured_map, unseen
 from problems import localize
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)

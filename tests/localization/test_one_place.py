@@ -14,8 +14,7 @@ from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.localization.localizer import direction_only
 from bidnerf_core.mapping import LandmarkConfig, tracked_views
 from bidnerf_core.maps import load_info
-from bidnerf_core.testing import textured_map
-from bidnerf_core.testing.textured_field import MapWithLandmarks, unseen
+from bidnerf_core.testing import MapWithLandmarks, textured_map, unseen
 from landmark_scene import Points, looking_in, ring
 
 CENTRE = looking_in(0.0)

@@ -22,8 +22,7 @@ from bidnerf_core.localization import (
 )
 from bidnerf_core.localization.alternatives import NOISIEST, decide, log_odds_by_rendering
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import CAMERA, textured_map
-from bidnerf_core.testing.textured_field import TexturedGround, seen, unseen
+from bidnerf_core.testing import CAMERA, TexturedGround, seen, textured_map, unseen
 
 
 def stated(factor: float) -> Intrinsics:

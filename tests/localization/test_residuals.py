@@ -13,13 +13,14 @@ from bidnerf_core.fields import (
     RaySamples,
     Rendering,
     SceneBounds,
+    depth_residual,
+    free_space,
     masked_mean,
     render,
 )
-from bidnerf_core.fields.residuals import depth_residual, free_space
 from bidnerf_core.geometry import RobustName
 from bidnerf_core.localization import BidConfig, ColourSettings, DepthSettings, objective_of
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
 

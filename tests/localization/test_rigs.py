@@ -10,9 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.scenes import look_at, orbit
-from bidnerf_core.scenes.demo import demo_room
-from bidnerf_core.scenes.trajectories import look_around
+from bidnerf_core.scenes import demo_room, look_around, look_at, orbit
 
 CAMERA = Intrinsics(70.0, 75.0, 31.0, 24.5, 64, 48)
 

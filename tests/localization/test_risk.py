@@ -18,8 +18,7 @@ from bidnerf_core import InputError, Localizer
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, risk
 from bidnerf_core.localization.tracking.relocalization import relocalized
-from bidnerf_core.testing import textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import textured_map, unseen
 
 LEVELS = ((0.01, 0.97), (0.05, 0.9), (0.1, 0.8))
 

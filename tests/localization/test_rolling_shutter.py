@@ -15,8 +15,7 @@ from bidnerf_core.frames import observe
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import LandmarkDiagnostics, LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import textured_map, unseen
 
 TRUTH = unseen().T_ref_camera
 CHI2_99 = 16.8  # of six degrees of freedom

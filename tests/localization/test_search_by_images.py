@@ -17,8 +17,7 @@ from bidnerf_core.localization.search.by_images import APART, IMAGE_STAGES, TURN
 from bidnerf_core.localization.search.halving import Distinct
 from bidnerf_core.localization.search.starts import Surroundings, hypotheses_for_images
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes.primitives import Box
-from bidnerf_core.scenes.textures import blotches
+from bidnerf_core.scenes import Box, blotches
 
 KEYFRAMES = SE3.from_matrix(baked.toy().keyframes)
 

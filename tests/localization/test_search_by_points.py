@@ -12,8 +12,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.search.by_points import POINT_STAGES
 from bidnerf_core.localization.search.starts import hypotheses_for_points, random_rotations
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes.primitives import Box
-from bidnerf_core.scenes.textures import blotches
+from bidnerf_core.scenes import Box, blotches
 
 
 def test_the_pose_is_found_from_random_orientations(generator: Generator) -> None:

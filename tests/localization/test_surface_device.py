@@ -40,7 +40,7 @@ from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.solvers import levenberg_marquardt
 from bidnerf_core.mapping import SurfaceMap, SurfelIndex, Surfels, cast, trace
 from bidnerf_core.mapping.surface import casting
-from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
+from bidnerf_core.testing import DEVICE, DeviceFault, Elsewhere
 from problems import FieldMap
 
 

@@ -25,8 +25,7 @@ from bidnerf_core.localization.landmarks.chance import log_odds_of_share
 from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import BOUNDS, CAMERA, ground, textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, ground, textured_map, unseen
 from landmark_scene import Points, looking_in, ring
 from problems import localize
 

@@ -14,9 +14,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
-from bidnerf_core.scenes import HomogeneousBall, orbit
-from bidnerf_core.scenes.primitives import Box, Sphere
-from bidnerf_core.scenes.textures import blotches
+from bidnerf_core.scenes import Box, HomogeneousBall, Sphere, blotches, orbit
 
 RADIUS = 0.6
 BALL = baked.one_solid(Sphere(RADIUS), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))

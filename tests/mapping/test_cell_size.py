@@ -17,8 +17,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.surface.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
 from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, measured_image
-from bidnerf_core.scenes.primitives import Box
-from bidnerf_core.scenes.textures import blotches
+from bidnerf_core.scenes import Box, blotches
 
 SCENE = baked.one_solid(Box((0.6, 0.6, 0.6)), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
 

@@ -16,8 +16,7 @@ from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
 from bidnerf_core.mapping.surface.baking import KEYFRAME_SIDE, MOST
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import HomogeneousBall, orbit
-from bidnerf_core.testing import BOUNDS, CAMERA, ground, textured_field, training_views
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, ground, textured_field, training_views, unseen
 
 BALL = HomogeneousBall(0.5, 400.0, rgb=(0.8, 0.3, 0.2), sampler=Stratified(256))
 CUBE = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)

@@ -10,8 +10,7 @@ from torch import Generator, Tensor
 import baked
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import SurfaceMap, trace
-from bidnerf_core.scenes.primitives import Box, Primitive, Shape, Sphere
-from bidnerf_core.scenes.textures import blotches
+from bidnerf_core.scenes import Box, Primitive, Shape, Sphere, blotches
 
 PAINT = blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1)
 

@@ -19,8 +19,7 @@ from bidnerf_core.io import FileInUse, locked
 from bidnerf_core.maps import Anchor, Map, MapInfo
 from bidnerf_core.maps.anchor import load_anchor, save_anchor
 from bidnerf_core.maps.scaling import place_of
-from bidnerf_core.testing import BOUNDS, CAMERA, textured_map
-from bidnerf_core.testing.textured_field import unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen
 from commands import Run
 
 

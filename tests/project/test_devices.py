@@ -23,8 +23,7 @@ from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import MapInfo
 from bidnerf_core.scenes import HomogeneousBall
-from bidnerf_core.testing import textured_field
-from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
+from bidnerf_core.testing import DEVICE, Elsewhere, textured_field
 from problems import FieldMap
 
 CPU = torch.device("cpu")

@@ -15,11 +15,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import PointCloud, Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
-from bidnerf_core.scenes import demo_object, orbit
-from bidnerf_core.scenes.closed_form import ClosedFormScene
-from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.primitives import Primitive, Shape
-from bidnerf_core.scenes.textures import Texture
+from bidnerf_core.scenes import ClosedFormScene, GaussianBlobs, Primitive, Shape, Texture, demo_object, orbit
 from problems import FieldMap
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)

@@ -11,8 +11,7 @@ from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization import Pivot
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.rendered import WeightedRays
-from bidnerf_core.scenes import orbit
-from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes import GaussianBlobs, orbit
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 0.9, 0.8))
 FIELD = GaussianBlobs.random()

@@ -9,8 +9,7 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.frames import View, observe
-from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.frames import View, all_pixels, observe
 from bidnerf_core.geometry import SE3
 
 UNIT = 0.37

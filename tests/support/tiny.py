@@ -13,8 +13,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import Observations, Rays
-from bidnerf_core.frames import View, observe
-from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.frames import View, all_pixels, observe
 from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.scenes import views as seen_from
 from bidnerf_core.training import TrainingBatch

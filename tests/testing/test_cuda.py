@@ -23,7 +23,7 @@ from bidnerf_core.localization import captured, settings_of
 from bidnerf_core.localization.solvers import adam
 from bidnerf_core.maps import load_map
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing.scene import rgbd_views
+from bidnerf_core.testing import rgbd_views
 from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
 from problems import FieldMap
 

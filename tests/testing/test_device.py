@@ -12,9 +12,9 @@ from bidnerf_core.devices import may_wait, without_waiting
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.solvers.history import History
+from bidnerf_core.testing import DEVICE, DeviceFault, Elsewhere
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf_core.testing.device import check_steps
-from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
 
 FORBIDDEN: dict[str, Callable[[Tensor], object]] = {
     "cpu": lambda x: x.cpu(),

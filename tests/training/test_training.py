@@ -15,10 +15,9 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
-from bidnerf_core.frames import Frame, View, observe
-from bidnerf_core.frames.pixels import all_pixels
+from bidnerf_core.frames import Frame, View, all_pixels, observe
 from bidnerf_core.scenes import orbit
-from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
+from bidnerf_core.testing import DEVICE, Elsewhere
 from bidnerf_core.training import (
     RayBank,
     Report,

@@ -28,7 +28,7 @@ class AppliedFault:
     def __post_init__(self) -> None:
         allowed = find_fault(self.name).allowed
         if self.size not in allowed:
-            raise InputError(f"fault {self.name}: size is {self.size:.12g}, expected {allowed}")
+            raise InputError(f"size is {self.size:.12g}", where=f"fault {self.name}", expected=allowed)
 
     def __str__(self) -> str:
         return f"{self.name}:{self.size:.12g}"
@@ -42,7 +42,9 @@ class AppliedFault:
             T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
         changed = fault.change(view.frame, self.size, generator)
         if not isinstance(changed, Frame):
-            raise InputError(f"fault {self}: returned a {type(changed).__name__}, expected a Frame")
+            raise InputError(
+                f"returned a {type(changed).__name__}", where=f"fault {self}", expected="a Frame"
+            )
         return View(changed, T_ref_camera)
 
 
@@ -60,7 +62,7 @@ def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
         found += ["+".join(map(str, parse_faults(part))) or NO_FAULT for part in parts]
     twice = next((fault for place, fault in enumerate(found) if fault in found[:place]), None)
     if twice is not None:
-        raise InputError(f"fault {twice} is given twice, expected different ones")
+        raise InputError(f"fault {twice} is given twice", expected="different ones")
     return tuple(found)
 
 
@@ -72,7 +74,7 @@ def parse_faults(text: str) -> tuple[AppliedFault, ...]:
     names = [fault.name for fault in faults]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"fault {text} has {twice} twice, expected each once")
+        raise InputError(f"fault {text} has {twice} twice", expected="each once")
     return faults
 
 
@@ -106,7 +108,7 @@ def _parsed(text: str) -> AppliedFault:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise InputError(f"fault {name}: size is {size!r}, expected {fault.allowed}")
+        raise InputError(f"size is {size!r}", where=f"fault {name}", expected=fault.allowed)
     return AppliedFault(name, number)
 
 

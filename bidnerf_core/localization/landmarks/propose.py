@@ -52,7 +52,7 @@ def propose(
     Raises ``InputError`` if there are no views.
     """
     if not views:
-        raise InputError("nothing to localize: expected at least one view")
+        raise InputError("nothing to localize:", expected="at least one view")
     prior = _calibration_prior(views) if prior is None else prior
     query = LandmarkQuery(query_images(views, features or matcher.features), matcher.landmarks, prior, moving)
     matches, first = _first_pose(query, matcher, seed)

@@ -39,7 +39,7 @@ class Clock:
             return Clock(now, self.interval, stamped=False), self.interval
         is_number = isinstance(time, Real) and not isinstance(time, bool)
         if not is_number or not abs(time) <= LARGEST_NUMBER:
-            raise InputError(f"time of the frame is {str(time)[:40]!r}, expected seconds or None")
+            raise InputError(f"time of the frame is {str(time)[:40]!r}", expected="seconds or None")
         time = float(time)
         if self.now is None:
             return Clock(time, self.interval), self.interval

@@ -146,13 +146,13 @@ class StoredNumbers:
     def __post_init__(self) -> None:
         for name in ("frames", "lost", "searchable", "waited", "sought", "age"):
             if getattr(self, name) < 0:
-                raise InputError(f"{name} is {getattr(self, name)}, expected 0 or more")
+                raise InputError(f"{name} is {getattr(self, name)}", expected="0 or more")
         if self.clock.interval <= 0 or self.noise <= 0:
-            raise InputError("the interval or the noise is 0 or less, expected positive numbers")
+            raise InputError("the interval or the noise is 0 or less", expected="positive numbers")
         if (self.reach is None) != (self.agility is None):
-            raise InputError("only one of reach and agility is given, expected both or neither")
+            raise InputError("only one of reach and agility is given", expected="both or neither")
         if self.reach is not None and not 0 < self.reach <= LARGEST_LENGTH:
-            raise InputError(f"reach is {self.reach}, expected a positive distance")
+            raise InputError(f"reach is {self.reach}", expected="a positive distance")
 
     @staticmethod
     def of(state: TrackerState) -> StoredNumbers:
@@ -183,7 +183,7 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
     try:
         return _state(numbers, tensors)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not a whole state of a tracker ({error}), save it anew") from error
+        raise InputError(f"not a whole state of a tracker ({error}), save it anew", where=path) from error
 
 
 def _read(path: Path, key: str) -> tuple[StoredNumbers, dict[str, Tensor]]:
@@ -191,13 +191,15 @@ def _read(path: Path, key: str) -> tuple[StoredNumbers, dict[str, Tensor]]:
     tensors, metadata = read_tensors_and_metadata(path, expected)
     found = parse_json(metadata.get("bidnerf", "null"), str(path), expected)
     if not isinstance(found, dict) or found.get("format") != STATE_FORMAT:
-        raise InputError(f"{path}: not the state of a tracker, expected {expected}")
+        raise InputError("not the state of a tracker", where=path, expected=expected)
     if found.get("version") != STATE_VERSION:
         raise InputError(
-            f"{path}: version {found.get('version')!r}, expected {STATE_VERSION}; begin the sequence anew"
+            f"version {found.get('version')!r}",
+            where=path,
+            expected=f"{STATE_VERSION}; begin the sequence anew",
         )
     if found.get("map") != key:
-        raise InputError(f"{path}: belongs to map {found.get('map')!r}, the tracker's is {key!r}")
+        raise InputError(f"belongs to map {found.get('map')!r}, the tracker's is {key!r}", where=path)
     return from_plain(StoredNumbers, found.get("state"), str(path)), tensors
 
 

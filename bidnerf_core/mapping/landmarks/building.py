@@ -183,7 +183,8 @@ class TrackedViews:
         if not len(found):
             images = len(self.observations.images)
             raise InputError(
-                f"no landmarks found in {images} images: expected texture that several images show from different places"
+                f"no landmarks found in {images} images:",
+                expected="texture that several images show from different places",
             )
         moving = float((self.motion != 0).any(1).double().mean())
         name = self.features if isinstance(self.features, str) else ""
@@ -263,14 +264,15 @@ def tracked_views(
     """
     detector = find_features(features) if isinstance(features, str) else features
     if not views:
-        raise InputError("nothing to build landmarks from: expected at least one view")
+        raise InputError("nothing to build landmarks from:", expected="at least one view")
     pairs = _pairs([view.T_ref_camera for view in views], config)
     counter = _Counter(progress, len(views) + len(pairs))
     images = counter.over(_mapped(lambda view: image_keypoints(view, detector), views))
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
         raise PluginError(
-            f"descriptors have {enumeration([*map(str, lengths)])} channels in different images, expected the same number"
+            f"descriptors have {enumeration([*map(str, lengths)])} channels in different images",
+            expected="the same number",
         )
     return TrackedViews(_joined(images, pairs, counter), features)
 

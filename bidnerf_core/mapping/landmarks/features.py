@@ -122,27 +122,30 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
     found, who = features(rgb), f"detector {getattr(features, '__name__', type(features).__name__)}"
     if not isinstance(found, Keypoints):
         raise PluginError(
-            f"{who}: returned a {type(found).__name__}, expected Keypoints(pixels, sizes, descriptors)"
+            f"returned a {type(found).__name__}", where=who, expected="Keypoints(pixels, sizes, descriptors)"
         )
     parts = (found.pixels, found.sizes, found.descriptors)
     if not all(isinstance(part, Tensor) for part in parts):
         kinds = enumeration([type(part).__name__ for part in parts])
-        raise PluginError(f"{who}: pixels, sizes and descriptors are {kinds}, expected tensors")
+        raise PluginError(f"pixels, sizes and descriptors are {kinds}", where=who, expected="tensors")
     shapes = tuple(tuple(part.shape) for part in parts)
     count = len(found.descriptors)
     if shapes[:2] != ((count, 2), (count,)) or found.descriptors.ndim != 2:
         raise PluginError(
-            f"{who}: pixels, sizes and descriptors have shapes {enumeration([str(shape) for shape in shapes])},"
-            " expected (n, 2), (n) and (n, d)"
+            f"pixels, sizes and descriptors have shapes {enumeration([str(shape) for shape in shapes])}",
+            where=who,
+            expected="(n, 2), (n) and (n, d)",
         )
     if found.descriptors.dtype != torch.uint8:
         raise PluginError(
-            f"{who}: descriptors have dtype {found.descriptors.dtype}, expected torch.uint8; quantized converts floats"
+            f"descriptors have dtype {found.descriptors.dtype}",
+            where=who,
+            expected="torch.uint8; quantized converts floats",
         )
     size = torch.tensor([rgb.shape[1], rgb.shape[0]])
     if not bool(((found.pixels >= 0) & (found.pixels <= size)).all()):
         raise PluginError(
-            f"{who}: keypoints lie outside the image of {size[0]}x{size[1]} pixels, expected all inside"
+            f"keypoints lie outside the image of {size[0]}x{size[1]} pixels", where=who, expected="all inside"
         )
     return found
 

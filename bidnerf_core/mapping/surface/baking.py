@@ -99,7 +99,7 @@ def bake(
     """
     total = len(views) + len(cameras)
     if not total:
-        raise InputError("no images to bake a surface from: expected at least one camera or view")
+        raise InputError("no images to bake a surface from:", expected="at least one camera or view")
     images = [measured_image(view, config.measured / total) for view in views]
     for number, (intrinsics, T) in enumerate(cameras, start=1):
         images.append(rendered_image(field, bounds, intrinsics, T, config.rays / total))

@@ -121,7 +121,8 @@ def block_shape(grid: VoxelGrid) -> tuple[int, int, int]:
     x, y, z = (-(-count // BLOCK_SIDE) for count in grid.shape)
     if x * y * z * CELLS_OF_BLOCK > MOST_CELLS:
         raise InputError(
-            f"the surface's grid has {x * y * z * CELLS_OF_BLOCK} cells, expected at most {MOST_CELLS}; use larger cells"
+            f"the surface's grid has {x * y * z * CELLS_OF_BLOCK} cells",
+            expected=f"at most {MOST_CELLS}; use larger cells",
         )
     return x, y, z
 

@@ -58,7 +58,7 @@ class PoseTable(Dataset):
 
     def frame_names(self, split: str) -> list[str]:
         if split not in self.splits:
-            raise InputError(f"{self.path}: no split {split!r}, expected 'train'")
+            raise InputError(f"no split {split!r}", where=self.path, expected="'train'")
         return list(self._rows)
 
     def views(
@@ -75,7 +75,7 @@ class PoseTable(Dataset):
     def view(self, name: str) -> View:
         """Read one image. Raises ``InputError`` for an unknown name."""
         if name not in self._rows:
-            raise InputError(f"{self.path}: no image {name!r} in {TABLE}")
+            raise InputError(f"no image {name!r} in {TABLE}", where=self.path)
         frame = Frame.open(
             self.path / f"{name}.png",
             depth=self.path / f"{name}.depth.png",
@@ -124,9 +124,9 @@ def read_table(file: Path) -> list[Row]:
                 time, *matrix = map(float, values)
                 rows = torch.tensor(matrix, dtype=torch.float64).reshape(3, 4)
             except (ValueError, RuntimeError) as error:
-                raise InputError(f"{file}: line {number} is not a name and 13 numbers") from error
+                raise InputError(f"line {number} is not a name and 13 numbers", where=file) from error
             pose = SE3(rows[:, :3], rows[:, 3])
             if not bool(pose.is_rigid()):
-                raise InputError(f"{file}: line {number}: the pose of {name} is not a rigid transform")
+                raise InputError(f"line {number}: the pose of {name} is not a rigid transform", where=file)
             found.append(Row(name, time, pose.normalized()))
     return found

@@ -55,7 +55,7 @@ def gaussians_of_map(scene: Map) -> Gaussians:
         return field.gaussians().similar(scale, torch.eye(3), torch.zeros(3))
     if scene.surface is None:
         raise InputError(
-            f"{scene.name}: has no surface, from which a splat could be made; 'bidnerf bake' adds one"
+            "has no surface, from which a splat could be made; 'bidnerf bake' adds one", where=scene.name
         )
     return gaussians_of_surface(scene.surface)
 
@@ -81,7 +81,7 @@ def _spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """Return the mean distance of each point from its neighbours (metres), within reason."""
     most = min(NEIGHBOURS + 1, len(points))
     if most < 2:
-        raise InputError("a surface of one surfel, expected more from which to make a splat")
+        raise InputError("a surface of one surfel", expected="more from which to make a splat")
     distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=most)
     found = torch.from_numpy(np.asarray(distances[:, 1:].mean(-1), dtype=np.float32))
     middle = float(found.median()) or float(found.max()) or 1.0

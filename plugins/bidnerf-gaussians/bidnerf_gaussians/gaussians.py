@@ -98,7 +98,9 @@ def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
     """
     if found.harmonics.shape[1] not in COEFFICIENTS.values():
         raise InputError(
-            f"{where}: {found.harmonics.shape[1]} spherical harmonics, expected 1, 4, 9 or 16 (degree 0 to 3)"
+            f"{found.harmonics.shape[1]} spherical harmonics",
+            where=where,
+            expected="1, 4, 9 or 16 (degree 0 to 3)",
         )
     finite = _finite(found)
     turned = found.quaternions.abs().amax(-1) > 1e-12
@@ -110,7 +112,9 @@ def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
     if not bool(kept.any()):
         what = f": {dropped}" if len(found) else ""
         raise InputError(
-            f"{where}: none of its {len(found):,} Gaussians can be rendered{what}, expected at least one"
+            f"none of its {len(found):,} Gaussians can be rendered{what}",
+            where=where,
+            expected="at least one",
         )
     few = found if bool(kept.all()) else found[kept]
     return Gaussians(

@@ -62,7 +62,7 @@ class GaussiansImporter:
         """Read the Gaussians in a file as a field, see ``Importer``."""
         found = format_of(path)
         if found is None:
-            raise InputError(f"{path}: not a readable file of Gaussians, expected {self.summary}")
+            raise InputError("not a readable file of Gaussians", where=path, expected=self.summary)
         return imported(
             found.read(path), str(path), config, placement, found, cameras_beside(path, placement)
         )
@@ -78,7 +78,9 @@ def imported(
     if config.least_opacity:
         before, kept = len(kept), kept[kept.opacities >= config.least_opacity]
         if not len(kept):
-            raise InputError(f"{where}: no Gaussian reaches opacity {config.least_opacity:g} (least_opacity)")
+            raise InputError(
+                f"no Gaussian reaches opacity {config.least_opacity:g} (least_opacity)", where=where
+            )
     count = len(gaussians)
     kept = replace(kept, harmonics=kept.harmonics[:, : (config.degree + 1) ** 2])
     T = placement.T_target_source

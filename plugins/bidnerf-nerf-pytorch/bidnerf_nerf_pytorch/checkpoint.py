@@ -44,9 +44,11 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
     """
     found = read_saved(path, EXPECTED)
     if not isinstance(found, dict) or not isinstance(found.get(NETWORKS["coarse"]), dict):
-        raise InputError(f"{path}: contains no {NETWORKS['coarse']!r}, expected a nerf-pytorch checkpoint")
+        raise InputError(
+            f"contains no {NETWORKS['coarse']!r}", where=path, expected="a nerf-pytorch checkpoint"
+        )
     if not isinstance(found.get(NETWORKS["fine"]), dict):
-        raise InputError(f"{path}: has no fine network, expected a coarse and a fine one")
+        raise InputError("has no fine network", where=path, expected="a coarse and a fine one")
     check_sizes(path, [found[key] for key in NETWORKS.values()], EXPECTED)
     kinds: dict[str, NetworkConfig] = {}
     tensors: dict[str, Tensor] = {}
@@ -55,7 +57,7 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
         tensors |= {f"{level}.network.{name}": value.float() for name, value in found[key].items()}
     if kinds["coarse"] != kinds["fine"]:
         raise InputError(
-            f"{path}: the networks differ ({kinds['coarse']}; {kinds['fine']}), expected equal ones"
+            f"the networks differ ({kinds['coarse']}; {kinds['fine']})", where=path, expected="equal ones"
         )
     steps = found.get("iter")
     return Checkpoint(kinds["fine"], tensors, steps + 1 if type(steps) is int and steps >= 0 else 0)
@@ -74,7 +76,7 @@ def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> Network
             1 + len(inputs), width, skips, *frequencies, octaves, "fc_out.weight" not in shapes
         )
     except InputError as error:
-        raise InputError(f"{where}: unknown architecture, {error}") from error
+        raise InputError(f"unknown architecture, {error}", where=where) from error
     _check(tensors, shapes, Network(network), where)
     return network
 
@@ -85,14 +87,18 @@ def _is_hidden(name: str) -> bool:
 
 def _sizes(shape: tuple[int, ...] | None, where: str) -> tuple[int, int]:
     if shape is None or len(shape) != 2:
-        raise InputError(f"{where}: unknown architecture without 'layer1.weight', expected FlexibleNeRFModel")
+        raise InputError(
+            "unknown architecture without 'layer1.weight'", where=where, expected="FlexibleNeRFModel"
+        )
     return shape[0], shape[1]
 
 
 def _frequencies(width: int, where: str) -> tuple[int, bool]:
     """Return the number of frequencies of an encoding of length ``width``, and whether it includes the input itself."""
     if width < 3 or width % 3:
-        raise InputError(f"{where}: unknown architecture, {width} inputs where a multiple of 3 was expected")
+        raise InputError(
+            f"unknown architecture, {width} inputs where a multiple of 3 was expected", where=where
+        )
     return width // 6, width // 3 % 2 == 1
 
 
@@ -101,7 +107,7 @@ def _check(tensors: dict[str, Any], shapes: dict[str, tuple[int, ...]], network:
     for name in sorted(expected.keys() | shapes.keys()):
         found, wanted = shapes.get(name, "nothing"), expected.get(name, "nothing")
         if found != wanted:
-            raise InputError(f"{where}: unknown architecture, {name!r} is {found}, expected {wanted}")
+            raise InputError(f"unknown architecture, {name!r} is {found}", where=where, expected=wanted)
         value = tensors[name]
         if not (value.is_floating_point() and bool(value.isfinite().all())):
-            raise InputError(f"{where}: {name!r} has values that are not finite numbers")
+            raise InputError(f"{name!r} has values that are not finite numbers", where=where)

@@ -56,8 +56,9 @@ class NerfPytorchImporter:
         """Read the field of both networks, see ``Importer``. It stays in the world that it was trained in."""
         if not placement.is_identity:
             raise InputError(
-                f"{path}: networks cannot be moved or scaled; expected photos in their world, without scale"
-                " or pose"
+                "networks cannot be moved or scaled;",
+                where=path,
+                expected="photos in their world, without scale or pose",
             )
         bounds = SceneBounds(
             config.box[:3], config.box[3:], config.near, config.far, background_colour(config.background)

@@ -33,7 +33,7 @@ class NerfPytorchConfig(FieldConfig, SupervisionConfig):
         super().__post_init__()
         for kind in ("position", "direction"):
             if not (getattr(self, f"{kind}_frequencies") or getattr(self, f"{kind}_input")):
-                raise InputError(f"{kind}_frequencies is 0 without {kind}_input, expected one of them")
+                raise InputError(f"{kind}_frequencies is 0 without {kind}_input", expected="one of them")
 
 
 def train(field: NerfPytorchField, views: Sequence[View], config: NerfPytorchConfig, report: Report) -> None:
@@ -58,5 +58,7 @@ def _start_from(path: Path, field: NerfPytorchField) -> None:
     for each in fields(NetworkConfig):
         found, expected = getattr(checkpoint.network, each.name), getattr(field.config, each.name)
         if found != expected:
-            raise InputError(f"{path}: its networks have {each.name} {found}, but the config says {expected}")
+            raise InputError(
+                f"its networks have {each.name} {found}, but the config says {expected}", where=path
+            )
     field.load_state_dict(checkpoint.tensors)

@@ -84,7 +84,9 @@ def _data(run: Run, config: ImportSettings) -> tuple[Path | None, str]:
     if config.data:
         given = Path(config.data)
         if not given.exists():
-            raise InputError(f"{given}: no such file or folder, expected the dataset of the run (--data)")
+            raise InputError(
+                "no such file or folder", where=given, expected="the dataset of the run (--data)"
+            )
         return given, ""
     named = run.data
     if named is None or not named.exists():
@@ -129,7 +131,9 @@ def _networks(run: Run, placement: Placement, config: ImportSettings) -> Importe
     if model is None:
         known = enumeration([*MODELS, *SPLATS])
         raise InputError(
-            f"{run.folder / CONFIG}: a run of {run.kind}, which cannot be read; expected one of {known}"
+            f"a run of {run.kind}, which cannot be read;",
+            where=run.folder / CONFIG,
+            expected=f"one of {known}",
         )
     tensors, steps = run.weights()
     weights = Weights(run.checkpoint, tensors)
@@ -153,7 +157,7 @@ def _bounds(
     lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (read.box[:3], read.box[3:]))
     if not bool((lower < upper).all()):
         raise InputError(
-            f"{run.checkpoint}: the scene's box {read.box} is empty, expected one with an extent"
+            f"the scene's box {read.box} is empty", where=run.checkpoint, expected="one with an extent"
         )
     corners = torch.cartesian_prod(*torch.stack([lower, upper], dim=-1))
     world = inverse(placement.similarity).apply(corners)
@@ -172,7 +176,9 @@ def _splats(run: Run, placement: Similarity) -> ImportedField:
         from bidnerf_gaussians import importer
     except ImportError as error:
         raise InputError(
-            f"{run.folder / CONFIG}: a run of {run.kind}, expected the plugin bidnerf-gaussians to be installed"
+            f"a run of {run.kind}",
+            where=run.folder / CONFIG,
+            expected="the plugin bidnerf-gaussians to be installed",
         ) from error
     return importer.read(run.checkpoint, importer.config_type(), placement)
 

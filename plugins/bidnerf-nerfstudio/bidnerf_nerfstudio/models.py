@@ -73,7 +73,7 @@ def _radiance(
     names |= layer_names("radiance.base.head.", layers) | layer_names("radiance.head.", head)
     box = weights.get("field.aabb")
     if tuple(box.shape) != (2, 3):
-        raise weights.error(f"'field.aabb' is {tuple(box.shape)}, expected (2, 3)")
+        raise weights.error(f"'field.aabb' is {tuple(box.shape)}", expected="(2, 3)")
     corners = tuple(box.reshape(-1).tolist())
     settings = {
         "encoding": encoding, "geometry_features": geometry, "colour_layers": len(head),
@@ -89,7 +89,7 @@ def _base(weights: Weights) -> tuple[str, str]:
         if f"{begin}0.hash_table" in weights.tensors:
             return f"{begin}1.", f"{begin}0.hash_table"
     raise weights.error(
-        "no 'field.mlp_base.model.0.hash_table', expected a checkpoint of the model that the config names"
+        "no 'field.mlp_base.model.0.hash_table'", expected="a checkpoint of the model that the config names"
     )
 
 
@@ -108,7 +108,7 @@ def instant_ngp(weights: Weights, model: Record, parser: Record) -> Read:
     radiance, state, box = _radiance(weights, model, mean=False)
     cells = weights.get("occupancy_grid.binaries")
     if cells.dim() != 4 or len({*cells.shape[1:]}) != 1:
-        raise weights.error(f"'occupancy_grid.binaries' is {tuple(cells.shape)}, expected cubes of cells")
+        raise weights.error(f"'occupancy_grid.binaries' is {tuple(cells.shape)}", expected="cubes of cells")
     radiance["initial_density"] = 1.0  # this model does not set it
     side = [high - low for low, high in zip(box[:3], box[3:], strict=True)]
     step = model.number("render_step_size") or sum(s * s for s in side) ** 0.5 / 1000
@@ -125,7 +125,7 @@ def instant_ngp(weights: Weights, model: Record, parser: Record) -> Read:
 def vanilla(weights: Weights, model: Record, parser: Record) -> Read:
     """Read a vanilla-nerf run. Raises ``InputError`` if its tensors are inconsistent."""
     if model.value("enable_temporal_distortion"):
-        raise weights.error("a dynamic scene (enable_temporal_distortion), expected a static one")
+        raise weights.error("a dynamic scene (enable_temporal_distortion)", expected="a static one")
     names: dict[str, str] = {}
     for ours, theirs in (("coarse", "field_coarse"), ("fine", "field_fine")):
         begin = f"{ours}.network."

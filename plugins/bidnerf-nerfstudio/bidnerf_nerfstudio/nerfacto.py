@@ -41,11 +41,11 @@ class NerfactoConfig(RadianceConfig, SupervisionConfig):
         super().__post_init__()
         if not len(self.proposals) == len(self.proposal_samples) > 0:
             raise InputError(
-                f"proposal_samples has {len(self.proposal_samples)} numbers, expected one for each of"
-                f" {len(self.proposals)} proposals, and at least one"
+                f"proposal_samples has {len(self.proposal_samples)} numbers",
+                expected=f"one for each of {len(self.proposals)} proposals, and at least one",
             )
         if min(self.proposal_samples) < 2:
-            raise InputError(f"proposal_samples is {self.proposal_samples}, expected numbers of at least 2")
+            raise InputError(f"proposal_samples is {self.proposal_samples}", expected="numbers of at least 2")
 
 
 class Proposal(nn.Module):

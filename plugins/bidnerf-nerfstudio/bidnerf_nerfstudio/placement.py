@@ -35,7 +35,7 @@ class Placement:
             return Placement(scale, (1, 0, 0, 0, 1, 0, 0, 0, 1), (-scale * x, -scale * y, -scale * z))
         if len(numbers) != 13:
             raise InputError(
-                f"placement has {len(numbers)} numbers, expected a scale, 9 of a rotation, 3 of a shift"
+                f"placement has {len(numbers)} numbers", expected="a scale, 9 of a rotation, 3 of a shift"
             )
         return Placement(numbers[0], numbers[1:10], numbers[10:])
 

@@ -43,7 +43,7 @@ class RadianceConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= self.appearance <= 4096:
-            raise InputError(f"appearance is {self.appearance}, expected 0 to 4096")
+            raise InputError(f"appearance is {self.appearance}", expected="0 to 4096")
 
 
 class Radiance(nn.Module):

@@ -90,7 +90,7 @@ class Run:
             (int(match[1]), path) for path in folder.glob("*.ckpt") if (match := STEP.fullmatch(path.name))
         ]
         if not found:
-            raise InputError(f"{folder}: no step-*.ckpt, expected the checkpoint of a training run")
+            raise InputError("no step-*.ckpt", where=folder, expected="the checkpoint of a training run")
         return max(found)[1]
 
     def weights(self) -> tuple[dict[str, Tensor], int]:
@@ -98,7 +98,9 @@ class Run:
         found = read_saved(self.checkpoint, EXPECTED)
         tensors = found.get("pipeline") if isinstance(found, dict) else None
         if not isinstance(tensors, dict):
-            raise InputError(f"{self.checkpoint}: contains no 'pipeline', expected a nerfstudio checkpoint")
+            raise InputError(
+                "contains no 'pipeline'", where=self.checkpoint, expected="a nerfstudio checkpoint"
+            )
         named = {
             name.removeprefix("module.").removeprefix(PREFIX): value
             for name, value in tensors.items()
@@ -123,7 +125,7 @@ class Run:
         record = read_record(path, "the transform and the scale of nerfstudio's poses")
         scale = record.number("scale")
         if scale is None or not 1e-12 < scale < 1e12:
-            raise record.error(f"scale is {scale}, expected a number above 0")
+            raise record.error(f"scale is {scale}", expected="a number above 0")
         found = Similarity(scale, _moved(record, _rows(record, "transform"), scale))
         if data is None:
             return found, (
@@ -142,24 +144,24 @@ def read_run(path: Path) -> Run:
     folder = path.parent if path.name == CONFIG else path
     file = folder / CONFIG
     if not file.is_file():
-        raise InputError(f"{path}: no {CONFIG}, expected {EXPECTED}")
+        raise InputError(f"no {CONFIG}", where=path, expected=EXPECTED)
     if file.stat().st_size > LARGEST_CONFIG:
-        raise InputError(f"{file}: has {file.stat().st_size:,} bytes, expected a config of nerfstudio")
+        raise InputError(f"has {file.stat().st_size:,} bytes", where=file, expected="a config of nerfstudio")
     text = read_file(file, "a config of nerfstudio").decode("utf-8", "replace")
     try:
         found = yaml.load(text, _PlainLoader)
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{file}: not readable ({reason}), expected a config of nerfstudio") from error
+        raise InputError(f"not readable ({reason})", where=file, expected="a config of nerfstudio") from error
     if not isinstance(found, dict) or not isinstance(found.get("pipeline"), dict):
-        raise InputError(f"{file}: has no pipeline, expected a config of nerfstudio")
+        raise InputError("has no pipeline", where=file, expected="a config of nerfstudio")
     return Run(folder, Record(str(file), found))
 
 
 def _part(record: Record, key: str) -> Record:
     found = record.value(key)
     if not isinstance(found, dict):
-        raise record.error(f"no {key}, expected a config of nerfstudio")
+        raise record.error(f"no {key}", expected="a config of nerfstudio")
     return Record(f"{record.where}: {key}", found)
 
 
@@ -167,7 +169,7 @@ def _rows(record: Record, key: str) -> Float[Tensor, "3 4"]:
     """Return a matrix with 3 (or 4) rows of 4 numbers."""
     rows = record.items(key) or []
     if not (len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)):
-        raise record.error(f"{key} is not readable, expected 3 rows of 4 numbers")
+        raise record.error(f"{key} is not readable", expected="3 rows of 4 numbers")
     numbers = [[record.checked_number(value, key) for value in row] for row in rows[:3]]
     return torch.tensor(numbers, dtype=torch.float64)
 
@@ -177,7 +179,7 @@ def _moved(record: Record, rows: Float[Tensor, "3 4"], scale: float) -> SE3:
     rotation = rows[:, :3]
     off = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
     if not (float(off) < RIGID and float(torch.linalg.det(rotation)) > 0):
-        raise record.error("transform is not a rigid transform, expected a rotation and a translation")
+        raise record.error("transform is not a rigid transform", expected="a rotation and a translation")
     u, _, vh = torch.linalg.svd(rotation)
     return SE3(u @ vh, scale * rows[:, 3])
 

@@ -129,7 +129,7 @@ def reordered(weight: Float[Tensor, "o i"], count: int, weights: Weights) -> Flo
     """
     width = encoded_width(count)
     if weight.dim() != 2 or weight.shape[1] < width:
-        raise weights.error(f"a layer is {tuple(weight.shape)}, expected {width} inputs or more")
+        raise weights.error(f"a layer is {tuple(weight.shape)}", expected=f"{width} inputs or more")
     waves = torch.arange(2 * 3 * count).reshape(2, 3, count).transpose(1, 2).reshape(-1)
     order = torch.cat([torch.arange(width - 3, width), waves])
     return torch.cat([weight[:, order], weight[:, width:]], dim=-1)

@@ -28,16 +28,16 @@ class Weights:
     def __post_init__(self) -> None:
         packed = [name for name in self.tensors if name.endswith(".params")]
         if packed:
-            raise InputError(f"{self.path}: {TCNN} ({packed[0]!r})")
+            raise InputError(f"{TCNN} ({packed[0]!r})", where=self.path)
 
-    def error(self, finding: str) -> InputError:
-        return InputError(f"{self.path}: {finding}")
+    def error(self, found: str, expected: str | None = None) -> InputError:
+        return InputError(found, where=self.path, expected=expected)
 
     def get(self, name: str) -> Tensor:
         """Return a tensor of finite numbers, in single precision."""
         found = self.tensors.get(name)
         if found is None:
-            raise self.error(f"no {name!r}, expected a checkpoint of the model that the config names")
+            raise self.error(f"no {name!r}", expected="a checkpoint of the model that the config names")
         if found.is_floating_point() and not bool(found.isfinite().all()):
             raise self.error(f"{name!r} has values that are not finite numbers")
         return found.float()
@@ -46,7 +46,7 @@ class Weights:
         """Return an integer stored as a tensor."""
         found = self.get(name)
         if found.numel() != 1:
-            raise self.error(f"{name!r} is {tuple(found.shape)}, expected one number")
+            raise self.error(f"{name!r} is {tuple(found.shape)}", expected="one number")
         return int(found)
 
     def layers(self, prefix: str) -> list[str]:
@@ -56,7 +56,7 @@ class Weights:
             names.append(f"{prefix}layers.{len(names)}.")
         if not names:
             raise self.error(
-                f"no '{prefix}layers.0.weight', expected a checkpoint of the model that the config names"
+                f"no '{prefix}layers.0.weight'", expected="a checkpoint of the model that the config names"
             )
         return names
 
@@ -64,7 +64,7 @@ class Weights:
         """Return the shape of a tensor with that many dimensions."""
         shape = tuple(self.get(name).shape)
         if len(shape) != dimensions:
-            raise self.error(f"{name!r} is {shape}, expected {dimensions} dimensions")
+            raise self.error(f"{name!r} is {shape}", expected=f"{dimensions} dimensions")
         return shape
 
     def hash_config(self, field: str, table: str, layers: list[str], base: int) -> HashConfig:
@@ -75,7 +75,7 @@ class Weights:
         levels, log2 = self.number(f"{field}num_levels"), self.number(f"{field}log2_hashmap_size")
         if not (1 <= levels <= 64 and 1 <= log2 <= 30 and rows == levels * 2**log2):
             raise self.error(
-                f"{table!r} has {rows:,} rows, expected {levels} tables of 2 to the power of {log2}"
+                f"{table!r} has {rows:,} rows", expected=f"{levels} tables of 2 to the power of {log2}"
             )
         width = self.shape(f"{layers[0]}weight", 2)[0] if len(layers) > 1 else 1
         return HashConfig(levels, features, log2, base, self.number(f"{field}max_res"), width, len(layers))
@@ -89,9 +89,9 @@ class Weights:
         expected = field.state_dict()
         for name, value in expected.items():
             if name not in state:
-                raise self.error(f"nothing for {name!r} in it, expected {tuple(value.shape)}")
+                raise self.error(f"nothing for {name!r} in it", expected=tuple(value.shape))
             if state[name].shape != value.shape:
-                raise self.error(f"{name!r} is {tuple(state[name].shape)}, expected {tuple(value.shape)}")
+                raise self.error(f"{name!r} is {tuple(state[name].shape)}", expected=tuple(value.shape))
         field.load_state_dict({name: state[name].to(value.dtype) for name, value in expected.items()})
         return {name: value.detach() for name, value in field.state_dict().items()}
 
@@ -109,5 +109,5 @@ def mean_code(weights: Weights, name: str, mean: bool) -> Tensor:
     """Return the appearance code with which nerfstudio renders: the mean over its images, or zeros."""
     codes = weights.get(name)
     if codes.dim() != 2 or not len(codes):
-        raise weights.error(f"{name!r} is {tuple(codes.shape)}, expected a code for each image")
+        raise weights.error(f"{name!r} is {tuple(codes.shape)}", expected="a code for each image")
     return codes.mean(0) if mean else torch.zeros(codes.shape[1])

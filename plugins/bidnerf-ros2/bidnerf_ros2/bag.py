@@ -104,8 +104,9 @@ class BagReader(Reader):
     def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Raise ``InputError``: a bag is a sequence, not a dataset."""
         raise InputError(
-            f"{path}: a bag has no poses for its images, expected 'bidnerf track MAP {path}', or a dataset"
-            " with poses"
+            "a bag has no poses for its images",
+            where=path,
+            expected=f"'bidnerf track MAP {path}', or a dataset with poses",
         )
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
@@ -113,7 +114,7 @@ class BagReader(Reader):
         topics = _topics(path)
         given = options.camera
         if given is not None and not isinstance(given, Intrinsics):
-            raise InputError(f"{path}: a bag has its own camera; expected Intrinsics to replace it")
+            raise InputError("a bag has its own camera;", where=path, expected="Intrinsics to replace it")
         depth = "no depth" if topics.depth is None else f"depth of {topics.depth}"
         log.info("%s: images of %s, camera of %s, %s", path, topics.image, topics.info, depth)
         return BagSequence(path, topics, given or topics.camera)
@@ -131,14 +132,14 @@ def _messages(path: Path, names: tuple[str | None, ...]) -> Iterator[tuple[str, 
     except InputError:
         raise
     except Exception as error:  # the formats' parsers may raise anything
-        raise InputError(f"{path}: the bag cannot be read ({type(error).__name__}: {error})") from error
+        raise InputError(f"the bag cannot be read ({type(error).__name__}: {error})", where=path) from error
 
 
 def _first(path: Path, topic: str) -> Any:
     """Return the first message of a topic. Raises ``InputError`` if the bag declares messages but has none."""
     for _, _, message in _messages(path, (topic,)):
         return message
-    raise InputError(f"{path}: has no message of {topic}, although it declares some; is it truncated?")
+    raise InputError(f"has no message of {topic}, although it declares some; is it truncated?", where=path)
 
 
 def _topics(path: Path) -> Topics:
@@ -153,14 +154,17 @@ def _topics(path: Path) -> Topics:
                 elif connection.msgtype == INFO and connection.msgcount:
                     infos.add(connection.topic)
     except (AnyReaderError, OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: not a readable bag ({error}), expected {BagReader().expected}") from error
+        raise InputError(
+            f"not a readable bag ({error})", where=path, expected=BagReader().expected
+        ) from error
     first = {topic: _first(path, topic) for topic in (*counts, *infos)}
     colour = [t for t in counts if not is_depth(first[t]) and _info_beside(t, infos) in infos]
     if not colour:
         listed = ", ".join(sorted({*counts, *infos})) or "none"
         raise InputError(
-            f"{path}: no topic of colour images with a matching camera_info, expected one; its images and"
-            f" infos: {listed}"
+            "no topic of colour images with a matching camera_info",
+            where=path,
+            expected=f"one; its images and infos: {listed}",
         )
     image = max(colour, key=lambda topic: (counts[topic], not hasattr(first[topic], "format")))
     info = _info_beside(image, infos)

@@ -43,11 +43,11 @@ def intrinsics(info: Any, rectified: bool = False) -> Intrinsics:
     k, d, p = (_values(info, name) for name in "kdp")
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if rectified else (k[0], k[4], k[2], k[5])
     if not fx > 0:
-        raise InputError("the camera info has a focal length of 0, expected a calibrated camera")
+        raise InputError("the camera info has a focal length of 0", expected="a calibrated camera")
     model = info.distortion_model
     if not rectified and any(d) and model not in ("plumb_bob", "rational_polynomial"):
         raise InputError(
-            f"distortion model {model!r}, expected plumb_bob or rational_polynomial; or rectify the images"
+            f"distortion model {model!r}", expected="plumb_bob or rational_polynomial; or rectify the images"
         )
     lens = () if rectified or not any(d) else tuple(d)
     bin_x, bin_y, roi = info.binning_x or 1, info.binning_y or 1, info.roi
@@ -74,7 +74,8 @@ def colour_image(message: Any) -> np.ndarray:
     if message.encoding not in COLOURS:
         known = ", ".join(COLOURS)
         raise InputError(
-            f"image encoding {message.encoding!r}, expected one of {known}; image_proc converts Bayer patterns"
+            f"image encoding {message.encoding!r}",
+            expected=f"one of {known}; image_proc converts Bayer patterns",
         )
     pixels = _raster(message, np.dtype(np.uint8), BYTES.get(message.encoding, 1))
     order = COLOURS[message.encoding]
@@ -89,7 +90,7 @@ def depth_image(message: Any) -> tuple[np.ndarray, float]:
     if hasattr(message, "format"):
         return _compressed_depth(message)
     if message.encoding not in DEPTHS:
-        raise InputError(f"depth encoding {message.encoding!r}, expected one of {', '.join(DEPTHS)}")
+        raise InputError(f"depth encoding {message.encoding!r}", expected=f"one of {', '.join(DEPTHS)}")
     kind, unit = DEPTHS[message.encoding]
     return _raster(message, np.dtype(kind), 1)[..., 0], unit
 
@@ -115,7 +116,8 @@ def _raster(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
     row, data = width * channels * kind.itemsize, np.asarray(bytearray(message.data), np.uint8)
     if not (0 < width * height <= LARGEST and row <= step and len(data) >= step * (height - 1) + row):
         raise InputError(
-            f"an image of {width}x{height} in rows of {step} bytes has {len(data)} bytes, expected {step * height}"
+            f"an image of {width}x{height} in rows of {step} bytes has {len(data)} bytes",
+            expected=step * height,
         )
     rows = np.ascontiguousarray(np.ndarray((height, row), np.uint8, data, 0, (step, 1)))
     stored = kind.newbyteorder(">" if message.is_bigendian else "<")
@@ -127,8 +129,8 @@ def _decoded(content: bytes) -> Image.Image:
         image = Image.open(io.BytesIO(content), formats=("JPEG", "PNG", "TIFF", "WEBP"))
         if image.width * image.height > LARGEST:
             raise InputError(
-                f"an image has {image.width}x{image.height} pixels, expected at most {LARGEST // 10**6}"
-                " megapixels"
+                f"an image has {image.width}x{image.height} pixels",
+                expected=f"at most {LARGEST // 10**6} megapixels",
             )
         image.load()
     except InputError:

@@ -61,7 +61,7 @@ def make_node() -> Any:
                 name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()
             }
             if not self.options["map"]:
-                raise InputError("parameter map is empty, expected the folder of a map")
+                raise InputError("parameter map is empty", expected="the folder of a map")
             self.bridge = Bridge(Localizer(load_map(self.options["map"])), bool(self.options["odom_frame"]))
             self.optical_frame, self.info = "", None
             self.buffer = tf2_ros.Buffer()

@@ -45,7 +45,7 @@ def export_obj(scene: Map, out: Path) -> list[Path]:
 def _mesh(scene: Map) -> Mesh:
     if scene.surface is None:
         raise InputError(
-            f"{scene.name}: has no surface, from which a mesh could be made; 'bidnerf bake' adds one"
+            "has no surface, from which a mesh could be made; 'bidnerf bake' adds one", where=scene.name
         )
     return mesh_of_surface(scene.surface)
 

@@ -79,7 +79,7 @@ class ScanImporter:
         """Read the mesh or cloud in a file as a field, see ``Importer``."""
         found = format_of(path)
         if found is None:
-            raise InputError(f"{path}: not a readable mesh or point cloud, expected {self.summary}")
+            raise InputError("not a readable mesh or point cloud", where=path, expected=self.summary)
         return imported(
             found.read(path), str(path), config, placement, found, cameras_beside(path, placement)
         )
@@ -186,9 +186,10 @@ def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSetti
     if rounding > COARSEST * side:
         x, y, z = (round(o + float(m)) for o, m in zip(config.origin, middle, strict=True))
         raise InputError(
-            f"{where}: its coordinates are around ({x}, {y}, {z}), which single precision resolves only to"
-            f" {rounding:.2g}; expected a scan near the origin (--origin {x} {y} {z} makes that place the"
-            " origin)"
+            f"its coordinates are around ({x}, {y}, {z}), which single precision resolves only to"
+            f" {rounding:.2g};",
+            where=where,
+            expected=f"a scan near the origin (--origin {x} {y} {z} makes that place the origin)",
         )
 
 

@@ -62,19 +62,19 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
     """Return the usable part of a scan, and what was left out. Raises ``InputError`` if nothing is left."""
     dropped = Dropped()
     if not len(scan.points):
-        raise InputError(f"{where}: holds no points, expected a mesh or a point cloud")
+        raise InputError("holds no points", where=where, expected="a mesh or a point cloud")
     good = np.asarray(np.all(np.isfinite(scan.points) & (np.abs(scan.points) < FARTHEST), axis=-1))
     dropped.not_finite = int((~good).sum())
     rgb = None if scan.rgb is None else np.nan_to_num(scan.rgb, nan=0.5).clip(0, 1)
     if scan.faces is None:
         points, rgb = scan.points[good], None if rgb is None else rgb[good]
         if not len(points):
-            raise InputError(f"{where}: none of its {len(good):,} points has finite coordinates")
+            raise InputError(f"none of its {len(good):,} points has finite coordinates", where=where)
         _, first = np.unique(points, axis=0, return_index=True)
         dropped.repeated = len(points) - len(first)
         first.sort()
         if len(first) < FEWEST:
-            raise InputError(f"{where}: {len(first)} distinct points, expected at least three")
+            raise InputError(f"{len(first)} distinct points", where=where, expected="at least three")
         return Scan(points[first], None if rgb is None else rgb[first]), dropped
     exists = np.asarray(np.all((scan.faces >= 0) & (scan.faces < len(scan.points)), axis=-1))
     whole = exists.copy()
@@ -87,7 +87,7 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
     kept = whole & has_area
     dropped.broken_faces, dropped.flat_faces = int((~whole).sum()), int((whole & ~has_area).sum())
     if not kept.any():
-        raise InputError(f"{where}: none of its {len(kept):,} faces has three finite corners and an area")
+        raise InputError(f"none of its {len(kept):,} faces has three finite corners and an area", where=where)
     part = replace(
         scan, points=np.where(good[:, None], scan.points, 0.0), rgb=rgb, faces=scan.faces[kept],
         uv=None if scan.uv is None else np.nan_to_num(scan.uv[kept]),

@@ -153,8 +153,9 @@ def _between(frame: ScannerFrame, name: str) -> Frame:
     photo_width, photo_height = projected_size(frame.record)
     if not same_aspect((width, height), (photo_width, photo_height)):
         raise InputError(
-            f"{frame.beside('depth')}: depth is {width}x{height}, but its camera's photos are"
-            f" {photo_width}x{photo_height}; expected the same aspect ratio"
+            f"depth is {width}x{height}, but its camera's photos are {photo_width}x{photo_height};",
+            where=frame.beside("depth"),
+            expected="the same aspect ratio",
         )
     camera = scanner_camera(frame.record, photo_width, photo_height).resized(width, height)
     return Frame(name, torch.zeros(height, width, 3), camera, depth, has_colour=False)
@@ -170,12 +171,12 @@ def scanner_frames(folder: Path) -> list[ScannerFrame]:
     photos = sorted((int(found[1]), path) for path, found in numbered.items() if found)
     if not photos:
         raise InputError(
-            f"{folder}: has frame_N.json but no photo, expected frame_N.jpg next to some of them"
+            "has frame_N.json but no photo", where=folder, expected="frame_N.jpg next to some of them"
         )
     for (number, path), (following, other) in pairwise(photos):
         if number == following:
             raise InputError(
-                f"{folder}: {path.name} and {other.name} have the same number, expected each once"
+                f"{path.name} and {other.name} have the same number", where=folder, expected="each once"
             )
     has_depth = any(folder.glob("depth_*.png")) or any(folder.glob("conf_*.png"))
     return [_frame(path.with_suffix(".json"), path, has_depth) for _, path in photos]
@@ -197,7 +198,7 @@ def _frame(description: Path, photo: Path | None, has_depth: bool) -> ScannerFra
     for kind in ("depth", "conf") if has_depth else ():
         if not frame.beside(kind).is_file():
             there = description if photo is None else photo
-            raise InputError(f"{frame.beside(kind)}: no such file, although {there.name} exists")
+            raise InputError(f"no such file, although {there.name} exists", where=frame.beside(kind))
     return frame
 
 
@@ -209,7 +210,7 @@ def projected_size(record: Record) -> tuple[int, int]:
     fx, _, _, _, fy, *_ = _numbers(record, INTRINSICS, 9)
     projection = _numbers(record, PROJECTION, 16)
     if projection[0] <= 0 or projection[5] <= 0:
-        raise record.error(f"{PROJECTION} has no positive focal lengths, expected an ARKit matrix")
+        raise record.error(f"{PROJECTION} has no positive focal lengths", expected="an ARKit matrix")
     return round(2 * fx / projection[0]), round(2 * fy / projection[5])
 
 
@@ -217,7 +218,7 @@ def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
     """Return the camera of a photo of this size. Raises ``InputError`` if the intrinsics are for another size."""
     fx, skew, cx, _, fy, cy, *last = _numbers(record, INTRINSICS, 9)
     if abs(skew) > 1e-6 or last != [0, 0, 1]:
-        raise record.error(f"{INTRINSICS} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], expected 3x3 row by row")
+        raise record.error(f"{INTRINSICS} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]", expected="3x3 row by row")
     centre = (cx + 0.5, cy + 0.5)
     if record.items(PROJECTION) is not None:
         # u = (1 + x_ndc) w / 2 with x_ndc = P00 x / -z - P02, and likewise v, which points down
@@ -240,9 +241,11 @@ def read_measured(depth: Path, confidence: Path) -> DepthImage:
     height, width = measured.metres.shape
     if sure.shape != (height, width):
         found = "x".join(map(str, sure.shape[1::-1] + sure.shape[2:]))
-        raise InputError(f"{confidence}: is {found}, expected {width}x{height} as {depth.name}")
+        raise InputError(f"is {found}", where=confidence, expected=f"{width}x{height} as {depth.name}")
     if sure.dtype != np.uint8 or sure.max() > HIGH_CONFIDENCE:
-        raise InputError(f"{confidence}: has values up to {sure.max()}, expected confidences of 0, 1 and 2")
+        raise InputError(
+            f"has values up to {sure.max()}", where=confidence, expected="confidences of 0, 1 and 2"
+        )
     return replace(measured, metres=_kept(measured.metres, torch.from_numpy(sure)))
 
 
@@ -252,7 +255,8 @@ def _kept(metres: Float[Tensor, "h w"], confidence: Tensor) -> Float[Tensor, "h 
 
 def _other_size(record: Record, width: int, height: int) -> InputError:
     return record.error(
-        f"{INTRINSICS} do not match its photo of {width}x{height}; expected intrinsics scaled with the photo"
+        f"{INTRINSICS} do not match its photo of {width}x{height};",
+        expected="intrinsics scaled with the photo",
     )
 
 
@@ -260,9 +264,9 @@ def _numbers(record: Record, key: str, count: int) -> list[float]:
     """Return ``count`` finite numbers."""
     found = record.items(key)
     if found is None:
-        raise record.error(f"no {key}, expected {count} numbers")
+        raise record.error(f"no {key}", expected=f"{count} numbers")
     if len(found) != count:
-        raise record.error(f"{key} has {len(found)} entries, expected {count} numbers")
+        raise record.error(f"{key} has {len(found)} entries", expected=f"{count} numbers")
     return [record.checked_number(value, f"an entry of {key}") for value in found]
 
 

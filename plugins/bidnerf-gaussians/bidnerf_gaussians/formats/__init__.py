@@ -51,7 +51,7 @@ def read_gaussians(path: Path) -> Gaussians:
     found = format_of(path)
     if found is None:
         names = ", ".join(each.name for each in FORMATS)
-        raise InputError(f"{path}: not a readable file of Gaussians, expected one of: {names}")
+        raise InputError("not a readable file of Gaussians", where=path, expected=f"one of: {names}")
     return found.read(path)
 
 
@@ -60,6 +60,6 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
     writers = {".ply": ply.write, ".spz": spz.write}
     if path.suffix.lower() not in writers:
         raise InputError(
-            f"{path}: cannot write {path.suffix or 'a name without extension'}, expected .ply or .spz"
+            f"cannot write {path.suffix or 'a name without extension'}", where=path, expected=".ply or .spz"
         )
     writers[path.suffix.lower()](path, gaussians)

@@ -38,7 +38,7 @@ def read(path: Path) -> Gaussians:
     found = _parameters(read_saved(path, EXPECTED))
     missing = [name for name in ("means", "log_scales", "quaternions", "logits", "sh0") if name not in found]
     if missing:
-        raise InputError(f"{path}: has no {', '.join(missing)}, expected {EXPECTED}")
+        raise InputError(f"has no {', '.join(missing)}", where=path, expected=EXPECTED)
     check_sizes(path, found, EXPECTED)
     try:
         parts = {name: value.float() for name, value in found.items()}
@@ -50,7 +50,7 @@ def read(path: Path) -> Gaussians:
             parts["quaternions"].reshape(count, 4), parts["logits"].reshape(count), harmonics,
         )  # fmt: skip
     except (RuntimeError, TypeError) as error:
-        raise InputError(f"{path}: tensors with different counts ({error}), expected {EXPECTED}") from error
+        raise InputError(f"tensors with different counts ({error})", where=path, expected=EXPECTED) from error
 
 
 def _parameters(saved: Any) -> dict[str, Tensor]:

@@ -52,14 +52,18 @@ class _Scene:
         if uri is None and self.binary is not None and number == 0:
             return self.binary
         if not isinstance(uri, str) or Path(uri).name != uri:
-            raise InputError(f"{self.path}: names a buffer {str(uri)[:40]!r}, expected a file next to it")
+            raise InputError(
+                f"names a buffer {str(uri)[:40]!r}", where=self.path, expected="a file next to it"
+            )
         return read_file(self.path.parent / uri, f"a buffer of {EXPECTED}", LARGEST_FILE)
 
     def accessor(self, number: int) -> np.ndarray:
         """Return the numbers (n w) of an accessor; normalized integers become fractions."""
         entry = self.gltf["accessors"][number]
         if "sparse" in entry or "bufferView" not in entry:
-            raise InputError(f"{self.path}: accessor {number} is sparse or empty, expected plain numbers")
+            raise InputError(
+                f"accessor {number} is sparse or empty", where=self.path, expected="plain numbers"
+            )
         view = self.gltf["bufferViews"][entry["bufferView"]]
         kind, width, count = (
             np.dtype(COMPONENTS[entry["componentType"]]),
@@ -72,8 +76,9 @@ class _Scene:
         last = start + (count - 1) * stride + width * kind.itemsize
         if min(start, count, stride - width * kind.itemsize) < 0 or last > len(content):
             raise InputError(
-                f"{self.path}: accessor {number} declares {count:,} elements, but its buffer of"
-                f" {len(content):,} bytes is too short"
+                f"accessor {number} declares {count:,} elements, but its buffer of {len(content):,} bytes is"
+                " too short",
+                where=self.path,
             )
         rows = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).astype(np.float32)
         if not entry.get("normalized"):
@@ -97,10 +102,10 @@ def read(path: Path) -> Gaussians:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{path}: is damaged ({type(error).__name__}: {error}), expected {EXPECTED}"
+            f"is damaged ({type(error).__name__}: {error})", where=path, expected=EXPECTED
         ) from error
     if not found:
-        raise InputError(f"{path}: no node shows Gaussians, expected {EXPECTED}")
+        raise InputError("no node shows Gaussians", where=path, expected=EXPECTED)
     return joined(found)
 
 
@@ -113,15 +118,15 @@ def _opened(path: Path) -> _Scene:
         while place + 8 <= len(content):
             length, kind = struct.unpack_from("<II", content, place)
             if place + 8 + length > len(content):
-                raise InputError(f"{path}: a chunk of {length:,} bytes is truncated, expected {EXPECTED}")
+                raise InputError(f"a chunk of {length:,} bytes is truncated", where=path, expected=EXPECTED)
             chunks.setdefault(kind, content[place + 8 : place + 8 + length])
             place += 8 + length
         if JSON not in chunks:
-            raise InputError(f"{path}: has no JSON chunk, expected {EXPECTED}")
+            raise InputError("has no JSON chunk", where=path, expected=EXPECTED)
         text, binary = chunks[JSON], chunks.get(BINARY)
     gltf = parse_json(text, str(path), EXPECTED)
     if not isinstance(gltf, dict):
-        raise InputError(f"{path}: its JSON is not an object, expected {EXPECTED}")
+        raise InputError("its JSON is not an object", where=path, expected=EXPECTED)
     return _Scene(path, gltf, binary)
 
 
@@ -162,7 +167,9 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
     names = primitive["attributes"]
     if "extensions" in primitive["extensions"][EXTENSION]:
         further = ", ".join(primitive["extensions"][EXTENSION]["extensions"])
-        raise InputError(f"{scene.path}: its Gaussians are compressed ({further}), which is not supported")
+        raise InputError(
+            f"its Gaussians are compressed ({further}), which is not supported", where=scene.path
+        )
     harmonics = []
     for degree in COEFFICIENTS:
         of_degree = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for n in range(2 * degree + 1)]
@@ -182,7 +189,7 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
     count = len(position)
     if shapes != [(count, 3), (count, 3), (count, 4), (count, 1), *[(count, 3)] * len(harmonics)]:
         raise InputError(
-            f"{scene.path}: its attributes have the shapes {shapes}, expected one for each Gaussian"
+            f"its attributes have the shapes {shapes}", where=scene.path, expected="one for each Gaussian"
         )
     return gaussians_of(
         position, scale, np.roll(rotation, 1, axis=-1), logit(opacity[:, 0]), np.stack(harmonics, axis=1)
@@ -195,7 +202,7 @@ def _placed(gaussians: Gaussians, matrix: np.ndarray, path: Path) -> Gaussians:
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not scale > 0 or float(np.ptp(scales)) > UNEVEN * scale:
         raise InputError(
-            f"{path}: a node stretches or mirrors its Gaussians, expected one scale for all axes"
+            "a node stretches or mirrors its Gaussians", where=path, expected="one scale for all axes"
         )
     rotation = torch.from_numpy(matrix[:3, :3] / scale)
     return gaussians.similar(scale, rotation, torch.from_numpy(matrix[:3, 3].copy()))

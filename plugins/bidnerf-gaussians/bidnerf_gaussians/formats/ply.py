@@ -54,7 +54,7 @@ def read(path: Path) -> Gaussians:
     names = vertices.dtype.names or ()
     missing = [name for name in NEEDED if name not in names]
     if missing:
-        raise InputError(f"{path}: has no property {', '.join(missing)}, expected {EXPECTED}")
+        raise InputError(f"has no property {', '.join(missing)}", where=path, expected=EXPECTED)
     rest = sum(name.startswith("f_rest_") for name in names)
     harmonics = _columns(vertices, COLOUR)[:, None]
     if rest:
@@ -67,7 +67,7 @@ def read(path: Path) -> Gaussians:
 
 def _vertices(elements: Mapping[str, np.ndarray], path: Path) -> np.ndarray:
     if "vertex" not in elements:
-        raise InputError(f"{path}: has lists of numbers in or before its vertices, expected {EXPECTED}")
+        raise InputError("has lists of numbers in or before its vertices", where=path, expected=EXPECTED)
     return elements["vertex"]
 
 
@@ -75,7 +75,9 @@ def _rest(rows: np.ndarray, count: int, path: Path) -> np.ndarray:
     """Return the harmonics (n k 3) above degree 0, which are stored channel by channel."""
     if count not in DEGREES or any(f"f_rest_{i}" not in (rows.dtype.names or ()) for i in range(count)):
         raise InputError(
-            f"{path}: has {count} properties f_rest_N, expected 0, 9, 24 or 45 (degree 0 to 3 of the harmonics)"
+            f"has {count} properties f_rest_N",
+            where=path,
+            expected="0, 9, 24 or 45 (degree 0 to 3 of the harmonics)",
         )
     return _columns(rows, tuple(f"f_rest_{i}" for i in range(count))).reshape(len(rows), 3, -1).swapaxes(1, 2)
 
@@ -111,7 +113,7 @@ def read_compressed(path: Path) -> Gaussians:
     missing = [name for name in PACKED if name not in names]
     if missing or chunks is None or len(chunks) * CHUNK < len(vertices):
         found = f"no property {', '.join(missing)}" if missing else "too few chunks"
-        raise InputError(f"{path}: has {found}, expected a compressed PlayCanvas PLY file")
+        raise InputError(f"has {found}", where=path, expected="a compressed PlayCanvas PLY file")
     position, turn, scale, colour = (vertices[name].astype(np.uint32) for name in PACKED)
     chunk = np.arange(len(vertices)) // CHUNK
 

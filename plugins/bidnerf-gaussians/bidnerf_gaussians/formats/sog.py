@@ -50,7 +50,7 @@ def read(path: Path) -> Gaussians:
             if isinstance(error, InputError):
                 raise
             raise InputError(
-                f"{path}: is damaged ({type(error).__name__}: {error}), expected {EXPECTED}"
+                f"is damaged ({type(error).__name__}: {error})", where=path, expected=EXPECTED
             ) from error
 
 
@@ -62,7 +62,7 @@ def _opened(path: Path) -> Iterator[Member]:
 
         def of_folder(name: str) -> bytes:
             if Path(name).name != name:
-                raise InputError(f"{path}: names a file {name!r}, expected one next to {META}")
+                raise InputError(f"names a file {name!r}", where=path, expected=f"one next to {META}")
             return read_file(folder / name, f"a part of {EXPECTED}", LARGEST_MEMBER)
 
         yield of_folder
@@ -70,7 +70,7 @@ def _opened(path: Path) -> Iterator[Member]:
     try:
         archive = zipfile.ZipFile(path)
     except Exception as error:  # damaged archives raise errors of many types
-        raise InputError(f"{path}: is not a zip archive ({error}), expected {EXPECTED}") from error
+        raise InputError(f"is not a zip archive ({error})", where=path, expected=EXPECTED) from error
     with archive:
 
         def of_archive(name: str) -> bytes:
@@ -78,7 +78,7 @@ def _opened(path: Path) -> Iterator[Member]:
                 size = archive.getinfo(name).file_size
                 if size > LARGEST_MEMBER:
                     raise InputError(
-                        f"{path}: {name} unpacks to {size / 2**20:,.0f} MiB, expected at most 512"
+                        f"{name} unpacks to {size / 2**20:,.0f} MiB", where=path, expected="at most 512"
                     )
                 with archive.open(name) as file:
                     return file.read(LARGEST_MEMBER)
@@ -88,7 +88,7 @@ def _opened(path: Path) -> Iterator[Member]:
                 Exception
             ) as error:  # raised by zipfile and its decompressors; an encrypted member raises another one
                 raise InputError(
-                    f"{path}: contains no readable {name} ({error}), expected {EXPECTED}"
+                    f"contains no readable {name} ({error})", where=path, expected=EXPECTED
                 ) from error
 
         yield of_archive
@@ -96,22 +96,22 @@ def _opened(path: Path) -> Iterator[Member]:
 
 def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:
     if meta.get("version") != 2:
-        raise InputError(f"{path}: version {meta.get('version')!r} of its {META}, expected 2")
+        raise InputError(f"version {meta.get('version')!r} of its {META}", where=path, expected="2")
     count = meta["count"]
     if type(count) is not int or not 0 < count <= LARGEST_IMAGE:
-        raise InputError(f"{path}: declares {count!r} Gaussians, expected 1 to {LARGEST_IMAGE:,}")
+        raise InputError(f"declares {count!r} Gaussians", where=path, expected=f"1 to {LARGEST_IMAGE:,}")
 
     def pixels(part: str, number: int = 0) -> np.ndarray:
         name = meta[part]["files"][number]
         found = _image(member(name), f"{path}: {name}").reshape(-1, 4)
         if len(found) < count:
-            raise InputError(f"{path}: {name} has {len(found):,} pixels, too few for {count:,} Gaussians")
+            raise InputError(f"{name} has {len(found):,} pixels, too few for {count:,} Gaussians", where=path)
         return found[:count]
 
     def book(part: str) -> np.ndarray:
         values = np.array(meta[part]["codebook"], dtype=np.float32)
         if values.shape != (256,):
-            raise InputError(f"{path}: a codebook of {values.shape} in {part}, expected 256 numbers")
+            raise InputError(f"a codebook of {values.shape} in {part}", where=path, expected="256 numbers")
         return values
 
     low, high = (np.array(meta["means"][end], dtype=np.float32) for end in ("mins", "maxs"))
@@ -140,10 +140,10 @@ def _rest(
     entry = labels[:, 0] + 256 * labels[:, 1]
     palette = _image(member(meta["files"][0]), f"{path}: {meta['files'][0]}")
     if palette.shape[1] != PALETTE_WIDTH * count:
-        raise InputError(f"{path}: a palette {palette.shape[1]} wide, expected {PALETTE_WIDTH * count}")
+        raise InputError(f"a palette {palette.shape[1]} wide", where=path, expected=PALETTE_WIDTH * count)
     entries = palette[..., :3].reshape(-1, count, 3)  # row by row, with ``PALETTE_WIDTH`` entries per row
     if int(entry.max()) >= len(entries):
-        raise InputError(f"{path}: names entry {int(entry.max())} of a palette of {len(entries)}")
+        raise InputError(f"names entry {int(entry.max())} of a palette of {len(entries)}", where=path)
     return book[entries[entry]]
 
 
@@ -155,8 +155,12 @@ def _image(content: bytes, where: str) -> np.ndarray:
             image = Image.open(io.BytesIO(content), formats=("WEBP", "PNG"))
             if image.width * image.height > LARGEST_IMAGE:
                 raise InputError(
-                    f"{where}: has {image.width} x {image.height} pixels, expected at most {LARGEST_IMAGE:,}"
+                    f"has {image.width} x {image.height} pixels",
+                    where=where,
+                    expected=f"at most {LARGEST_IMAGE:,}",
                 )
             return np.asarray(image.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{where}: is not a readable image ({error}), expected a lossless WebP") from error
+        raise InputError(
+            f"is not a readable image ({error})", where=where, expected="a lossless WebP"
+        ) from error

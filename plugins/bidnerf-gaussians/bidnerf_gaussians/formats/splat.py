@@ -25,7 +25,7 @@ def read(path: Path) -> Gaussians:
     content = read_file(path, "a .splat file", LARGEST_FILE)
     if not content or len(content) % ROW.itemsize:
         raise InputError(
-            f"{path}: has {len(content):,} bytes, expected a multiple of 32, the size of a Gaussian"
+            f"has {len(content):,} bytes", where=path, expected="a multiple of 32, the size of a Gaussian"
         )
     rows = np.frombuffer(content, ROW)
     rgba = rows["rgba"] / np.float32(255)

@@ -64,15 +64,17 @@ def _sizes(version: int, count: int, degree: int) -> list[int]:
 def _checked(header: tuple[Any, ...], versions: range, path: Path) -> tuple[int, int, int, int]:
     magic, version, count, degree, bits = header[:5]
     if magic != MAGIC:
-        raise InputError(f"{path}: begins with {magic!r}, expected {EXPECTED}")
+        raise InputError(f"begins with {magic!r}", where=path, expected=EXPECTED)
     if version not in versions:
         raise InputError(
-            f"{path}: version {version}, expected {versions[0]} to {versions[-1]} of {EXPECTED} like this"
+            f"version {version}",
+            where=path,
+            expected=f"{versions[0]} to {versions[-1]} of {EXPECTED} like this",
         )
     if degree not in COEFFICIENTS:
-        raise InputError(f"{path}: harmonics of degree {degree}, expected 0 to 3")
+        raise InputError(f"harmonics of degree {degree}", where=path, expected="0 to 3")
     if bits > 24:
-        raise InputError(f"{path}: {bits} fraction bits, expected 0 to 24")
+        raise InputError(f"{bits} fraction bits", where=path, expected="0 to 24")
     return version, count, degree, bits
 
 
@@ -81,22 +83,22 @@ def _unzipped(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, i
     try:
         start = stream.decompress(content, HEADER.size)
         if len(start) < HEADER.size:
-            raise InputError(f"{path}: is too short for a header, expected {EXPECTED}")
+            raise InputError("is too short for a header", where=path, expected=EXPECTED)
         version, count, degree, bits = _checked(HEADER.unpack(start), range(1, 4), path)
         sizes = _sizes(version, count, degree)
         if sum(sizes) > MOST_INFLATED * len(content):
             raise InputError(
-                f"{path}: declares {count:,} Gaussians, more than its {len(content):,} bytes can hold"
+                f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path
             )
         rest = stream.decompress(
             stream.unconsumed_tail, sum(sizes) or 1
         )  # no more than declared is ever unpacked
     except zlib.error as error:
-        raise InputError(f"{path}: is damaged ({error}), expected {EXPECTED}") from error
+        raise InputError(f"is damaged ({error})", where=path, expected=EXPECTED) from error
     if len(rest) < sum(sizes):
         raise InputError(
-            f"{path}: declares {count:,} Gaussians, but its data ends after {len(rest):,} of {sum(sizes):,}"
-            " bytes"
+            f"declares {count:,} Gaussians, but its data ends after {len(rest):,} of {sum(sizes):,} bytes",
+            where=path,
         )
     ends = np.cumsum([0, *sizes])
     return [rest[a:b] for a, b in pairwise(ends)], version, count, degree, bits
@@ -104,7 +106,7 @@ def _unzipped(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, i
 
 def _streams(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, int]:
     if len(content) < HEADER_4.size:
-        raise InputError(f"{path}: is too short for a header, expected {EXPECTED}")
+        raise InputError("is too short for a header", where=path, expected=EXPECTED)
     header = HEADER_4.unpack_from(content)
     version, count, degree, bits = _checked(header, range(4, 5), path)
     number, place = header[6], header[7]
@@ -113,18 +115,20 @@ def _streams(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, in
     start = place + 16 * number
     if number != len(wanted) or place < HEADER_4.size or start > len(content):
         raise InputError(
-            f"{path}: has {number} streams, expected {len(wanted)} for {count:,} Gaussians of degree {degree}"
+            f"has {number} streams",
+            where=path,
+            expected=f"{len(wanted)} for {count:,} Gaussians of degree {degree}",
         )
     if sum(sizes) > MOST_INFLATED * len(content):
         raise InputError(
-            f"{path}: declares {count:,} Gaussians, more than its {len(content):,} bytes can hold"
+            f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path
         )
     found = []
     for index, size in enumerate(wanted):
         packed, unpacked = struct.unpack_from("<QQ", content, place + 16 * index)
         if unpacked != size or start + packed > len(content):
             raise InputError(
-                f"{path}: stream {index} has {unpacked:,} bytes, expected {size:,}; is it truncated?"
+                f"stream {index} has {unpacked:,} bytes", where=path, expected=f"{size:,}; is it truncated?"
             )
         found.append(_zstandard(content[start : start + packed], size, path))
         start += packed
@@ -137,19 +141,19 @@ def _zstandard(content: bytes, size: int, path: Path) -> bytes:
         import zstandard
     except ImportError as error:
         raise InputError(
-            f"{path}: has version 4, which needs the package zstandard: pip install zstandard"
+            "has version 4, which needs the package zstandard: pip install zstandard", where=path
         ) from error
     try:
         told = zstandard.get_frame_parameters(
             content
         ).content_size  # which the library trusts, regardless of our limit
         if told not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            raise InputError(f"{path}: a stream unpacks to {told:,} bytes, expected {size:,}")
+            raise InputError(f"a stream unpacks to {told:,} bytes", where=path, expected=f"{size:,}")
         found = bytes(zstandard.ZstdDecompressor().decompress(content, max_output_size=size))
     except (zstandard.ZstdError, MemoryError) as error:
-        raise InputError(f"{path}: is damaged ({error}), expected {EXPECTED}") from error
+        raise InputError(f"is damaged ({error})", where=path, expected=EXPECTED) from error
     if len(found) != size:
-        raise InputError(f"{path}: a stream has {len(found):,} bytes, expected {size:,}")
+        raise InputError(f"a stream has {len(found):,} bytes", where=path, expected=f"{size:,}")
     return found
 
 
@@ -198,7 +202,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
     largest = max(1e-9, float(found.means.abs().max()) if len(found) else 1.0)
     bits = int(np.clip(np.floor(23 - np.log2(largest * (1 + 1e-6))), 0, 24))
     if largest * 2**bits >= 2**23:
-        raise InputError(f"{path}: a Gaussian {largest:g} from the origin is too far for this format")
+        raise InputError(f"a Gaussian {largest:g} from the origin is too far for this format", where=path)
     fixed = np.round(found.means.double().numpy() * 2**bits).astype(np.int32) & 0xFFFFFF
     position = np.stack([fixed & 255, fixed >> 8 & 255, fixed >> 16], axis=-1)
     harmonics = found.harmonics.numpy()

@@ -45,5 +45,5 @@ def read_scan(path: str | Path) -> Scan:
     found = format_of(Path(path))
     if found is None:
         names = ", ".join(each.name for each in FORMATS)
-        raise InputError(f"{path}: not a readable mesh or point cloud, expected {names}")
+        raise InputError("not a readable mesh or point cloud", where=path, expected=names)
     return found.read(Path(path))

@@ -34,16 +34,16 @@ def read(path: Path, expected: str) -> Scan:
     except (Exception, RecursionError) as error:  # trimesh raises whatever its parsing steps raise
         said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise InputError(
-            f"{path}: not readable ({said[:200]}), expected {expected}; is it truncated?"
+            f"not readable ({said[:200]})", where=path, expected=f"{expected}; is it truncated?"
         ) from error
     if count > MOST_POINTS:
-        raise InputError(f"{path}: its nodes place {count:,} points, expected at most {MOST_POINTS:,}")
+        raise InputError(f"its nodes place {count:,} points", where=path, expected=f"at most {MOST_POINTS:,}")
     meshes = [part for part in parts if part.faces is not None and len(part.faces)]
     chosen = meshes or [part for part in parts if len(part.points)]
     if not chosen:
-        raise InputError(f"{path}: holds neither faces nor points, expected {expected}")
+        raise InputError("holds neither faces nor points", where=path, expected=expected)
     if sum(image.shape[0] * image.shape[1] for part in chosen for image in part.images) > MOST_TEXELS:
-        raise InputError(f"{path}: textures of more than {MOST_TEXELS:,} pixels, expected fewer")
+        raise InputError(f"textures of more than {MOST_TEXELS:,} pixels", where=path, expected="fewer")
     return joined(chosen)
 
 

@@ -36,8 +36,9 @@ def read(path: Path) -> Scan:
     needed = [name for name in COMPRESSED if name in (content.get("extensionsUsed") or ())]
     if needed:
         raise InputError(
-            f"{path}: is compressed ({needed[0]}), which is not supported, expected glTF without compression"
-            " (`gltf-transform copy` or Blender write it)"
+            f"is compressed ({needed[0]}), which is not supported",
+            where=path,
+            expected="glTF without compression (`gltf-transform copy` or Blender write it)",
         )
     _check_counts(path, content)
     return by_trimesh.read(path, EXPECTED)
@@ -51,23 +52,24 @@ def _content(path: Path) -> dict[str, Any]:
         if path.suffix.lower() == ".glb":
             head = file.read(20)
             if len(head) < 20 or head[:4] != b"glTF":
-                raise InputError(f"{path}: no binary glTF header, expected {EXPECTED}")
+                raise InputError("no binary glTF header", where=path, expected=EXPECTED)
             _, total, length = struct.unpack("<III", head[4:16])
             if total > size or length > size - 20:
                 raise InputError(
-                    f"{path}: has {size:,} bytes but declares {max(total, length + 20):,}; is it truncated?"
+                    f"has {size:,} bytes but declares {max(total, length + 20):,}; is it truncated?",
+                    where=path,
                 )
             text = file.read(length)
         else:
             if size > LARGEST_JSON:
-                raise InputError(f"{path}: {size:,} bytes of JSON, expected {LARGEST_JSON:,} at most")
+                raise InputError(f"{size:,} bytes of JSON", where=path, expected=f"{LARGEST_JSON:,} at most")
             text = file.read()
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: its JSON is damaged ({error}), expected {EXPECTED}") from error
+        raise InputError(f"its JSON is damaged ({error})", where=path, expected=EXPECTED) from error
     if not isinstance(content, dict):
-        raise InputError(f"{path}: its JSON is not an object, expected {EXPECTED}")
+        raise InputError("its JSON is not an object", where=path, expected=EXPECTED)
     return content
 
 
@@ -87,10 +89,11 @@ def _check_counts(path: Path, content: dict[str, Any]) -> None:
                 held = max(path.stat().st_size, 2**20)  # zeros, which sparse values replace
             if count < 0 or size > held:
                 raise InputError(
-                    f"{path}: accessor {number} declares {count:,} elements, but {held:,} bytes are too few for"
-                    " them; is it damaged?"
+                    f"accessor {number} declares {count:,} elements, but {held:,} bytes are too few for"
+                    " them; is it damaged?",
+                    where=path,
                 )
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise InputError(
-                f"{path}: accessor {number} is not readable ({error!r}), expected {EXPECTED}"
+                f"accessor {number} is not readable ({error!r})", where=path, expected=EXPECTED
             ) from error

@@ -19,5 +19,5 @@ def recognises(path: Path) -> bool:
 def read(path: Path) -> Scan:
     """Return the mesh or the points of an OBJ file."""
     if path.stat().st_size == 0:
-        raise InputError(f"{path}: is empty, expected {EXPECTED}")
+        raise InputError("is empty", where=path, expected=EXPECTED)
     return by_trimesh.read(path, EXPECTED)

@@ -43,7 +43,7 @@ def read(path: Path) -> Scan:
     rows = _rows(path, header, memoryview(data)[header.length :])
     names = header.kind.names or ()
     if not {"x", "y", "z"} <= set(names):
-        raise InputError(f"{path}: its points have {', '.join(names)}, expected x, y and z")
+        raise InputError(f"its points have {', '.join(names)}", where=path, expected="x, y and z")
     points = np.stack([rows[axis].astype(np.float64).reshape(len(rows), -1)[:, 0] for axis in "xyz"], axis=-1)
     return Scan(points, _colours(rows))
 
@@ -74,7 +74,7 @@ def _header(path: Path, data: bytes) -> _Header:
     while "DATA" not in found:
         end = data.find(b"\n", at, LARGEST_HEADER)
         if end < 0:
-            raise InputError(f"{path}: no PCD header, expected {EXPECTED}")
+            raise InputError("no PCD header", where=path, expected=EXPECTED)
         words = data[at:end].decode("latin-1").split()
         at = end + 1
         if words and not words[0].startswith("#"):
@@ -99,7 +99,7 @@ def _header(path: Path, data: bytes) -> _Header:
             raise ValueError(f"{count} points")
         return _Header(kind, count, found["DATA"][0].lower(), at)
     except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise InputError(f"{path}: its header is damaged ({error!r}), expected {EXPECTED}") from error
+        raise InputError(f"its header is damaged ({error!r})", where=path, expected=EXPECTED) from error
 
 
 def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
@@ -112,7 +112,7 @@ def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
         _require(path, header, size, len(data))
         return np.frombuffer(data[:size], header.kind)
     if header.encoding != "binary_compressed":
-        raise InputError(f"{path}: DATA {header.encoding}, expected ascii, binary or binary_compressed")
+        raise InputError(f"DATA {header.encoding}", where=path, expected="ascii, binary or binary_compressed")
     if len(data) < 8:
         _require(path, header, size, 0)
     packed, whole = (int(n) for n in np.frombuffer(data[:8], "<u4"))
@@ -135,7 +135,9 @@ def _width(header: _Header) -> int:
 def _require(path: Path, header: _Header, needed: int, held: int) -> None:
     if needed > held:
         raise InputError(
-            f"{path}: declares {header.count:,} points, for which its {held:,} bytes of data are too few; is the file truncated?"
+            f"declares {header.count:,} points, for which its {held:,} bytes of data are too few; is the"
+            " file truncated?",
+            where=path,
         )
 
 
@@ -148,7 +150,8 @@ def _text_rows(path: Path, header: _Header, text: bytes) -> NDArray:
             raise ValueError(f"found {table.shape[0]:,} rows of {table.shape[1]}")
     except ValueError as error:
         raise InputError(
-            f"{path}: expected {header.count:,} rows of {_width(header)} numbers ({error}); is the file truncated?"
+            where=path,
+            expected=f"{header.count:,} rows of {_width(header)} numbers ({error}); is the file truncated?",
         ) from error
     rows, at = np.zeros(header.count, header.kind), 0
     for name in header.kind.names or ():
@@ -187,9 +190,9 @@ def _decompressed(path: Path, data: bytes, size: int) -> bytes:
             if len(found) > size:
                 raise IndexError
     except IndexError as error:
-        raise InputError(f"{path}: its compressed data is damaged; is the file truncated?") from error
+        raise InputError("its compressed data is damaged; is the file truncated?", where=path) from error
     if len(found) != size:
         raise InputError(
-            f"{path}: {len(found):,} bytes when decompressed, expected {size:,}; is it truncated?"
+            f"{len(found):,} bytes when decompressed", where=path, expected=f"{size:,}; is it truncated?"
         )
     return bytes(found)

@@ -36,15 +36,15 @@ def read(path: Path) -> Scan:
     header = read_ply_header(path, EXPECTED)
     vertex, face = header.element("vertex"), header.element("face")
     if vertex is None or not {"x", "y", "z"} <= set(vertex.names):
-        raise InputError(f"{path}: no vertices with x, y and z, expected {EXPECTED}")
+        raise InputError("no vertices with x, y and z", where=path, expected=EXPECTED)
     if vertex.count == 0:
-        raise InputError(f"{path}: holds no vertices, expected {EXPECTED}")
+        raise InputError("holds no vertices", where=path, expected=EXPECTED)
     if face is not None and face.count:
         _check_size(path, header)
         return by_trimesh.read(path, EXPECTED)
     rows = read_ply(path, EXPECTED).get("vertex")
     if rows is None:
-        raise InputError(f"{path}: its vertices hold lists of numbers, expected {EXPECTED}")
+        raise InputError("its vertices hold lists of numbers", where=path, expected=EXPECTED)
     points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     return Scan(points, _colours(rows))
 
@@ -70,7 +70,8 @@ def _check_size(path: Path, header: PlyHeader) -> None:
         least += 1 if element.has_lists else 0
         if element.count * least > left + 1:
             raise InputError(
-                f"{path}: declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of"
-                " data are too few for them; is the file truncated?"
+                f"declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of data are"
+                " too few for them; is the file truncated?",
+                where=path,
             )
         left -= element.count * least

@@ -31,8 +31,9 @@ def read_las(path: Path) -> Scan:
             least = 1 if path.suffix.lower() == ".laz" else 8 * header.point_format.size
             if count * least > 8 * size:
                 raise InputError(
-                    f"{path}: declares {count:,} points, but its {size:,} bytes are too few for them; is the"
-                    " file truncated?"
+                    f"declares {count:,} points, but its {size:,} bytes are too few for them; is the file"
+                    " truncated?",
+                    where=path,
                 )
             rows = file.read()
         points = np.stack([np.asarray(axis, np.float64) for axis in (rows.x, rows.y, rows.z)], axis=-1)
@@ -43,7 +44,7 @@ def read_las(path: Path) -> Scan:
         raise
     except Exception as error:  # laspy and its decompressors raise errors of many types
         raise InputError(
-            f"{path}: not readable ({type(error).__name__}: {error}), expected LAS; is it truncated?"
+            f"not readable ({type(error).__name__}: {error})", where=path, expected="LAS; is it truncated?"
         ) from error
     if not rgb.size or rgb.max() == 0:
         return Scan(points)  # the colour fields are unused
@@ -61,8 +62,9 @@ def read_e57(path: Path) -> Scan:
             count = int(file.get_header(number).point_count)
             if count > path.stat().st_size:
                 raise InputError(
-                    f"{path}: declares {count:,} points, but its {path.stat().st_size:,} bytes are too few"
-                    " for them; is the file truncated?"
+                    f"declares {count:,} points, but its {path.stat().st_size:,} bytes are too few for them;"
+                    " is the file truncated?",
+                    where=path,
                 )
             rows = file.read_scan(number, colors=True, intensity=False, ignore_missing_fields=True)
             points = np.stack([rows[f"cartesian{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
@@ -75,8 +77,8 @@ def read_e57(path: Path) -> Scan:
         raise
     except Exception as error:  # pye57 passes on errors of a C++ library
         raise InputError(
-            f"{path}: not readable ({type(error).__name__}: {error}), expected E57; is it truncated?"
+            f"not readable ({type(error).__name__}: {error})", where=path, expected="E57; is it truncated?"
         ) from error
     if not parts:
-        raise InputError(f"{path}: holds no scan, expected E57 with points")
+        raise InputError("holds no scan", where=path, expected="E57 with points")
     return joined(parts)
