@@ -1,4 +1,4 @@
-"""Each distribution under plugins/ is installed as a stranger's would be, and is found. ``.ci/wheels`` runs their own tests."""
+"""The distributions under plugins/ are installed as a stranger's would be, and found. ``.ci/wheels`` runs their own tests."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def quietly(command: list[str], **options: object) -> str:
     return str(done.stdout)
 
 
-def installed(source: Path, target: Path) -> dict[str, str]:
-    """Install a copy, so that nothing is written into the checkout; the environment in which it is found."""
+def installed(sources: list[Path], target: Path) -> dict[str, str]:
+    """Install folders or wheels; the environment in which they are found."""
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index"]
-    quietly([*pip, "--target", str(target), str(source)])
+    quietly([*pip, "--target", str(target), *map(str, sources)])
     path = os.pathsep.join(filter(None, [str(target), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path}
 
@@ -64,14 +64,24 @@ def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
     return {(e["group"], e["name"]): e["distribution"] for e in listed if e["fault"] is None}
 
 
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], str]:
+    """What is offered where all plugins are installed: the wheels that ``make wheels`` made, or copies of their folders.
+
+    Copies, so that nothing is written into the checkout.
+    """
+    folder = tmp_path_factory.mktemp("plugins")
+    if wheels := os.environ.get("BIDNERF_WHEELS"):
+        sources = [*Path(wheels).glob("bidnerf_*.whl")]
+    else:
+        sources = [copied(plugin, folder) for plugin in PLUGINS]
+    return offered(installed(sources, folder / "site"))
+
+
 @every_plugin
-def test_a_plugin_is_found(plugin: Path, tmp_path: Path) -> None:
-    source = copied(plugin, tmp_path)
-    environment = installed(source, tmp_path / "site")
-    found = offered(environment)
-    assert {point: found.get(point) for point in declared(source)} == dict.fromkeys(
-        declared(source), plugin.name
-    )
+def test_a_plugin_is_found(plugin: Path, found: dict[tuple[str, str], str]) -> None:
+    points = declared(plugin)
+    assert {point: found.get(point) for point in points} == dict.fromkeys(points, plugin.name)
 
 
 @every_plugin
@@ -105,6 +115,6 @@ def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:
     mine = tmp_path / "bidnerf-mine"
     text = "".join(file.read_text() for file in mine.rglob("*") if file.suffix in (".py", ".toml"))
     assert "template" not in text.lower()
-    environment = installed(mine, tmp_path / "site")
+    environment = installed([mine], tmp_path / "site")
     assert offered(environment)["backends", "mine"] == "bidnerf-mine"
     assert "passed" in run_tests(mine, environment)

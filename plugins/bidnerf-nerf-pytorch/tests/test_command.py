@@ -17,7 +17,7 @@ from bidnerf_core.testing import SCENE_BOUNDS, Recorder, rgb_views
 from bidnerf_core.training import Silent
 from bidnerf_nerf_pytorch import NerfPytorchConfig, NerfPytorchField, backend, read_checkpoint
 from bidnerf_nerf_pytorch.command import main
-from conftest import SMALL, Writer, contents
+from checkpoints import SMALL, Writer, contents
 
 
 def test_the_map_holds_the_networks(write: Writer, tmp_path: Path) -> None:

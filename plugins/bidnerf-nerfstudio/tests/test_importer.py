@@ -19,7 +19,7 @@ from bidnerf_core.maps import UNMOVED, ImportedField, importer_of
 from bidnerf_nerfstudio.importer import ImportSettings, importer
 from bidnerf_nerfstudio.placement import Placement, after, inverse
 from bidnerf_nerfstudio.run import read_run
-from conftest import RunOf
+from stored_runs import RunOf
 
 
 def read(folder: Path, placement: Similarity = UNMOVED, **config: Any) -> ImportedField:

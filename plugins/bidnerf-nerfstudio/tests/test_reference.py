@@ -19,7 +19,7 @@ from bidnerf_core.io import to_plain
 from bidnerf_core.maps import UNMOVED, MapInfo, frozen_field
 from bidnerf_nerfstudio.importer import ImportSettings, importer
 from bidnerf_nerfstudio.placement import inverse
-from conftest import RUNS, RunOf
+from stored_runs import RUNS, RunOf
 
 SPACING = 4
 OPENGL = torch.tensor([1.0, -1.0, -1.0, 1.0])
