@@ -17,8 +17,8 @@ import baked
 import tiny
 from bidnerf_core import InputError, Localizer, Outcome, View
 from bidnerf_core.evaluation import perturb
-from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import METHODS, AutoConfig, pose_from_matrix, settings_of
+from bidnerf_core.geometry import SE3, pose_from_matrix
+from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.localization.tracking.motion import Clock
 from bidnerf_core.results import pose_error
 from bidnerf_core.testing import DEVICE, Elsewhere

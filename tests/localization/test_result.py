@@ -12,9 +12,9 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import from_plain
-from bidnerf_core.localization import Localization, Outcome, Verdict, pose_from_matrix
+from bidnerf_core.localization import Localization, Outcome, Verdict
 
 T = SE3.exp(torch.tensor([0.1, -2.0, 3.0, 0.4, -0.5, 0.6], dtype=torch.float64))
 FOUND = Localization(
