@@ -9,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 REQUIREMENTS := pyproject.toml constraints.txt
 DEMO_OUT := demo-out
-SHAPES := tests/test_contract.py::TestHashGrid tests/test_cli_bake.py::test_a_baked_map_needs_no_start
+SHAPES := tests/testing/test_contract.py::TestHashGrid tests/cli/test_cli_bake.py::test_a_baked_map_needs_no_start
 # A process a core, of one thread each; a file's tests share fixtures, and conftest.py puts the longest files first.
 PARALLEL := -n logical --dist loadfile --no-loadscope-reorder
 PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL)
@@ -18,11 +18,12 @@ PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALL
 PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done)
 
-# Quiet, but downloads of many megabytes show that something goes on.
-INSTALL = $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
+# Quiet, but downloads of many megabytes show that something goes on. Most modules are never imported: Python compiles those that
+# are, the first time.
+INSTALL = $(BIN)/python -m pip install --disable-pip-version-check --no-compile -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test slow robustness shapes check lint format types arrows docs clean
+.PHONY: help demo test slow robustness shapes check lint format types arrows wheels docs clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -53,6 +54,10 @@ types: $(VENV)/.installed-dev ## static types
 
 arrows: $(VENV)/.installed-dev ## which module may import which
 	@$(BIN)/lint-imports --no-logo
+
+wheels: $(VENV)/.installed-dev ## what is distributed, of bidnerf and of every plugin, in dist/
+	@rm -rf dist
+	@printf '%s\n' . plugins/*/ | xargs -P 2 -n 1 $(BIN)/python -m build --no-isolation --quiet --outdir dist
 
 format: $(VENV)/.installed-dev ## put the code into shape
 	@$(BIN)/ruff check --fix --quiet || true

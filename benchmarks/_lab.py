@@ -16,8 +16,8 @@ from scipy.stats import chi2
 
 from bidnerf_core import Localization, Map, View, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate
+from bidnerf_core.evaluation import write_record
+from bidnerf_core.results import normalized_error_squared, pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 LIMITS = {"5deg 0.05": (0.05, 5.0), "1deg 0.02": (0.02, 1.0)}

@@ -27,7 +27,7 @@ from _lab import (
 )
 
 from bidnerf_core import Localizer
-from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation import RowStore
 from bidnerf_core.localization import settings_of
 
 SLOW = "surface alone"

@@ -29,16 +29,12 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.advice import summary
-from bidnerf_core.captures.coverage import horizontal_axes
-from bidnerf_core.captures.report import CaptureReport, Gap
-from bidnerf_core.captures.survey import surveyed
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import CaptureReport, Gap, horizontal_axes, summary, surveyed
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import Features, tracked_views
-from bidnerf_core.mapping.landmarks.features import SIFT, FoundOnce
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping import SIFT, Features, FoundOnce, tracked_views
 
 BLUR = 0.02
 """Length of the motion blur, as a share of the image's longer side."""

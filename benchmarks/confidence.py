@@ -23,10 +23,16 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from bidnerf_core.localization import Outcome, confidence
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics
+import bidnerf_core
+from bidnerf_core.localization import (
+    ACCEPTED,
+    LandmarkDiagnostics,
+    LogisticModel,
+    Outcome,
+    landmark_features,
+)
 
-STORED = Path(confidence.__file__).with_suffix(".json")
+STORED = Path(bidnerf_core.__file__).parent / "localization" / "confidence.json"
 RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
 GOOD = ("inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers")
@@ -64,11 +70,11 @@ def examples(paths: Sequence[Path]) -> list[Example]:
 def example(row: dict[str, Any]) -> Example:
     said, error = row["diagnostics"], row["translation"]
     right = error is not None and error < 0.05 and row["rotation_deg"] < 5
-    features = confidence.landmark_features(LandmarkDiagnostics(**said))
+    features = landmark_features(LandmarkDiagnostics(**said))
     return Example(features, right, row["scene"], row["fault"])
 
 
-def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.LogisticModel:
+def fitted(given: Sequence[Example], ridge: float = RIDGE) -> LogisticModel:
     """Fit a logistic regression whose weights have the right signs.
 
     Features are standardised for the ridge penalty; the weights returned are for the raw features.
@@ -89,7 +95,7 @@ def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.Logisti
     start = np.zeros(len(names) + 1)
     best = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[*bounds, (None, None)]).x
     weights = best[:-1] / deviation
-    return confidence.LogisticModel(names, tuple(weights.tolist()), float(best[-1] - weights @ mean))
+    return LogisticModel(names, tuple(weights.tolist()), float(best[-1] - weights @ mean))
 
 
 def folds(given: Sequence[Example], by_fault: bool) -> list[tuple[list[Example], list[Example]]]:
@@ -115,7 +121,7 @@ def assessed(said: Sequence[float], right: Sequence[bool]) -> dict[str, Any]:
         for i in range(BINS)
         if (m := number == i).any()
     ]
-    accepted = p >= confidence.ACCEPTED
+    accepted = p >= ACCEPTED
     return {
         "n": len(p),
         "right": int(y.sum()),

@@ -40,13 +40,12 @@ from _lab import (
 from query_conditions import resized
 
 from bidnerf_core import SE3, Frame, View
-from bidnerf_core.captures.trial import build_tried_landmarks
+from bidnerf_core.captures import build_tried_landmarks
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.localization import LandmarkMatcher, propose
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.evaluation import RowStore
+from bidnerf_core.localization import LandmarkMatcher, landmark_verdict, propose
 from bidnerf_core.mapping import Features, find_features
-from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.results import normalized_error_squared, pose_error
 
 EVERY = (2, 4, 8, 16)
 ONE_GRID = "xfeat, one grid"

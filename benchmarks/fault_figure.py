@@ -13,8 +13,7 @@ from typing import Any
 import _lab
 import numpy as np
 
-from bidnerf_core.results.errors import success_rate
-from bidnerf_core.results.plot_style import COLOURS, new_figure, styled
+from bidnerf_core.results import COLOURS, new_figure, styled, success_rate
 
 DRAWN = {
     "right": ("right", COLOURS[2]),

@@ -46,14 +46,21 @@ from _lab import answer as timed_answer
 from bidnerf_core import Localization, Localizer, Map, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults, faulty, find_fault, parse_faults
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.trial import views_digest
-from bidnerf_core.evaluation.trials import parse_settings
-from bidnerf_core.evaluation.workers import local_processes
-from bidnerf_core.frames.frame import View
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.results.errors import success_rate
+from bidnerf_core.evaluation import (
+    FAULTS,
+    NO_FAULT,
+    RowStore,
+    expand_faults,
+    faulty,
+    find_fault,
+    local_processes,
+    parse_faults,
+    parse_settings,
+    views_digest,
+)
+from bidnerf_core.frames import View
+from bidnerf_core.io import to_plain
+from bidnerf_core.results import success_rate
 
 FOREIGN = "another-scene"
 

@@ -32,22 +32,21 @@ from paper_tables import test_frames
 
 from bidnerf_core import Localizer
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.evaluation.trials import opened
-from bidnerf_core.fields.contract import levels
+from bidnerf_core.evaluation import RowStore, opened, perturb
+from bidnerf_core.fields import levels
 from bidnerf_core.localization import (
     METHODS,
     AdamSettings,
+    AdamSteps,
     DescentSettings,
     RayCounts,
     ReachSettings,
     SampledLoss,
+    captured,
     objective_of,
     pivot,
     rig,
 )
-from bidnerf_core.localization.solvers.adam import AdamSteps, captured
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
 FRAMES = 40

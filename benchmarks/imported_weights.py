@@ -29,18 +29,22 @@ from kornia.metrics import psnr
 from scipy.stats import binomtest
 
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.summary import NEVER, steps_of, summarize
-from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trials import run_trial
-from bidnerf_core.fields.contract import levels
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.results.errors import CRITERIA
-from bidnerf_core.results.overlays import depth_to_rgb, tile
+from bidnerf_core.evaluation import (
+    NEVER,
+    ResultsFile,
+    RowStore,
+    Trial,
+    TrialResult,
+    key_of,
+    run_trial,
+    steps_of,
+    summarize,
+)
+from bidnerf_core.fields import levels, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.io import to_plain
+from bidnerf_core.maps import Map, load_map
+from bidnerf_core.results import CRITERIA, depth_to_rgb, tile
 from bidnerf_nerf_pytorch.command import main as import_command
 
 LEVELS = {"coarse": 0, "fine": 1}

@@ -79,11 +79,9 @@ from scipy.stats import binomtest
 from sift import FEWEST_INLIERS, SiftMatcher, colmap_pnp, opencv_pnp, sift_points
 
 from bidnerf_core import Localizer, View
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.protocols import bid_start
-from bidnerf_core.evaluation.trial import views_digest
-from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.evaluation import RowStore, bid_start, views_digest
+from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.results import pose_error
 
 OURS = "auto"
 LIBRARIES = {

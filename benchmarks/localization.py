@@ -24,13 +24,21 @@ import torch
 from _lab import BOUND, RESULTS, held_out, parser, record
 
 from bidnerf_core import SE3
-from bidnerf_core.evaluation.bench import Plan, planned, run_trials
-from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.summary import Summary, median, summarize
-from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trials import opened
-from bidnerf_core.evaluation.workers import local_processes
-from bidnerf_core.results.errors import normalized_error_squared, success_rate
+from bidnerf_core.evaluation import (
+    Plan,
+    ResultsFile,
+    Summary,
+    Trial,
+    TrialResult,
+    key_of,
+    local_processes,
+    median,
+    opened,
+    planned,
+    run_trials,
+    summarize,
+)
+from bidnerf_core.results import normalized_error_squared, success_rate
 
 Truth = dict[str, SE3]
 """T_world_camera of each frame, by its name."""

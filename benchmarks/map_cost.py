@@ -33,12 +33,10 @@ from _lab import Scene, one_thread, parser, record, without_depth
 from bidnerf_core import SE3, View, load_map
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.trials import forget_peak_memory, peak_memory_bytes
-from bidnerf_core.localization import LandmarkMatcher, propose
-from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.mapping import LandmarkMap, build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import concatenated
-from bidnerf_core.results.errors import pose_error, success_rate
+from bidnerf_core.evaluation import forget_peak_memory, peak_memory_bytes
+from bidnerf_core.localization import LandmarkMatcher, landmark_verdict, propose
+from bidnerf_core.mapping import LandmarkMap, build_landmarks, concatenated
+from bidnerf_core.results import pose_error, success_rate
 
 # The child measures itself: the child's peak as reported to the parent includes the parent's own.
 MAIN = """

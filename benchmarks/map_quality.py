@@ -33,15 +33,14 @@ import torch
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
-from bidnerf_core.captures.cameras import RowMotion, at_stored_poses, moved_cameras, pose_updates
+from bidnerf_core.captures import RowMotion, at_stored_poses, moved_cameras, pose_updates
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, levels
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.fields import RadianceField, SceneBounds, device_of, levels, render_image
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import to_plain
 from bidnerf_core.localization import LandmarkMatcher, confirm
-from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.maps import Map, load_map
 from bidnerf_core.training import fitted_colours
 
 LEAST_LANDMARKS = 30

@@ -30,14 +30,25 @@ from typing import Any
 import _lab
 
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.evaluation.bench import Plan, changed_settings, left_to_do, planned, run_trials
-from bidnerf_core.evaluation.groups import Group, grouped
-from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
-from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.summary import pairwise_tests, summarize
-from bidnerf_core.evaluation.trial import Trial
-from bidnerf_core.evaluation.trials import opened
-from bidnerf_core.evaluation.workers import local_processes
+from bidnerf_core.evaluation import (
+    Group,
+    Plan,
+    ResultsFile,
+    Trial,
+    changed_settings,
+    grouped,
+    key_of,
+    left_to_do,
+    local_processes,
+    note_run,
+    opened,
+    pairwise_tests,
+    planned,
+    provenance,
+    run_trials,
+    script_command,
+    summarize,
+)
 from bidnerf_core.localization import METHODS
 
 Settings = dict[str, Any]

@@ -28,11 +28,10 @@ from _lab import Row
 
 import bidnerf_core as bn
 from bidnerf_core import SE3, Frame, Map, View
-from bidnerf_core.datasets.sequence import TimedFrame
-from bidnerf_core.datasets.whole import all_views
-from bidnerf_core.geometry.similarity import Similarity, fit_similarity
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.datasets import TimedFrame, all_views
+from bidnerf_core.geometry import Similarity, fit_similarity
+from bidnerf_core.io import to_plain
+from bidnerf_core.results import pose_error
 
 RATE = 30
 """Frames per second of a video that is made of photos."""

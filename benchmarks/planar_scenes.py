@@ -23,18 +23,16 @@ from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from bidnerf_core import Localizer
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults.scene import texture
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import texture
+from bidnerf_core.fields import SceneBounds, Stratified
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
-from bidnerf_core.results.errors import success_rate
-from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.scenes.trajectories import look_at
+from bidnerf_core.results import success_rate
+from bidnerf_core.scenes import HomogeneousBall, look_at
 
 CAMERA = Intrinsics(400.0, 400.0, 240.0, 180.0, 480, 360)
 SUPERSAMPLED = 2

@@ -25,10 +25,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bidnerf_core import SE3, open_dataset
-from bidnerf_core.captures.pose_conventions import pose_contradiction
-from bidnerf_core.mapping import ImageKeypoints
-from bidnerf_core.mapping.landmarks.building import posed_keypoints
-from bidnerf_core.mapping.landmarks.features import SIFT
+from bidnerf_core.captures import pose_contradiction
+from bidnerf_core.mapping import SIFT, ImageKeypoints, posed_keypoints
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 Change = Callable[[SE3], SE3]

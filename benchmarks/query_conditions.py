@@ -36,8 +36,7 @@ from _lab import (
 )
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, View
-from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation import RowStore, faulty
 
 WRONG_FOCAL = 1.1
 """Factor on a focal length that is declared as approximate."""

@@ -17,10 +17,9 @@ import _lab
 import imageio.v3 as iio
 import torch
 
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.datasets.writing import write_transforms
+from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 WHITE = (1.0, 1.0, 1.0)
 

@@ -22,11 +22,11 @@ from torch import Generator, Tensor, nn
 
 from bidnerf_core import Localizer, Map
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
-from bidnerf_core.results.errors import success_rate
+from bidnerf_core.results import success_rate
 
 TURNS = (0.0, 90.0, 180.0)
 DESCRIPTOR_NOISE = 5.0

@@ -21,9 +21,9 @@ from torch import Generator
 
 from bidnerf_core import View
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults.camera import rolling_shutter
+from bidnerf_core.evaluation import rolling_shutter
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
-from bidnerf_core.results.errors import pose_error, success_rate, within
+from bidnerf_core.results import pose_error, success_rate, within
 
 WAYS = {"with motion": True, "taken as still": False}
 Answer = tuple[LandmarkPose, View, float]

@@ -35,9 +35,9 @@ from _lab import (
 
 from bidnerf_core import Localizer, Map, export_map, import_map, load_map
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.frames.frame import View
-from bidnerf_core.results.pose_files import read_pose
+from bidnerf_core.evaluation import RowStore
+from bidnerf_core.frames import View
+from bidnerf_core.results import read_pose
 
 OWN = "map"
 """The map that the others come from."""

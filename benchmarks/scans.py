@@ -29,7 +29,7 @@ from landmark_peers import Answer, Peer, answer, auto, kiss_gicp, open3d
 from bidnerf_core import Localizer, View, import_map, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation import RowStore
 
 CELLS = 256
 """Voxels of the fused depth along the longest side of what was measured."""

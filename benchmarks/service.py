@@ -41,7 +41,7 @@ import _openapi
 import numpy as np
 from _lab import Row, parser, record
 
-from bidnerf_core.evaluation.provenance import provenance
+from bidnerf_core.evaluation import provenance
 
 FORM = "multipart/form-data; boundary=boundary"
 CLIENTS = (1, 4, 16)

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from bidnerf_core import Frame, Intrinsics, View
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.trial import views_digest
-from bidnerf_core.io.files import write_file
-from bidnerf_core.mapping.landmarks.tracks import likely_pairs
+from bidnerf_core.evaluation import views_digest
+from bidnerf_core.io import write_file
+from bidnerf_core.mapping import likely_pairs
 
 NEIGHBOURS = 20
 """Number of nearby images with which each image is matched, as in hloc's examples."""

@@ -41,10 +41,10 @@ from map_quality import judge
 
 from bidnerf_core import Localizer, perturb, settings_of
 from bidnerf_core.backend import load_backend
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
-from bidnerf_core.io.json import from_plain
+from bidnerf_core.evaluation import RowStore
+from bidnerf_core.fields import render
+from bidnerf_core.frames import View
+from bidnerf_core.io import from_plain
 from bidnerf_core.training import Supervision
 
 RAYS = 2048

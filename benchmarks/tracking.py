@@ -36,9 +36,8 @@ from _lab import RESULTS, one_thread, parser, record
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, Map, Outcome, Tracker, load_map
 from bidnerf_core.datasets import TimedFrame, open_sequence
-from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.results.errors import pose_error, within
-from bidnerf_core.results.trajectory import TrajectoryErrors, spans
+from bidnerf_core.evaluation import RowStore
+from bidnerf_core.results import TrajectoryErrors, pose_error, spans, within
 
 WRONG = 0.05, 5.0
 """An accepted pose with a larger error (metres, degrees) is an undetected loss."""

@@ -10,8 +10,8 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import RadianceField, SceneBounds
+from bidnerf_core.frames import View
 from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.training import Report
 

@@ -17,7 +17,7 @@ from numbers import Real
 from typing import Annotated, Any, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.io.json import LARGEST_NUMBER, converted, to_plain
+from bidnerf_core.io import LARGEST_NUMBER, converted, to_plain
 
 S = TypeVar("S")
 

@@ -53,11 +53,18 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     return SETTINGS.sub(lambda found: settings_table(found[1]), markdown).replace(NAMES, public_names())
 
 
+def public_homes() -> dict[str, str]:
+    """Return the package or module that offers each public name, as the stub of ``bidnerf_core`` states it."""
+    stub = ast.parse(Path(bidnerf_core.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    return {name.name: str(node.module) for node in imports for name in node.names}
+
+
 def public_names() -> str:
     """Return the directives that document the public names, under the package that defines them."""
     by_package: dict[str, list[str]] = {}
-    for name, module in bidnerf_core.HOMES.items():
-        by_package.setdefault(module.partition(".")[0], []).append(f"::: bidnerf_core.{module}.{name}\n")
+    for name, package in public_homes().items():
+        by_package.setdefault(package, []).append(f"::: bidnerf_core.{package}.{name}\n")
     return "\n".join(
         f"### {package.capitalize()}\n\n" + "\n".join(directives)
         for package, directives in sorted(by_package.items())

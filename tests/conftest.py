@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from commands import CommandResult, Run
+from once import made_once
 
 THREADS = "BIDNERF_TEST_THREADS"
 DATA = "BIDNERF_DATA"
@@ -85,6 +87,31 @@ def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
         return CommandResult(status, printed.out, printed.err)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny dataset, ``data``, and the map ``map`` that was trained of it; tests change copies of them only."""
+    import tiny
+    from bidnerf_core.cli import main
+
+    def make(folder: Path) -> None:
+        tiny.write_dataset(folder / "data")
+        assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+
+    return made_once(tmp_path_factory, "shared", make)
+
+
+@pytest.fixture
+def data(shared: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny dataset."""
+    return Path(shutil.copytree(shared / "data", tmp_path / "data"))
+
+
+@pytest.fixture
+def map_folder(shared: Path, tmp_path: Path) -> Path:
+    """A copy of the map of the tiny dataset."""
+    return Path(shutil.copytree(shared / "map", tmp_path / "map"))
 
 
 @pytest.fixture

@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_adanerf.networks import Oracle
-from bidnerf_core.fields.contract import Rays, RaySamples, SceneBounds
-from bidnerf_core.fields.sampling import Stratified
+from bidnerf_core.fields import Rays, RaySamples, SceneBounds, Stratified
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_adanerf.field import AdaNerfField
-from bidnerf_core.fields.contract import FieldValues, Rays, RaySamples
-from bidnerf_core.fields.rendering import Rendering
-from bidnerf_core.fields.voxel_grid import OccupancyMask
+from bidnerf_core.fields import FieldValues, OccupancyMask, Rays, RaySamples, Rendering
 
 PROBED = 1 / 16
 """Fraction of the bins known to be empty that are shaded anyway, so that the field learns that they are empty."""

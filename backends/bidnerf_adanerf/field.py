@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from bidnerf_adanerf.bins import Bins, Sparse
 from bidnerf_adanerf.config import AdaNerfConfig
 from bidnerf_adanerf.networks import Oracle, ShadingNetwork
-from bidnerf_core.fields.contract import FieldValues, SceneBounds
-from bidnerf_core.fields.encoding import query_network
+from bidnerf_core.fields import FieldValues, SceneBounds, query_network
 
 
 class AdaNerfField(nn.Module):

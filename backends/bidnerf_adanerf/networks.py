@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.fields.encoding import encoded_width, frequency_encoding, octaves
+from bidnerf_core.fields import encoded_width, frequency_encoding, octaves
 
 
 def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:

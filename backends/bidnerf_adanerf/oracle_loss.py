@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from bidnerf_core.fields.contract import RaySamples
+from bidnerf_core.fields import RaySamples
 from bidnerf_core.training import TrainingBatch
 
 BLUR = 2.0

@@ -16,10 +16,15 @@ from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_adanerf.oracle_loss import oracle_loss
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.devices import moved
-from bidnerf_core.fields.contract import SceneBounds, device_of
-from bidnerf_core.fields.rendering import query_samples, rendering_weights
-from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import (
+    OccupancyMask,
+    SceneBounds,
+    VoxelGrid,
+    device_of,
+    query_samples,
+    rendering_weights,
+)
+from bidnerf_core.frames import View
 from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatch
 
 PROBE = 4096

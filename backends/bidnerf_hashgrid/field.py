@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.fields.sampling import Concentrated
+from bidnerf_core.fields import Concentrated, FieldValues, RaySampler, SceneBounds
 from bidnerf_core.settings import Count, Layers, NotNegative, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.networks import log_density_and_rgb

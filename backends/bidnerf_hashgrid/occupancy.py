@@ -11,10 +11,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields.contract import FieldValues, Rays, RaySamples, SceneBounds
-from bidnerf_core.fields.contraction import RaySpacing
-from bidnerf_core.fields.sampling import rows_of
-from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.fields import FieldValues, Rays, RaySamples, RaySpacing, SceneBounds, VoxelGrid, rows_of
 
 BLOCK = 8
 """Steps along a ray that are skipped together if no occupied cell is near."""

@@ -10,9 +10,8 @@ from torch import Generator
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds, device_of
-from bidnerf_core.fields.rendering import Rendering, render
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import Rendering, SceneBounds, device_of, render
+from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField

@@ -8,10 +8,18 @@ from typing import Annotated
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.fields.encoding import query_network
-from bidnerf_core.fields.sampling import HierarchicalField, Importance, OccupiedOnly, Stratified
-from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
+from bidnerf_core.fields import (
+    FieldValues,
+    HierarchicalField,
+    Importance,
+    OccupancyMask,
+    OccupiedOnly,
+    RaySampler,
+    SceneBounds,
+    Stratified,
+    VoxelGrid,
+    query_network,
+)
 from bidnerf_core.settings import Count, Range
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.fields.encoding import encoded_width, frequency_encoding, octaves
+from bidnerf_core.fields import encoded_width, frequency_encoding, octaves
 from bidnerf_core.settings import Count, Layers, Range, Settings
 
 

@@ -11,9 +11,8 @@ from torch import Generator
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import device_of, render
+from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch
 from bidnerf_vanilla.field import FieldConfig, VanillaField

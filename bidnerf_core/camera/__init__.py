@@ -1,1 +1,5 @@
 """Cameras: intrinsics, where they come from, orientation, and rolling shutters."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

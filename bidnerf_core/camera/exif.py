@@ -11,7 +11,7 @@ from typing import Any
 from PIL.ExifTags import IFD, Base
 
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.io.images import open_image
+from bidnerf_core.io import open_image
 
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Length of the unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre."""

@@ -27,9 +27,7 @@ from bidnerf_core.camera.lenses import (
     PanoramaFace,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import Record, parse_json, parse_record
-from bidnerf_core.io.rows import Row, parse_rows
+from bidnerf_core.io import Record, Row, parse_json, parse_record, parse_rows, read_file
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")

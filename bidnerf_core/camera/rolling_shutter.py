@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.geometry.rotations import cross_matrix
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3, cross_matrix
 
 MOVE, TURN = 0.005, 0.01
 """Typical motion of a hand-held camera during readout (a few hundredths of a second): translation along each

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from bidnerf_core.captures.report import Arrangement, CoverageRecord, Gap
 from bidnerf_core.captures.up_direction import UpDirection, up_direction
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews
-from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, Sightings, TrackedKeypoints, TrackedViews
 
 FACING = 0.9
 """Fraction of the cameras that must have the centre in front of them for the capture to count as going around

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures.cameras import StoredCamera
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.io.files import read_file, write_file
-from bidnerf_core.io.json import parse_record
+from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.io import parse_record, read_file, write_file
 
 NAME = "cameras.json"
 

@@ -11,11 +11,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import reduced_size
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.robust import mad_deviation
-from bidnerf_core.mapping import TrackedKeypoints
-from bidnerf_core.mapping.landmarks.tracks import likely_pairs
+from bidnerf_core.camera import reduced_size
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import mad_deviation
+from bidnerf_core.mapping import TrackedKeypoints, likely_pairs
 
 LARGEST = 800
 """Pixels along the longer side to which photos are downscaled: finer detail is of no use to a map."""

@@ -20,10 +20,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.captures.pose_readings import SWAP, Y_AND_Z_REVERSED, Reading, readings, with_axes
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import ImageKeypoints
-from bidnerf_core.mapping.landmarks.features import squared_distances
-from bidnerf_core.mapping.landmarks.tracks import LEAST_BASELINE, likely_pairs_of_poses
+from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs_of_poses, squared_distances
 
 MOST_PAIRS = 40
 """Largest number of examined pairs among those suggested by poses and order, and among those suggested by

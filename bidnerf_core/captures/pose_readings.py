@@ -18,7 +18,7 @@ from jaxtyping import Float
 from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 Understand = Callable[[SE3], SE3]
 """Maps the given poses (n) to the true T_world_camera; NaN for an image left without a pose."""

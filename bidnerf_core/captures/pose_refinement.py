@@ -9,24 +9,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.camera import STILL, MotionPrior
 from bidnerf_core.captures.cameras import PoseConsistency
 from bidnerf_core.captures.shutter_evidence import common_motion
-from bidnerf_core.geometry.independent import KEYPOINTS_PER_INDEPENDENT
-from bidnerf_core.geometry.robust import mad_deviation
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3, mad_deviation
 from bidnerf_core.mapping import (
+    ENOUGH_IMAGES,
+    LEAST_NOISE,
     Adjustment,
     LandmarkConfig,
     PosePrior,
     TrackedKeypoints,
     TrackedViews,
     adjusted,
+    noise,
+    pose_updates,
+    projected,
 )
-from bidnerf_core.mapping.geometry.projection import projected
-from bidnerf_core.mapping.geometry.resection import LEAST_NOISE
-from bidnerf_core.mapping.geometry.triangulation import noise
-from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, pose_updates
 
 ROUNDS = 3
 """Largest number of adjustments. After each, the keypoints are rematched, which finds matches that wrong

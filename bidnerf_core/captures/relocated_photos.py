@@ -12,11 +12,9 @@ from torch import Tensor
 
 from bidnerf_core.captures.report import PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
-from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.alternatives import mirror_image
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, mirror_image, propose
 from bidnerf_core.mapping import LandmarkConfig, TrackedKeypoints, TrackedViews
 
 SUSPECT = 0.5

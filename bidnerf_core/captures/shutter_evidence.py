@@ -8,11 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.mapping import TrackedKeypoints, resect
-from bidnerf_core.mapping.geometry.resection import log_motion_evidence
-from bidnerf_core.mapping.geometry.triangulation import noise
-from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, observed_at_rest
+from bidnerf_core.camera import STILL, MotionPrior
+from bidnerf_core.mapping import (
+    ENOUGH_IMAGES,
+    LEAST_VISIBLE_POINTS,
+    TrackedKeypoints,
+    log_motion_evidence,
+    noise,
+    observed_at_rest,
+    resect,
+)
 
 MOST_IMAGES = 60
 """Largest number of images examined, spread over the capture."""

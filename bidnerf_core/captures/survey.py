@@ -23,16 +23,18 @@ from bidnerf_core.captures.photos import (
 from bidnerf_core.captures.relocated_photos import Relocation, image_motion, relocated, suspects
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.captures.up_direction import UpDirection
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
+    ENOUGH_IMAGES,
     HeldOutTrial,
     LandmarkConfig,
     TrackedKeypoints,
     TrackedViews,
+    noise,
+    pose_updates,
+    robust_covariance,
 )
-from bidnerf_core.mapping.geometry.triangulation import noise
-from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, pose_updates, robust_covariance
 
 NOT_TRIED = HeldOutTrial()
 LEAST_EXPOSURE = 1.0

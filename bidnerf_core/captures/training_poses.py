@@ -13,7 +13,7 @@ from bidnerf_core.captures.cameras import PoseConsistency
 from bidnerf_core.captures.links import groups, linked
 from bidnerf_core.captures.pose_refinement import AdjustedPoses, adjusted_poses
 from bidnerf_core.captures.relocated_photos import Relocation, relocated, suspects
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import LandmarkConfig, TrackedViews
 
 INCONSISTENT = 0.25

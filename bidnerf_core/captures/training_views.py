@@ -20,11 +20,19 @@ from bidnerf_core.captures.pose_conventions import pose_contradiction
 from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, ImageKeypoints, TrackedViews, tracked_views
-from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, posed_keypoints
-from bidnerf_core.mapping.landmarks.features import SIFT, USUAL_FEATURES
-from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
+from bidnerf_core.frames import View
+from bidnerf_core.mapping import (
+    DEFAULT_LANDMARKS,
+    ENOUGH_IMAGES,
+    LEAST_VISIBLE_POINTS,
+    SIFT,
+    USUAL_FEATURES,
+    ImageKeypoints,
+    TrackedViews,
+    depth_ratio,
+    posed_keypoints,
+    tracked_views,
+)
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 
 log = logging.getLogger("bidnerf")

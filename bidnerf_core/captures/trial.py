@@ -15,13 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.robust import chi_squared_quantile
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3, chi_squared_quantile
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, propose
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
+    USUAL_FEATURES,
     Features,
     HeldOutTrial,
     LandmarkConfig,
@@ -29,7 +28,6 @@ from bidnerf_core.mapping import (
     TrackedViews,
     tracked_views,
 )
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
 HELD_OUT, MOST_HELD_OUT = 8, 24
 """One in ``HELD_OUT`` images is held out, ``MOST_HELD_OUT`` in all at most."""

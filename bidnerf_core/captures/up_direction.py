@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 UpSource = Literal["gravity", "planes", "cameras"]
 """Where an upward direction comes from."""

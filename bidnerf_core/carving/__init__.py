@@ -2,9 +2,6 @@
 matter is assumed.
 """
 
-from bidnerf_core.carving.bounds import estimate_bounds
-from bidnerf_core.carving.cells import occupied_cells, occupied_voxels
-from bidnerf_core.carving.free_space import FreeSpace
-from bidnerf_core.carving.hull import has_outline
+from lazy_loader import attach_stub
 
-__all__ = ["FreeSpace", "estimate_bounds", "has_outline", "occupied_cells", "occupied_voxels"]
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

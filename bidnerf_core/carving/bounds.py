@@ -18,8 +18,8 @@ from bidnerf_core.carving.pixel_footprint import (
     pixel_footprint,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.frames import View
 
 OUTLIERS = 1e-3  # fraction of the measured points, at either end of each axis, that may be wrong
 POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements to use: in all, and at least from each view

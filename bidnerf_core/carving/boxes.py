@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.fields.contract import crossed_box
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import crossed_box
+from bidnerf_core.frames import View
 
 Corner: TypeAlias = tuple[float, float, float]
 AxisBox: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from bidnerf_core.carving.boxes import Corner
 from bidnerf_core.carving.free_space import FreeSpace
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import SceneBounds, VoxelGrid
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 
 BLOCK = 8
 """Cells along the side of a block. Processing a block for a view that does not see it costs next to nothing."""

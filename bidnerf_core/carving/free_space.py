@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame, View
 
 LONGEST_SIDE = 400
 """Images are shrunk (by whole factors) to at most this many pixels a side: cells are coarse, and this bounds the time."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.carving.boxes import AxisBox, corner, grown, met, rays_of
 from bidnerf_core.carving.cells import occupied_cells
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 HULL = (64, 64, 64)
 CARVING_ROUNDS = 3  # each within the box that the previous one found

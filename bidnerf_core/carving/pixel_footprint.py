@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from bidnerf_core.carving.boxes import AxisBox
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 
 
 def pixel_footprint(views: Sequence[View], distance: Callable[[View], float]) -> float:

@@ -19,7 +19,7 @@ from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import UsageError
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.maps.map import load_map
+from bidnerf_core.maps import load_map
 
 
 def run(arguments: list[str]) -> None:

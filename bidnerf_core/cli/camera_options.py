@@ -9,9 +9,9 @@ import tyro
 
 from bidnerf_core.cli.options import option
 from bidnerf_core.datasets import DepthRegistration
-from bidnerf_core.depth.sensors import DEPTH_SENSORS
+from bidnerf_core.depth import DEPTH_SENSORS
 from bidnerf_core.errors import UsageError
-from bidnerf_core.frames.masks import HiddenColour, MaskFolder
+from bidnerf_core.frames import HiddenColour, MaskFolder
 
 NO = "no"
 """The value of ``--register-depth`` with which depth is used as it is."""

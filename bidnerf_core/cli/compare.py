@@ -23,13 +23,16 @@ from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import Flag, Names, option, parse, wrong_usage
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.evaluation.bench import Plan, changed_settings
-from bidnerf_core.evaluation.comparison import Comparison
-from bidnerf_core.evaluation.evaluate import run_comparison
-from bidnerf_core.evaluation.plots import comparison_figure
-from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.evaluation import (
+    PROTOCOLS,
+    Comparison,
+    Plan,
+    changed_settings,
+    comparison_figure,
+    find_protocol,
+    run_comparison,
+)
+from bidnerf_core.io import output_folder, to_plain
 from bidnerf_core.localization import METHODS
 from bidnerf_core.progress import Progress
 

@@ -13,28 +13,20 @@ from jaxtyping import UInt8
 from rich.table import Table
 
 from bidnerf_core.backend import Backend, load_backend, quick_config
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.options import DEFAULT_BACKEND, Flag, option, parse, require
 from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c, timed
-from bidnerf_core.datasets.writing import write_transforms
+from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.evaluation.plots import convergence_plot
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.io.images import png_bytes
+from bidnerf_core.evaluation import convergence_plot, perturb
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.io import output_folder, png_bytes, write_file
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps.map import Map
-from bidnerf_core.maps.training import train
-from bidnerf_core.results.errors import PoseError, pose_error
-from bidnerf_core.results.overlays import Painter, save_gif
-from bidnerf_core.scenes.closed_form import views
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.maps import Map, train
+from bidnerf_core.results import Painter, PoseError, pose_error, save_gif
+from bidnerf_core.scenes import demo_object, orbit, views
 from bidnerf_core.settings import LARGEST_SEED
 
 PHOTO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)

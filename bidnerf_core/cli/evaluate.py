@@ -23,13 +23,8 @@ from bidnerf_core.cli.options import Device, Names, option, parse, require, wron
 from bidnerf_core.cli.output import show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.errors import UsageError, amount
-from bidnerf_core.evaluation.bench import Plan, changed_settings
-from bidnerf_core.evaluation.evaluate import run_plan
-from bidnerf_core.evaluation.faults import FAULTS
-from bidnerf_core.evaluation.protocols import PROTOCOLS, Size
-from bidnerf_core.evaluation.provenance import command_line
-from bidnerf_core.localization import METHODS
-from bidnerf_core.localization.methods import USUAL_METHOD
+from bidnerf_core.evaluation import FAULTS, PROTOCOLS, Plan, Size, changed_settings, command_line, run_plan
+from bidnerf_core.localization import METHODS, USUAL_METHOD
 
 Place = Annotated[str, tyro.conf.Positional]
 STOPPING = "waiting for the trials under way (Ctrl-C again: at once)"

@@ -8,8 +8,8 @@ from typing import Annotated
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Flag, MapFolder, option, parse
 from bidnerf_core.cli.output import show
-from bidnerf_core.maps.map import load_map
-from bidnerf_core.results.export import export_map
+from bidnerf_core.maps import load_map
+from bidnerf_core.results import export_map
 
 
 def run(arguments: list[str]) -> None:

@@ -16,12 +16,11 @@ from bidnerf_core.cli.camera_options import (
 from bidnerf_core.cli.options import MapFolder, option, parse, require
 from bidnerf_core.cli.output import show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.datasets import Dataset, find_reader, open_dataset
 from bidnerf_core.errors import UsageError, amount
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.maps.description import load_info
-from bidnerf_core.maps.extending import extend as extend_map
+from bidnerf_core.maps import extend as extend_map
+from bidnerf_core.maps import load_info
 
 
 def run(arguments: list[str]) -> None:

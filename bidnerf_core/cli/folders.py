@@ -36,9 +36,7 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
 
 def check_pose_file(out: Path, inputs: Iterable[Path | str | None]) -> None:
     """Check an output file of poses as ``check_output`` does. Raises ``UsageError`` for an unknown file extension."""
-    from bidnerf_core.results.pose_files import (
-        pose_format,
-    )  # imported here, since 'report' works without torch
+    from bidnerf_core.results import pose_format  # imported here, since 'report' works without torch
 
     pose_format(out)
     check_output(out, inputs)
@@ -67,7 +65,7 @@ def check_folder(out: Path, inputs: Iterable[Path | str | None], may_be_map: boo
 
 def require_outside_maps(folder: Path, out: Path) -> None:
     """Raise ``UsageError`` if ``folder``, which would hold the output ``out``, is a map."""
-    from bidnerf_core.maps.description import DESCRIPTION
+    from bidnerf_core.maps import DESCRIPTION
 
     if (folder / DESCRIPTION).exists():
         raise UsageError("lies in the folder of a map", where=out, expected="a name outside of it")

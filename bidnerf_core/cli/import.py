@@ -15,10 +15,9 @@ from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
-from bidnerf_core.maps.importers import IMPORTERS, importer_of
-from bidnerf_core.maps.importing import import_map
-from bidnerf_core.results.pose_files import read_pose
+from bidnerf_core.mapping import USUAL_FEATURES
+from bidnerf_core.maps import IMPORTERS, import_map, importer_of
+from bidnerf_core.results import read_pose
 
 LEAST_SCALE = 1e-9
 

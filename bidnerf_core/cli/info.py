@@ -8,8 +8,8 @@ from typing import Annotated
 from bidnerf_core.cli.options import Flag, MapFolder, option, parse
 from bidnerf_core.cli.output import print_json, show
 from bidnerf_core.errors import InputError
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.results.capture_plot import draw_capture
+from bidnerf_core.maps import Map, load_map
+from bidnerf_core.results import draw_capture
 
 
 def run(arguments: list[str]) -> None:

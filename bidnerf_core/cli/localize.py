@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.cli.camera_options import (
     CameraFile,
     FieldOfView,
@@ -35,29 +35,36 @@ from bidnerf_core.cli.several_maps import (
     no_query,
 )
 from bidnerf_core.cli.starts import StartSpec
-from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.datasets.queries import DepthPoints, Photos, Query, QuerySource
+from bidnerf_core.datasets import DepthPoints, Photos, Query, QuerySource, SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.evaluation.trials import places_of
-from bidnerf_core.frames.frame import BLACK
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.images import png_bytes
-from bidnerf_core.localization import METHODS, Localization, Localizer
-from bidnerf_core.localization.methods import (
+from bidnerf_core.evaluation import places_of
+from bidnerf_core.frames import BLACK
+from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.io import png_bytes, write_file
+from bidnerf_core.localization import (
+    METHODS,
     USUAL_METHOD,
+    Localization,
+    Localizer,
+    landmark_cameras,
     matches_landmarks,
     require_start,
     require_use_of_depth,
 )
-from bidnerf_core.localization.problem import landmark_cameras
-from bidnerf_core.maps.collection import maps_in
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
-from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations
-from bidnerf_core.results.overlays import overlay
-from bidnerf_core.results.pose_files import OPENCV_AXES, pose_format, read_poses
+from bidnerf_core.maps import Map, load_map, maps_in
+from bidnerf_core.results import (
+    OPENCV_AXES,
+    Answer,
+    Answers,
+    Failure,
+    PoseError,
+    localize_each,
+    overlay,
+    pose_error,
+    pose_format,
+    read_poses,
+    standard_deviations,
+)
 from bidnerf_core.settings import LARGEST_SEED
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start)")

@@ -17,7 +17,7 @@ from bidnerf_core.errors import InputError, printable
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Dataset
-    from bidnerf_core.frames.frame import View
+    from bidnerf_core.frames import View
 else:
     Dataset = View = Any  # their modules import torch, which commands such as 'backends' do not need
 
@@ -62,7 +62,7 @@ def print_table(table: Table) -> None:
 
 def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None) -> list[View]:
     """Read the views of a split, with a progress display if there are many. Raises ``InputError`` for an empty split."""
-    from bidnerf_core.datasets.whole import with_all  # imported here, since it imports torch
+    from bidnerf_core.datasets import with_all  # imported here, since it imports torch
 
     dataset = with_all(dataset, split)
     total = len(dataset.frame_names(split)) if names is None else len(names)

@@ -11,8 +11,8 @@ from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Flag, option, parse
 from bidnerf_core.cli.output import print_json
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.structure.poses import find_poses
+from bidnerf_core.io import to_plain
+from bidnerf_core.structure import find_poses
 
 
 def run(arguments: list[str]) -> None:

@@ -6,20 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.cli.options import require, require_different
-from bidnerf_core.datasets import DepthRegistration, MaskFolder, ReadOptions, open_dataset
-from bidnerf_core.datasets.queries import (
+from bidnerf_core.datasets import (
     DatasetFrames,
     DepthPoints,
+    DepthRegistration,
     Photos,
     QuerySource,
+    ReadOptions,
     depth_files,
+    find_reader,
+    open_dataset,
     photo_files,
 )
-from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.errors import UsageError
-from bidnerf_core.io.images import IMAGE_SUFFIXES
+from bidnerf_core.frames import MaskFolder
+from bidnerf_core.io import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True)

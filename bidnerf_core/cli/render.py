@@ -22,14 +22,11 @@ from bidnerf_core.cli.options import DataFolder, Flag, MapFolder, Names, option,
 from bidnerf_core.cli.output import console, read_views, say, show
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError, printable
-from bidnerf_core.fields.rendering import RenderedImage
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.io.images import png_bytes
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.maps.rendering import RenderingScores, rendering_scores
+from bidnerf_core.fields import RenderedImage
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import symbol
+from bidnerf_core.io import output_folder, png_bytes, write_file
+from bidnerf_core.maps import Map, RenderingScores, load_map, rendering_scores
 
 DEEPEST = 65.535  # largest depth in metres that a 16-bit image in millimetres can hold
 

@@ -41,9 +41,7 @@ def report(
     Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """
     # Imported when a report is made, since help pages do not need it.
-    from bidnerf_core.evaluation.provenance import read_runs
-    from bidnerf_core.evaluation.report import chosen_criterion, write_report
-    from bidnerf_core.evaluation.results import ResultTable
+    from bidnerf_core.evaluation import ResultTable, chosen_criterion, read_runs, write_report
 
     if not results:
         raise UsageError("no results file", expected="at least one written by 'bidnerf evaluate'")

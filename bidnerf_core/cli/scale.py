@@ -11,11 +11,8 @@ from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import MapFolder, option, parse
 from bidnerf_core.cli.output import say, show
 from bidnerf_core.errors import UsageError
-from bidnerf_core.maps.description import load_info
-from bidnerf_core.maps.files import map_folder
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.maps.scaling import factor_of_distance, factor_of_poses
-from bidnerf_core.results.pose_files import read_positions
+from bidnerf_core.maps import Map, factor_of_distance, factor_of_poses, load_info, load_map, map_folder
+from bidnerf_core.results import read_positions
 
 one_way = tyro.conf.create_mutex_group(required=True, title="length of a unit (one of them)")
 

@@ -11,10 +11,9 @@ import tyro
 from bidnerf_core.cli.options import Device, option, parse, require
 from bidnerf_core.cli.output import say
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import read_record
-from bidnerf_core.service import server
-from bidnerf_core.service.settings import LEAST_TOKEN, ServiceLimits
+from bidnerf_core.io import read_file, read_record
+from bidnerf_core.service import LEAST_TOKEN, PORT, ServiceLimits
+from bidnerf_core.service import serve as serve_maps
 
 TOKEN = "BIDNERF_TOKEN"
 """The environment variable that may hold the token; a command-line argument would be visible to all users of
@@ -44,7 +43,7 @@ def serve(
             "this machine only",
         ),
     ] = None,
-    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = server.PORT,
+    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = PORT,
     token_file: Annotated[
         Path | None,
         option(
@@ -78,7 +77,7 @@ def serve(
     if not maps:
         raise UsageError("no MAP", expected="folders of maps")
     given = _token(token_file)
-    server.serve(
+    serve_maps(
         _named(maps), host=host, port=port, token=given, method=method, device=device, limits=limits,
         config=None if config is None else read_record(config).values,
         ready=lambda address, token: _announce(address, "TOKEN, the one that was given" if given else token),

@@ -9,16 +9,20 @@ from typing import Any
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.progress import counted
-from bidnerf_core.datasets.queries import Query, QuerySource
-from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.datasets import Query, QuerySource, find_reader
 from bidnerf_core.errors import InputError, UsageError, enumeration
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.io.images import IMAGE_SUFFIXES
-from bidnerf_core.maps.collection import MapCollection, maps_in
-from bidnerf_core.results.answers import Answer, Failure
-from bidnerf_core.results.errors import standard_deviations
-from bidnerf_core.results.placements import PlacedAnswer, Placements, place_each
-from bidnerf_core.results.pose_files import pose_format
+from bidnerf_core.geometry import symbol
+from bidnerf_core.io import IMAGE_SUFFIXES
+from bidnerf_core.maps import MapCollection, maps_in
+from bidnerf_core.results import (
+    Answer,
+    Failure,
+    PlacedAnswer,
+    Placements,
+    place_each,
+    pose_format,
+    standard_deviations,
+)
 
 
 def named_maps(first: Path, others: Sequence[Path]) -> tuple[list[Path], tuple[Path, ...]]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.datasets.queries import Query
+from bidnerf_core.datasets import Query
 from bidnerf_core.errors import UsageError
-from bidnerf_core.evaluation import protocols
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.results.pose_files import pose_of
+from bidnerf_core.evaluation import FARTHEST_START, perturb
+from bidnerf_core.geometry import SE3
+from bidnerf_core.results import pose_of
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class StartSpec:
     def check(self) -> None:
         """Raise ``UsageError`` for a perturbation out of range."""
         if self.perturb is not None:
-            limits = (("T", "metres", protocols.FARTHEST_START), ("R", "degrees", 180.0))
+            limits = (("T", "metres", FARTHEST_START), ("R", "degrees", 180.0))
             for (what, unit, most), value in zip(limits, self.perturb, strict=True):
                 if not 0 <= value <= most:
                     raise UsageError(
@@ -41,5 +41,5 @@ class StartSpec:
         Raises ``InputError`` if a file of several poses has none for this query.
         """
         if self.perturb is not None and query.truth is not None:
-            return protocols.perturb(query.truth, *self.perturb, seed)
+            return perturb(query.truth, *self.perturb, seed)
         return None if self.fixed is None else pose_of(self.fixed, query.name, self.file or "start")

@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.cli.camera_options import (
     CameraFile,
     DatasetDepthUnit,
@@ -32,17 +32,20 @@ from bidnerf_core.cli.output import print_json, print_table, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.watch_folder import STDIN, requests
 from bidnerf_core.datasets import FileSequence, FrameSequence, ReadOptions
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.depth import DepthCamera
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.localization import Localizer, Tracker, TrackerConfig, settings_of
-from bidnerf_core.localization.methods import USUAL_METHOD
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.results import tracked_path as library
-from bidnerf_core.results.answers import BAD_INPUT
-from bidnerf_core.results.plot_style import require_matplotlib
-from bidnerf_core.results.pose_files import read_pose
-from bidnerf_core.results.tracked_path import TrackedPath, opened_for
-from bidnerf_core.results.tracking_video import TrackingVideo, check_video
+from bidnerf_core.localization import USUAL_METHOD, Localizer, Tracker, TrackerConfig, settings_of
+from bidnerf_core.maps import Map, load_map
+from bidnerf_core.results import (
+    BAD_INPUT,
+    TrackedPath,
+    TrackingVideo,
+    check_video,
+    opened_for,
+    read_pose,
+    require_matplotlib,
+)
+from bidnerf_core.results import track as track_frames
 
 
 def run(arguments: list[str]) -> None:
@@ -167,7 +170,7 @@ def run(arguments: list[str]) -> None:
                     )
                     frames = frames if split is None else _of_split(frames, split)
                     with counted("tracking", "frames", -(-len(frames) // every)) as report:
-                        library.track(
+                        track_frames(
                             localizer, frames, config=config, start=begin, depth=depth, every=every, path=path,
                             each=None if drawn is None else drawn.add, progress=lambda p: report(p.done, p.total),
                         )  # fmt: skip

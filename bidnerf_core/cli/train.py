@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from bidnerf_core.backend import load_backend
-from bidnerf_core.captures.training_views import RefinementChoice
+from bidnerf_core.captures import RefinementChoice
 from bidnerf_core.cli.camera_options import (
     DatasetCamera,
     DatasetDepthUnit,
@@ -32,19 +32,25 @@ from bidnerf_core.cli.options import (
     wrong_usage,
 )
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.datasets import Background, open_dataset
-from bidnerf_core.datasets.colmap import SparseChoice
+from bidnerf_core.datasets import SparseChoice, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.io.images import background_colour
-from bidnerf_core.io.json import from_plain
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
-from bidnerf_core.maps import training
-from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS
-from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
-from bidnerf_core.maps.views import Images
+from bidnerf_core.io import Background, background_colour, from_plain
+from bidnerf_core.mapping import USUAL_FEATURES
+from bidnerf_core.maps import (
+    CHECKPOINT_SECONDS,
+    DESCRIPTION,
+    Images,
+    MapInfo,
+    OtherSettings,
+    interrupted,
+    load_info,
+    longest_side,
+)
+from bidnerf_core.maps import resume as resume_training
+from bidnerf_core.maps import train as train_map
 from bidnerf_core.settings import to_flat
-from bidnerf_core.structure.sources import lacks_poses
+from bidnerf_core.structure import lacks_poses
 
 
 def run(arguments: list[str]) -> None:
@@ -112,7 +118,7 @@ def run(arguments: list[str]) -> None:
         require("--checkpoint-every", checkpoint_every, 0)
         if resume and overwrite:
             raise UsageError(
-                "--resume continues a map, --overwrite starts a new one;", expected="only one of them"
+                "--resume continues a map, --overwrite starts a new one; expected only one of them"
             )
         if largest is not None:
             require("--largest", largest, 1)
@@ -125,29 +131,26 @@ def run(arguments: list[str]) -> None:
         photos = lacks_poses(data)
         if photos and (depth_unit is not None or register_depth is not None):
             raise UsageError(
-                "photos without poses have no depth; leave out --depth-unit and --register-depth", where=data
+                f"{data}: photos without poses have no depth; leave out --depth-unit and --register-depth"
             )
         if photos and masks is not None:
             raise UsageError(
-                "photos without poses; find them with 'bidnerf poses', then train with --masks", where=data
+                f"{data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
             )
         if photos and not (out / DESCRIPTION).exists():
             resume = False  # it was interrupted during pose estimation, which resumes by itself
         if resume:
-            info = training.interrupted(out, not no_bake)
+            info = interrupted(out, not no_bake)
             _check_unchanged(out, info, named, default, config)
             _check_refinement(out, info, refine_poses)
             if largest is not None and largest != longest_side(info):
                 raise UsageError(
-                    f"was started with images of {longest_side(info)} px, got --largest {largest}; leave it"
-                    " out",
-                    where=out,
+                    f"{out}: was started with images of {longest_side(info)} px, got --largest {largest}; leave"
+                    " it out"
                 )
             if landmark_features not in (USUAL_FEATURES, info.landmark_features):
                 began = f"--landmark-features {info.landmark_features}"
-                raise UsageError(
-                    f"was started with {began}, got {landmark_features}; leave it out", where=out
-                )
+                raise UsageError(f"{out}: was started with {began}, got {landmark_features}; leave it out")
             begun = info.bounds.background if background is None else background
         images: Images = data
         if not photos:
@@ -162,7 +165,7 @@ def run(arguments: list[str]) -> None:
                 "background": begun if photos else None, "camera": camera if photos else None,
             }  # fmt: skip
             if not resume:
-                training.train(
+                train_map(
                     images,
                     name,
                     out,
@@ -176,8 +179,8 @@ def run(arguments: list[str]) -> None:
                 )
                 return
             try:
-                training.resume(out, images, **same)
-            except training.OtherSettings as error:
+                resume_training(out, images, **same)
+            except OtherSettings as error:
                 raise UsageError(error) from error
 
     parse("train", train, arguments, default)
@@ -199,15 +202,14 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
     be ignored.
     """
     if backend not in (None, info.backend):
-        raise UsageError(f"uses backend {info.backend!r}, cannot resume it with {backend!r}", where=out)
+        raise UsageError(f"{out}: uses backend {info.backend!r}, cannot resume it with {backend!r}")
     began = from_plain(type(config), info.config, f"{out}: config")
     stored, given, usual = (to_flat(settings) for settings in (began, config, default))
     for key, value in given.items():
         if value not in (usual[key], stored[key]):
             raise UsageError(
-                f"was started with {key} {stored[key]}, got {value}; --resume keeps settings, --overwrite"
-                " starts again",
-                where=out,
+                f"{out}: was started with {key} {stored[key]}, got {value}; --resume keeps settings,"
+                " --overwrite starts again"
             )
 
 
@@ -219,6 +221,5 @@ def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) ->
     if refinement == ("never" if refined else "always"):
         has = "refined" if refined else "given"
         raise UsageError(
-            f"was started with {has} poses, got --refine-poses {refinement}; --resume keeps the poses",
-            where=out,
+            f"{out}: was started with {has} poses, got --refine-poses {refinement}; --resume keeps the poses"
         )

@@ -8,23 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.cli.camera_options import CameraFile, FieldOfView, FocalLength
 from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.options import Device, MapFolder, Names, option, parse, require
 from bidnerf_core.cli.output import console, say, show
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
-from bidnerf_core.datasets.dataset import in_other_split
-from bidnerf_core.datasets.queries import DatasetFrames, Query, QuerySource
+from bidnerf_core.datasets import DatasetFrames, Query, QuerySource, in_other_split
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
-from bidnerf_core.results.answers import BAD_INPUT
-from bidnerf_core.viewer import server
+from bidnerf_core.results import BAD_INPUT
+from bidnerf_core.viewer import PORT, serve_view
 
 if TYPE_CHECKING:
     from bidnerf_core.localization import Localizer
-    from bidnerf_core.viewer.answer import ShownAnswer
-    from bidnerf_core.viewer.table import ShownRow
+    from bidnerf_core.viewer import ShownAnswer, ShownRow
 
 
 def run(arguments: list[str]) -> None:
@@ -61,7 +59,7 @@ def view(
         str | None,
         option("ADDRESS", "allow other machines to view the page; they need the address with its token", "this machine only"),
     ] = None,
-    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = server.PORT,
+    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = PORT,
     device: Device = "cpu",
 ) -> None:  # fmt: skip
     """View a map in a browser, drop photos on it, and see how and why a pose was found or rejected. Ctrl-C
@@ -72,10 +70,8 @@ def view(
     """
     # Imported when a page is made, since help pages do not need it.
     from bidnerf_core.localization import Localizer
-    from bidnerf_core.maps.description import load_info
-    from bidnerf_core.maps.map import load_map
-    from bidnerf_core.viewer.trajectories import shown_trajectory
-    from bidnerf_core.viewer.view import page_of
+    from bidnerf_core.maps import load_info, load_map
+    from bidnerf_core.viewer import page_of, shown_trajectory
 
     require("--most", most, 1)
     require("--port", port, 0, 65535)
@@ -106,7 +102,7 @@ def view(
             page_of(scene, answers, path, rows).save(save)
         show(f"look at {save}")
         return
-    server.serve_view(
+    serve_view(
         localizer,
         source,
         path,
@@ -119,7 +115,7 @@ def view(
 
 
 def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, ...]:
-    from bidnerf_core.viewer.view import read_and_localized
+    from bidnerf_core.viewer import read_and_localized
 
     answers, count = [], len(source.names)
     with counted("localizing and rendering", "images", count) as report:
@@ -131,8 +127,8 @@ def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, 
 
 def rows_of(results: Path) -> tuple[ShownRow, ...]:
     """Return the trials in a results file as rows of the page's table."""
-    from bidnerf_core.evaluation.results import read_results
-    from bidnerf_core.viewer.table import shown_row
+    from bidnerf_core.evaluation import read_results
+    from bidnerf_core.viewer import shown_row
 
     return tuple(
         shown_row(

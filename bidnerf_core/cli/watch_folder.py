@@ -8,13 +8,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.depth import DepthCamera
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import photos_in
-from bidnerf_core.io.images import IMAGE_SUFFIXES, Background
-from bidnerf_core.io.json import parse_record
+from bidnerf_core.frames import Frame, photos_in
+from bidnerf_core.io import IMAGE_SUFFIXES, Background, parse_record
 
 STDIN = "-"
 POLL = 0.05

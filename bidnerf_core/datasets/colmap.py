@@ -17,12 +17,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.datasets.colmap_files import ModelImage, ModelPoints, read_model
-from bidnerf_core.depth.registration import nearest_depth
+from bidnerf_core.depth import nearest_depth
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import fit_similarity, spread
+from bidnerf_core.fields import Observations
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3, fit_similarity, spread
 
 MODEL_SPLITS = frozenset({"train", "val", "test"})
 LARGEST_MISFIT = 0.2

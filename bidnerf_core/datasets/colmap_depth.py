@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bidnerf_core.depth.images import DepthImage, depth_image
+from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import is_file, read_file
+from bidnerf_core.io import is_file, read_file
 
 FOLDER = "stereo/depth_maps"
 KINDS = ("geometric", "photometric")

@@ -19,13 +19,10 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera.colmap_models import MODEL_IDS, colmap_camera, colmap_parameters
-from bidnerf_core.camera.files import read_text_cameras
-from bidnerf_core.camera.lenses import Camera
+from bidnerf_core.camera import MODEL_IDS, Camera, colmap_camera, colmap_parameters, read_text_cameras
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.rows import Row, read_lines
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import Row, read_file, read_lines
 
 _Item = TypeVar("_Item")
 

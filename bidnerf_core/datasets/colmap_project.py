@@ -22,8 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera.lenses import Camera, PanoramaFace
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import Camera, CameraSource, PanoramaFace
 from bidnerf_core.datasets.colmap_depth import depth_map_of, read_colmap_depth
 from bidnerf_core.datasets.colmap_files import (
     ModelImage,
@@ -40,10 +39,9 @@ from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
+from bidnerf_core.frames import Frame, natural_order
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES
 
 MODELS = (
     "sparse",

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Protocol, TypeAlias, runtime_checkable
 
 from bidnerf_core.errors import InputError, refuse_text, spelling_hint
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import LengthUnit
 
 ReadingProgress: TypeAlias = Callable[[int, int], None]
 """Called with (frames read, frames requested) after each frame."""

@@ -17,8 +17,7 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.posed_images import ImageFrame, MetricImageDataset, images_posed, images_there
 from bidnerf_core.datasets.reader import OpenQuestion, Reader, ReadOptions
@@ -26,9 +25,8 @@ from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import Splits, hold_out
 from bidnerf_core.datasets.trajectories import read_timed_rows, read_trajectory, require_distinct_times
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.pose_rows import rigid_pose
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import is_file, read_file
+from bidnerf_core.geometry import SE3, rigid_pose
+from bidnerf_core.io import is_file, read_file
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
 NUMBERS = r"\s*:[^\[]*\[([^\]]*)\]"

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
+from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES, is_file
 
 IMAGE_ENDINGS = ("", *IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.dataset import unique_names
 from bidnerf_core.datasets.sequence import FileSequence, SequenceEntry, timestamp
-from bidnerf_core.depth.images import MILLIMETRE
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.depth import MILLIMETRE, DepthCamera
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
-from bidnerf_core.io.images import Background
+from bidnerf_core.frames import DEPTH_STEM, Frame, photos_in
+from bidnerf_core.io import Background
 
 
 def open_images(

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.posed_images import ImageFrame, MetricImageDataset, images_posed
@@ -25,11 +24,9 @@ from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import Splits, hold_out
 from bidnerf_core.datasets.trajectories import read_matrices
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import IMAGE_SUFFIXES, read_header
-from bidnerf_core.io.rows import read_rows
+from bidnerf_core.frames import natural_order
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import IMAGE_SUFFIXES, is_file, read_header, read_rows
 
 CALIBRATION = "calib.txt"
 CAMERAS = (2, 0, 3, 1)

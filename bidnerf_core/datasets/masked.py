@@ -10,15 +10,12 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera.lenses import CentralLens
-from bidnerf_core.camera.source import Raster
+from bidnerf_core.camera import CentralLens, Raster
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, ReadFrame, SequenceEntry, TimedFrame
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.masks import MaskFolder, WhollyHidden
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.frames import Frame, MaskFolder, View, WhollyHidden
+from bidnerf_core.geometry import SE3, LengthUnit
 
 
 class MaskedDataset:

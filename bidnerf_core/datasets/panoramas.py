@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from bidnerf_core.camera.lenses import PANORAMA_FACES, PanoramaFace
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import PANORAMA_FACES, PanoramaFace
+from bidnerf_core.geometry import SE3
 
 
 def faces_of(T_world_panorama: SE3) -> list[tuple[str, SE3]]:

@@ -24,17 +24,15 @@ from jaxtyping import Integer, Shaped
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import CameraSource, Raster
+from bidnerf_core.camera import CameraSource, Intrinsics, Raster
 from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.rgbd import largest_side
 from bidnerf_core.datasets.trajectories import check_unit
-from bidnerf_core.depth.images import DepthImage
+from bidnerf_core.depth import DepthImage
 from bidnerf_core.errors import InputError, amount, enumeration
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import fit_depth
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import reduced
+from bidnerf_core.frames import Frame, fit_depth
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import reduced
 
 LARGEST_SIDE = 640
 """Default limit of the pixels on a photo's longer side."""

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.rows import read_rows
-from bidnerf_core.io.tensors import read_archive, read_array
+from bidnerf_core.fields import Observations
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import read_archive, read_array, read_rows
 
 EXPECTED_POINTS = "n rows of x, y, z in metres"
 

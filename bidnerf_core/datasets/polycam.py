@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.phone_scans import CENTRE_OF_PIXEL, Measured, SureDepth, scan_frame
@@ -28,16 +28,11 @@ from bidnerf_core.datasets.phone_scans import HIGH_CONFIDENCE as ARKIT_CONFIDENC
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.depth.images import MILLIMETRE, read_depth_image
+from bidnerf_core.depth import MILLIMETRE, read_depth_image
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.pose_rows import pose_of_rows
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import Background, decode, read_compact_image
-from bidnerf_core.io.json import Record, read_record
+from bidnerf_core.frames import Frame, natural_order
+from bidnerf_core.geometry import SE3, LengthUnit, pose_of_rows
+from bidnerf_core.io import Background, Record, decode, is_file, read_compact_image, read_record
 
 BORDER = 15
 """Width in pixels of the hidden border of an undistorted photo."""

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.splits import SplitDataset
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import is_file
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import is_file
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,23 +9,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets import Dataset
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.colmap import SparsePoints
-from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.dataset import Dataset, unique_names
 from bidnerf_core.datasets.masked import MaskedDataset
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.reader import file_of_dataset, no_dataset
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.datasets.whole import WholeDataset, with_all
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.depth import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.masks import MaskFolder
-from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import Background, looks_like_image
+from bidnerf_core.fields import Observations
+from bidnerf_core.frames import DEPTH_STEM, Frame, MaskFolder, View, photos_in
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import Background, looks_like_image
 from bidnerf_core.localization import window as windowed
 
 log = logging.getLogger("bidnerf")

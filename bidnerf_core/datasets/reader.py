@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from bidnerf_core.camera.lenses import Camera
+from bidnerf_core.camera import Camera
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence, sequence_of
-from bidnerf_core.depth.images import FARTHEST
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.depth import FARTHEST
+from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
 from bidnerf_core.errors import InputError, InputWarning, enumeration
-from bidnerf_core.io.images import IMAGE_SUFFIXES, Background
+from bidnerf_core.io import IMAGE_SUFFIXES, Background
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path

@@ -19,8 +19,7 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames, posix_name
 from bidnerf_core.datasets.incomplete import present
@@ -29,11 +28,9 @@ from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import Splits, hold_out
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import open_binary
-from bidnerf_core.io.images import read_header
-from bidnerf_core.io.rows import Row, read_lines
+from bidnerf_core.frames import natural_order
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import Row, open_binary, read_header, read_lines
 
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")
 LENS = ("k1", "k2", "t1", "t2", "k3")

@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.phone_scans import (
@@ -36,15 +36,20 @@ from bidnerf_core.datasets.phone_scans import (
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.depth.images import depth_image
+from bidnerf_core.depth import depth_image
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.archives import Archive
-from bidnerf_core.io.files import is_file, read_file
-from bidnerf_core.io.images import Background, ImageSource, read_compact_image
-from bidnerf_core.io.json import Record, parse_record
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import (
+    Archive,
+    Background,
+    ImageSource,
+    Record,
+    is_file,
+    parse_record,
+    read_compact_image,
+    read_file,
+)
 
 METADATA = "metadata"
 EXPECTED = "a Record3D recording (.r3d)"

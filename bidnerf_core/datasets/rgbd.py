@@ -11,15 +11,10 @@ from pathlib import Path
 from jaxtyping import Bool
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.lenses import Camera
-from bidnerf_core.camera.source import Raster
-from bidnerf_core.depth.images import DepthImage
-from bidnerf_core.depth.registration import DepthCamera
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import fit_depth, pinhole_of
-from bidnerf_core.frames.resampling import Images
-from bidnerf_core.io.images import read_compact_image, read_header
+from bidnerf_core.camera import Camera, Intrinsics, Raster
+from bidnerf_core.depth import DepthCamera, DepthImage
+from bidnerf_core.frames import Frame, Images, fit_depth, pinhole_of
+from bidnerf_core.io import read_compact_image, read_header
 
 
 @dataclass(frozen=True)

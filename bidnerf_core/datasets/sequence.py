@@ -15,9 +15,8 @@ from typing import Protocol, TypeAlias, overload, runtime_checkable
 
 from bidnerf_core.datasets.dataset import Dataset, unique_names
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame, natural_order
+from bidnerf_core.geometry import SE3
 
 ReadFrame: TypeAlias = Callable[[], tuple[Frame, SE3 | None]]
 """Reads the files of a frame; the pose is ``T_world_camera`` if known."""

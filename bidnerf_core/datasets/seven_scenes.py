@@ -27,24 +27,18 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import CameraSource, folder_camera
+from bidnerf_core.camera import CameraSource, Intrinsics, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import present
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.depth.images import MILLIMETRE, DepthReader
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.pose_rows import read_pose_matrix
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.images import Background
-from bidnerf_core.io.rows import read_rows
+from bidnerf_core.frames import Frame, natural_order
+from bidnerf_core.geometry import SE3, LengthUnit, read_pose_matrix
+from bidnerf_core.io import Background, read_rows
 
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)

@@ -11,12 +11,9 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 from bidnerf_core.datasets.dataset import ReadingProgress, positions, unique_names
 from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, SequenceEntry
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.masks import WhollyHidden
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.images import Background, background_colour
+from bidnerf_core.frames import Frame, View, WhollyHidden, natural_order
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import Background, background_colour
 
 HOLD_OUT_EVERY = 8
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.phone_scans import (
@@ -30,14 +30,11 @@ from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.datasets.video_frames import VideoFrames
-from bidnerf_core.depth.images import MILLIMETRE, read_depth_image
+from bidnerf_core.depth import MILLIMETRE, read_depth_image
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import Background, decode
-from bidnerf_core.io.rows import Row, read_lines, read_rows
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import Background, Row, decode, is_file, read_lines, read_rows
 
 VIDEO, ODOMETRY, MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")

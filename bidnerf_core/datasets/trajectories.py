@@ -27,10 +27,8 @@ from torch import Tensor
 
 from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.geometry.pose_rows import rigid_pose
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.rows import LARGEST_ROWS, Row, parse_rows, read_rows
+from bidnerf_core.geometry import SE3, rigid_pose
+from bidnerf_core.io import LARGEST_ROWS, Row, parse_rows, read_file, read_rows
 
 NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
 UNIT_TO = 0.01

@@ -30,9 +30,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import same_aspect
-from bidnerf_core.camera.lenses import Camera
-from bidnerf_core.camera.source import Raster
+from bidnerf_core.camera import Camera, Raster, same_aspect
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.incomplete import present, remark
@@ -41,13 +39,11 @@ from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
-from bidnerf_core.depth.images import DepthReader
+from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.masks import HiddenColour, hides_everything, read_mask
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import Background, background_colour, read_header
+from bidnerf_core.frames import Frame, HiddenColour, hides_everything, read_mask
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import Background, background_colour, is_file, read_header
 
 DYNAMIC_MASK = "dynamic_mask_"
 """Prefix of instant-ngp's masks, which lie next to the images."""

@@ -8,19 +8,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, get_args
 
-from bidnerf_core.camera.files import CameraRecord, camera_record
-from bidnerf_core.camera.lenses import PANORAMA
+from bidnerf_core.camera import PANORAMA, CameraRecord, camera_record
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.panoramas import faces_of
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.geometry.pose_rows import pose_and_scale
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.images import IMAGE_SUFFIXES
-from bidnerf_core.io.json import Record, read_record
+from bidnerf_core.geometry import SE3, LengthUnit, pose_and_scale
+from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 
 SPLITS = ("train", "val", "test")
 METRES_PER_DEPTH_UNIT = 0.001

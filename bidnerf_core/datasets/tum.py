@@ -30,9 +30,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.lenses import Camera
-from bidnerf_core.camera.source import CameraSource, folder_camera
+from bidnerf_core.camera import Camera, CameraSource, Intrinsics, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.file_names import FileNames, posix_name
 from bidnerf_core.datasets.incomplete import present, remark
@@ -48,13 +46,11 @@ from bidnerf_core.datasets.trajectories import (
     read_trajectory,
     require_distinct_times,
 )
-from bidnerf_core.depth.images import DepthReader
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.depth import DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.images import Background
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import Background
 
 COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 METRES_PER_STEP = 1 / 5000

@@ -16,22 +16,18 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.posed_images import ImageFrame, MetricImageDataset, images_posed
 from bidnerf_core.datasets.reader import OpenQuestion, Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import Splits, hold_out
-from bidnerf_core.depth.images import MILLIMETRE, DepthReader
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.photos import natural_order
-from bidnerf_core.geometry.pose_rows import LARGEST_POSE, read_pose_matrix
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import is_file
-from bidnerf_core.io.rows import read_rows
+from bidnerf_core.frames import natural_order
+from bidnerf_core.geometry import LARGEST_POSE, SE3, read_pose_matrix
+from bidnerf_core.io import is_file, read_rows
 
 INFO = ("info.txt", "_info.txt")
 COLOUR = re.compile(r"frame-(\d+)\.color\.(?:png|jpe?g)", re.IGNORECASE)

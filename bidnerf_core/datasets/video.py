@@ -17,14 +17,11 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from bidnerf_core.camera.source import CameraSource, Raster
+from bidnerf_core.camera import CameraSource, Raster
 from bidnerf_core.datasets.sequence import TimedFrame
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.colours import as_floats
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.resampling import Images
-from bidnerf_core.io.files import open_binary
-from bidnerf_core.io.images import LARGEST_IMAGE, looks_like_image, reason
+from bidnerf_core.frames import Frame, Images, as_floats
+from bidnerf_core.io import LARGEST_IMAGE, looks_like_image, open_binary, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
 MICROSECONDS = 1_000_000

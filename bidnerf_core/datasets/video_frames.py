@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.datasets.video import opened_video, require_av, stored_pixels
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.images import reason
+from bidnerf_core.io import reason
 
 FORWARD = 90
 """Number of frames up to which decoding continues instead of seeking; phones write a key frame about once a second."""

@@ -11,9 +11,8 @@ from bidnerf_core.datasets.dataset import Dataset, ReadingProgress, positions, u
 from bidnerf_core.datasets.masked import MaskedDataset, wholly_hidden
 from bidnerf_core.datasets.splits import SplitDataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.masks import WhollyHidden
-from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.frames import View, WhollyHidden
+from bidnerf_core.geometry import LengthUnit
 
 ALL = "all"
 """The name that selects all splits together, unless a dataset has a split of that name."""

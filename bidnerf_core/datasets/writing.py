@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.transforms_json import METRES_PER_DEPTH_UNIT, SPLITS, file_of
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.images import png_bytes
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import png_bytes, write_file
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
 LENS = ("k1", "k2", "p1", "p2", "k3")

@@ -1,1 +1,5 @@
 """Depth images, the sensors that measure them, and their noise."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

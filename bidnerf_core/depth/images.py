@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.io.images import decode, to_numpy
-from bidnerf_core.io.tensors import read_array
+from bidnerf_core.io import decode, read_array, to_numpy
 
 FARTHEST = 1e9
 """Metres. No sensor measures farther."""

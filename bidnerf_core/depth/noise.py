@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth.sensors import DepthNoise, find_depth_sensor
-from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry import MAD_TO_SIGMA
 
 WINDOW_SIDE = 8
 """Side, in pixels, of the square windows to which planes are fitted."""

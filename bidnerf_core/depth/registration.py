@@ -9,14 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.camera.files import read_camera
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import Raster
+from bidnerf_core.camera import Intrinsics, Raster, read_camera
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.pose_rows import rigid_of_rows
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import resampled
-from bidnerf_core.io.json import read_record
+from bidnerf_core.geometry import SE3, rigid_of_rows
+from bidnerf_core.io import read_record, resampled
 
 ENOUGH_REGISTERED = 1000
 """Number of measured pixels above which at least one must fall into the colour image."""

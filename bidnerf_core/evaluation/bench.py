@@ -11,9 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass
 from typing import Any
 
-from bidnerf_core.datasets import Dataset
-from bidnerf_core.datasets.dataset import in_other_split
-from bidnerf_core.datasets.masked import wholly_hidden
+from bidnerf_core.datasets import Dataset, in_other_split, wholly_hidden
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, Size, find_protocol
@@ -30,13 +28,12 @@ from bidnerf_core.evaluation.trials import (
     run_trial,
     trial_views,
 )
-from bidnerf_core.frames.masks import INVERTED, HiddenColour
-from bidnerf_core.geometry.arcs import arc
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.localization import find_method
-from bidnerf_core.localization.methods import RENAMED, require_use_of_depth
+from bidnerf_core.frames import INVERTED, HiddenColour
+from bidnerf_core.geometry import arc
+from bidnerf_core.io import to_plain
+from bidnerf_core.localization import RENAMED, find_method, require_use_of_depth
 from bidnerf_core.progress import Cancel, Progress, ProgressCallback
-from bidnerf_core.scenes.closed_form_data import ClosedFormData
+from bidnerf_core.scenes import ClosedFormData
 from bidnerf_core.settings import Range, WholeNumbers, to_flat
 
 log = logging.getLogger("bidnerf")

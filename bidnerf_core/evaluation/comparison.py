@@ -21,14 +21,12 @@ from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summari
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import Opened
 from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured
-from bidnerf_core.geometry.units import LengthUnit, symbol
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.maps.description import DESCRIPTION, load_info
-from bidnerf_core.maps.map import Map
+from bidnerf_core.geometry import LengthUnit, symbol
+from bidnerf_core.io import to_plain, write_file
+from bidnerf_core.maps import DESCRIPTION, Map, load_info
 from bidnerf_core.progress import Cancel, Progress, ProgressCallback, check_cancelled
-from bidnerf_core.results.errors import CRITERIA
-from bidnerf_core.scenes.closed_form_data import is_closed_form
+from bidnerf_core.results import CRITERIA
+from bidnerf_core.scenes import is_closed_form
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from bidnerf_core.datasets import Dataset, ReadingProgress
-from bidnerf_core.datasets.dataset import positions
+from bidnerf_core.datasets import Dataset, ReadingProgress, positions
 from bidnerf_core.errors import Cancelled, InputError, amount, refuse_text
 from bidnerf_core.evaluation.bench import (
     Plan,
@@ -30,14 +29,12 @@ from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trials import Opened, Reading, open_map
 from bidnerf_core.evaluation.workers import workers_for
-from bidnerf_core.fields.contract import device_of
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.masks import HiddenColour
+from bidnerf_core.fields import device_of
+from bidnerf_core.frames import HiddenColour, View
 from bidnerf_core.localization import settings_of
-from bidnerf_core.maps.description import load_info
-from bidnerf_core.maps.map import Map
+from bidnerf_core.maps import Map, load_info
 from bidnerf_core.progress import Cancel, ProgressCallback
-from bidnerf_core.scenes.closed_form_data import is_closed_form
+from bidnerf_core.scenes import is_closed_form
 
 log = logging.getLogger("bidnerf")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.trial import TrialResult
-from bidnerf_core.io.json import parse_json
+from bidnerf_core.io import parse_json
 
 
 @dataclass(frozen=True)

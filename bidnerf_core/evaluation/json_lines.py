@@ -15,8 +15,15 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import FileInUse, open_binary, read_file, read_open_file, take_lock, write_file
-from bidnerf_core.io.json import parse_json
+from bidnerf_core.io import (
+    FileInUse,
+    open_binary,
+    parse_json,
+    read_file,
+    read_open_file,
+    take_lock,
+    write_file,
+)
 
 LARGEST_LINES = 512 * 2**20
 """Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""

@@ -34,18 +34,21 @@ from bidnerf_core.evaluation.summary import (
     usual_criterion,
 )
 from bidnerf_core.evaluation.trial import TrialResult
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.results.errors import CRITERIA, PoseError, Rate, success_rate_by_frame
-from bidnerf_core.results.overlays import as_array
-from bidnerf_core.results.plot_style import (
+from bidnerf_core.geometry import symbol
+from bidnerf_core.results import (
     COLOURS,
+    CRITERIA,
     CRITERION_NAMES,
     SHORT_CRITERION_NAMES,
+    PoseError,
+    Rate,
+    as_array,
     line_look,
     new_figure,
     require_matplotlib,
     save_figure,
     styled,
+    success_rate_by_frame,
     write_figure,
 )
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import InputError, unknown_name
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 SMALLEST_E_T, LARGEST_E_T = 0.5, 3.4
 """The range of e_t in the paper's tables: in units of a scene whose object fills a 2x2x2 cube, in metres in rooms."""

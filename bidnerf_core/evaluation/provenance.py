@@ -19,8 +19,7 @@ import torch
 
 import bidnerf_core
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import from_plain, read_record, to_plain
+from bidnerf_core.io import from_plain, read_record, to_plain, write_file
 
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
 SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")

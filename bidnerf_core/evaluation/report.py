@@ -27,10 +27,8 @@ from bidnerf_core.evaluation.summary import (
     usual_criterion,
 )
 from bidnerf_core.evaluation.trial import TrialResult
-from bidnerf_core.io.files import is_temporary, open_binary, write_file
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.results.errors import CRITERIA
-from bidnerf_core.results.plot_style import CRITERION_NAMES, require_matplotlib
+from bidnerf_core.io import is_temporary, open_binary, output_folder, write_file
+from bidnerf_core.results import CRITERIA, CRITERION_NAMES, require_matplotlib
 
 TEMPLATE = "report.html.jinja"
 MARK = '<meta name="generator" content="bidnerf report">'

@@ -17,10 +17,9 @@ from bidnerf_core.evaluation.groups import Condition, Group, Situation, grouped,
 from bidnerf_core.evaluation.json_lines import JsonLinesFile, LineFormat, as_line
 from bidnerf_core.evaluation.summary import Success, Summary, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.results.errors import CRITERIA
+from bidnerf_core.geometry import symbol
+from bidnerf_core.io import from_plain, to_plain, write_file
+from bidnerf_core.results import CRITERIA
 
 Key: TypeAlias = str
 """The identity of a trial, independent of the location of its folders."""

@@ -12,14 +12,8 @@ from dataclasses import dataclass
 
 from bidnerf_core.evaluation.groups import Group
 from bidnerf_core.evaluation.trial import TrialResult
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.results.errors import (
-    CRITERIA,
-    Rate,
-    Reduced,
-    steps_to_success,
-    success_rate_by_frame,
-)
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
 
 NEVER = math.inf
 """Steps to success of a trial that did not succeed."""

@@ -15,14 +15,13 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.masks import HiddenColour
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.results.errors import PoseError
-from bidnerf_core.scenes.closed_form_data import is_closed_form
+from bidnerf_core.frames import HiddenColour, View
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.io import to_plain
+from bidnerf_core.results import PoseError
+from bidnerf_core.scenes import is_closed_form
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 DIGEST_BYTES = 16  # enough that no two inputs coincide by chance

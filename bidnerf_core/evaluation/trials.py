@@ -20,10 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import torch
 from torch import Tensor
 
-from bidnerf_core.datasets import Dataset, MaskFolder, open_dataset
-from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.datasets.masked import MaskedDataset
-from bidnerf_core.datasets.whole import with_all
+from bidnerf_core.datasets import Dataset, MaskedDataset, SparseChoice, SparsePoints, open_dataset, with_all
 from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty, parse_faults
@@ -35,17 +32,14 @@ from bidnerf_core.evaluation.trial import (
     folder_digest,
     views_digest,
 )
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.masks import HiddenColour
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import from_plain, parse_record, to_plain
+from bidnerf_core.frames import HiddenColour, MaskFolder, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain, parse_record, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of
-from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.maps import DESCRIPTION, Map, MapInfo, cameras_of, load_map
 from bidnerf_core.registry import registered_names, require_registered
-from bidnerf_core.results.answers import plain_localization
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
+from bidnerf_core.results import plain_localization, pose_error
+from bidnerf_core.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
 
 if TYPE_CHECKING:

@@ -20,11 +20,10 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import Opened, opened_for, parse_settings, registered_for, run_trial
-from bidnerf_core.fields.contract import device_of, levels
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import draw, uniform
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import from_plain, parse_json, to_plain
+from bidnerf_core.fields import device_of, levels
+from bidnerf_core.frames import View, draw, uniform
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain, parse_json, to_plain
 from bidnerf_core.settings import to_flat
 
 PATIENCE = "20s"

@@ -1,1 +1,5 @@
 """Radiance fields: the contract, samplers, rendering, and residuals of renderings."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contraction import RaySpacing, contract
+from bidnerf_core.fields.contraction import RaySpacing, contract_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ class SceneBounds:
         then fills the inner half of each axis.
         """
         scaled = (positions - constant(self.centre, positions)) * (2 / self.side)
-        return contract(scaled) / 2 if self.contracted else scaled
+        return contract_points(scaled) / 2 if self.contracted else scaled
 
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
         """Return the rays limited to [near, far] and, unless the scene is contracted, to the box (slab method).

@@ -14,14 +14,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def contract(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+def contract_points(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
     """Return ``x`` where its norm is at most 1, and ``(2 - 1 / |x|) x / |x|`` elsewhere (eq. 10); every norm is below 2."""
     norm = points.abs().amax(-1, keepdim=True).clamp(min=1)
     return points * ((2 - 1 / norm) / norm)
 
 
 def expand(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-    """Return the points whose contractions are ``points``, the inverse of ``contract``."""
+    """Return the points whose contractions are ``points``, the inverse of ``contract_points``."""
     norm = points.abs().amax(-1, keepdim=True).clamp(min=1)
     return points / (norm * (2 - norm))
 

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import Rays, SceneBounds
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 
 @dataclass(frozen=True, eq=False)

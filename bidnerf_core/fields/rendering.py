@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
+from bidnerf_core.camera import Intrinsics, exposure_times, poses_of_rows
 from bidnerf_core.devices import constant, may_wait
 from bidnerf_core.fields.contract import (
     FieldValues,
@@ -22,7 +21,7 @@ from bidnerf_core.fields.contract import (
     SceneBounds,
     device_of,
 )
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.progress import check_stopped
 
 PICTURE_CONTRAST = 0.12

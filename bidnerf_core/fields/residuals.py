@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import Rendering
-from bidnerf_core.geometry.robust import Robust
+from bidnerf_core.geometry import Robust
 
 
 @runtime_checkable

@@ -1,1 +1,5 @@
 """Frames, the photos they are read from, and the selection of their pixels."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -15,27 +15,15 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.lenses import Camera, Lens
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.camera.source import CameraSource, Raster
-from bidnerf_core.depth.images import depth_image
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.camera import UPRIGHT, Camera, CameraSource, Intrinsics, Lens, Orientation, Raster
+from bidnerf_core.depth import DepthCamera, depth_image
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames.colours import HELD, LAST, Colours, as_bytes
 from bidnerf_core.frames.masks import HiddenColour, WhollyHidden, read_mask
 from bidnerf_core.frames.photos import fit_depth, read_photo
 from bidnerf_core.frames.resampling import Images
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import (
-    Background,
-    background_colour,
-    over,
-    pixel_array,
-    reduced,
-    resampled,
-    split_alpha,
-)
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import Background, background_colour, over, pixel_array, reduced, resampled, split_alpha
 
 SPARSE = 0.05
 """Fraction of pixels with depth below which depth counts as sparse: the pixels in between then remain unknown."""

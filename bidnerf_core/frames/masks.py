@@ -17,12 +17,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from bidnerf_core.camera.exif import read_exif
-from bidnerf_core.camera.intrinsics import same_aspect
-from bidnerf_core.camera.orientation import UPRIGHT
-from bidnerf_core.camera.source import Raster
+from bidnerf_core.camera import UPRIGHT, Raster, read_exif, same_aspect
 from bidnerf_core.errors import InputError, InputWarning, amount
-from bidnerf_core.io.images import IMAGE_SUFFIXES, decode, resampled
+from bidnerf_core.io import IMAGE_SUFFIXES, decode, resampled
 
 HiddenColour = Literal["black", "white"]
 """The colour in masks of the pixels that are ignored."""

@@ -9,14 +9,10 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.exif import read_exif
-from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
-from bidnerf_core.camera.lenses import Camera
-from bidnerf_core.camera.source import CameraSource, FoundCamera, Raster
-from bidnerf_core.depth.images import DepthImage, read_depth_image
-from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.camera import Camera, CameraSource, FoundCamera, Intrinsics, Raster, read_exif, same_aspect
+from bidnerf_core.depth import DepthCamera, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.images import (
+from bidnerf_core.io import (
     HEIF_SUFFIXES,
     IMAGE_SUFFIXES,
     Background,

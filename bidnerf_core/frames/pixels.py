@@ -20,8 +20,8 @@ from kornia.morphology import dilation
 from scipy.ndimage import distance_transform_edt
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
-from bidnerf_core.fields.observations import Observations
+from bidnerf_core.camera import exposure_times, poses_of_rows
+from bidnerf_core.fields import Observations
 from bidnerf_core.frames.colours import colours_at
 from bidnerf_core.frames.frame import Frame, View
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from bidnerf_core.camera.lenses import Lens
+from bidnerf_core.camera import Lens
 
 
 @dataclass(frozen=True, eq=False)

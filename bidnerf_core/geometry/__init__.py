@@ -1,1 +1,5 @@
 """Rigid transforms, similarities and robust statistics."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import Record
-from bidnerf_core.io.rows import read_rows
+from bidnerf_core.io import Record, read_rows
 
 LARGEST_POSE = 4096
 """Largest size of a file with one pose, in bytes."""

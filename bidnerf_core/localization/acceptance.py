@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
@@ -22,7 +22,7 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import RenderedThresholds
-from bidnerf_core.mapping.surface.casting import trace
+from bidnerf_core.mapping import trace
 
 WELL_BEFORE = 0.04
 """Fraction of the extent by which a line of sight must hit the surface too early to count as a violation."""

@@ -17,9 +17,9 @@ from functools import partial
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.orientation import Orientation
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Orientation
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
@@ -38,7 +38,7 @@ from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import ColourSettings, RefinementSettings, RefinementStage
 from bidnerf_core.localization.solvers.pivots import pivot
-from bidnerf_core.mapping.geometry.calibration import FIXED
+from bidnerf_core.mapping import FIXED
 
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which an image is not compared with its mirror image."""

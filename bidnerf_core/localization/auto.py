@@ -11,7 +11,7 @@ import math
 import time
 from dataclasses import dataclass, replace
 
-from bidnerf_core.depth.sensors import find_depth_sensor
+from bidnerf_core.depth import find_depth_sensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.chance import odds
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.solvers.pivots import Pivot

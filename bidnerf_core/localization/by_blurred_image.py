@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.devices import moved
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.acceptance import may_be_miscalibrated
 from bidnerf_core.localization.beyond_chance import Support, support
 from bidnerf_core.localization.by_landmarks import is_sharp

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator
 
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.acceptance import rendered_verdict
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.covariance import position_deviation

@@ -8,9 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Generator
 
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.robust import Robust
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3, USUAL, Robust
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.beyond_chance import support
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings

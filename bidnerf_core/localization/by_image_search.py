@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Generator
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.by_colour import ColourAnswer, localization_of, refine_by_colour, usual_stages
 from bidnerf_core.localization.by_landmarks import is_sharp

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import amount, enumeration
-from bidnerf_core.geometry.independent import USUAL, independent
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3, USUAL, independent
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,

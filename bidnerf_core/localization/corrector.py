@@ -6,8 +6,8 @@ import threading
 from types import TracebackType
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.result import Localization
 

@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.depth import UNKNOWN, DepthSensorModel
+from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.mapping import SurfaceMap
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.depth.sensors import DepthSensorModel
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.depth import DepthSensorModel
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.normal_equations import NormalEquations

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.geometry.robust import Robust
+from bidnerf_core.geometry import Robust
 
 EXPOSURE_ROUNDS = 6
 """Number of iterations of robust reweighting for the fit of the exposure."""

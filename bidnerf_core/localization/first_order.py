@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.residuals import Objective
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Objective
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.acceptance import DescentDiagnostics, descent_verdict
 from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.rendered import RayCounts, RenderedCost, draw_weighted_rays

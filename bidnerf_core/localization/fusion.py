@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.geometry.robust import RobustName
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3, RobustName
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings, Residuals
 from bidnerf_core.localization.covariance import position_deviation, weight
 from bidnerf_core.localization.depth_scale import (

@@ -12,16 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.depth.sensors import DepthSensorModel, find_depth_sensor
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import device_of
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
-from bidnerf_core.io.json import LARGEST_INTEGER
+from bidnerf_core.fields import Observations, device_of, render
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3, pose_from_matrix
+from bidnerf_core.io import LARGEST_INTEGER
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import (
     USUAL_METHOD,

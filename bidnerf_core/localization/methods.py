@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bidnerf_core.depth.sensors import UNKNOWN_SENSOR
+from bidnerf_core.depth import UNKNOWN_SENSOR
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization

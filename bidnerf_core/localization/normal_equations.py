@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3, se3_right_jacobian
+from bidnerf_core.geometry import SE3, se3_right_jacobian
 from bidnerf_core.localization.solvers.pivots import Pivot
 
 ROUNDING = 1e-9

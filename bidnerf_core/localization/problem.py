@@ -10,18 +10,15 @@ from typing import Protocol, TypeVar, runtime_checkable
 import torch
 from torch import nn
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.depth import UNKNOWN, DepthSensorModel
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, levels
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, levels
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 
 _Item = TypeVar("_Item")
 _Map = TypeVar("_Map", bound="SceneMap")

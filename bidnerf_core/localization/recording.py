@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.devices import moved
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 if TYPE_CHECKING:
     from bidnerf_core.localization.landmarks.pose import LandmarkPose

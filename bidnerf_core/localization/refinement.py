@@ -15,11 +15,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import may_wait, without_waiting
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Observations, RadianceField, SceneBounds, render
+from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.beyond_chance import Support, support
 from bidnerf_core.localization.costs.linearization import flattened
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings

@@ -13,14 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, unknown_name
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.pose_covariance import CovarianceConvention, covariance_in
-from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import from_plain, read_record, to_plain
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, CovarianceConvention, LengthUnit, covariance_in, pose_from_matrix
+from bidnerf_core.io import from_plain, read_record, to_plain, write_file
 
 
 class Outcome(StrEnum):

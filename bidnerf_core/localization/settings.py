@@ -6,18 +6,18 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from bidnerf_core.depth.sensors import DEPTH_SENSORS
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.residuals import (
+from bidnerf_core.depth import DEPTH_SENSORS
+from bidnerf_core.fields import (
     DEPTH_RESIDUALS,
     Objective,
+    SceneBounds,
     colour_term,
     depth_term,
     free_space_term,
     opacity_term,
 )
-from bidnerf_core.frames.pixels import DrawerName
-from bidnerf_core.geometry.robust import Robust, RobustName
+from bidnerf_core.frames import DrawerName
+from bidnerf_core.geometry import Robust, RobustName
 from bidnerf_core.localization.risk import least_confidence
 from bidnerf_core.localization.solvers.history import AnswerName
 from bidnerf_core.localization.solvers.pivots import PivotName

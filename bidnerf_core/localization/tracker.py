@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
 from bidnerf_core.localization.problem import SceneMap, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -48,8 +48,7 @@ from bidnerf_core.localization.tracking.state import (
     tracked_localization,
     unknown,
 )
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.landmarks.features import grey_image, strongest
+from bidnerf_core.mapping import SurfaceMap, grey_image, strongest
 
 START = 0.03, 0.1
 """Standard deviations of a start of unknown uncertainty: fraction of the scene's extent, and radians."""

@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidnerf_core.fields.contract import LARGEST_LENGTH
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import COLOUR_ROUNDING
+from bidnerf_core.fields import LARGEST_LENGTH, VoxelGrid
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import COLOUR_ROUNDING
 from bidnerf_core.mapping.landmarks.landmark_map import PER_LANDMARK, HeldOutTrial, LandmarkMap
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, Surfels
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape

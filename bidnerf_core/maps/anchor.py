@@ -23,10 +23,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
-from bidnerf_core.geometry.wgs84 import Geodetic, geodetic
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import from_plain, read_json, to_plain
+from bidnerf_core.geometry import SE3, Geodetic, geodetic, pose_from_matrix
+from bidnerf_core.io import from_plain, read_json, to_plain, write_file
 
 ANCHOR = "anchor.json"
 NEWER = re.compile(r"anchor-\d{8,}-[0-9a-f]{8}\.json")

@@ -7,15 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from bidnerf_core.captures.advice import summary
-from bidnerf_core.captures.cameras import pose_updates
-from bidnerf_core.captures.report import CaptureReport
-from bidnerf_core.captures.survey import surveyed
-from bidnerf_core.captures.trial import tried_landmarks
-from bidnerf_core.captures.up_direction import UpDirection
+from bidnerf_core.captures import CaptureReport, UpDirection, pose_updates, summary, surveyed, tried_landmarks
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import RadianceField
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import (
     BakeConfig,
     HeldOutTrial,
@@ -26,8 +21,8 @@ from bidnerf_core.mapping import (
     colour_noise,
     rendered_views,
     tracked_views,
+    update_scatter,
 )
-from bidnerf_core.mapping.landmarks.building import update_scatter
 from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import nn
 
-from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.fields import RadianceField
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.files import save_map
 from bidnerf_core.progress import Cancel, Progress, ProgressCallback

@@ -15,17 +15,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import Localization, Localizer, Outcome
-from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
-from bidnerf_core.localization.methods import USUAL_METHOD
-from bidnerf_core.localization.problem import unit_of
-from bidnerf_core.mapping import LandmarkMap, find_features
-from bidnerf_core.mapping.landmarks.features import detected
-from bidnerf_core.mapping.landmarks.vocabulary import Vocabulary, pooled_views
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import (
+    USUAL_METHOD,
+    Localization,
+    Localizer,
+    Outcome,
+    answer_by_landmarks,
+    localization_by_landmarks,
+    unit_of,
+)
+from bidnerf_core.mapping import LandmarkMap, Vocabulary, detected, find_features, pooled_views
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of, load_info
 from bidnerf_core.maps.files import load_landmarks
 from bidnerf_core.maps.map import Map, load_map

@@ -8,14 +8,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.cameras import PoseRefinement, StoredCamera, with_wrong_pose
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import PoseRefinement, StoredCamera, with_wrong_pose
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.json import from_plain, read_json
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import from_plain, read_json
+from bidnerf_core.mapping import USUAL_FEATURES
 
 FORMAT = "bidnerf map"
 VERSION = 1

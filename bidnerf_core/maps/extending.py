@@ -20,22 +20,15 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from bidnerf_core.backend import load_backend
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.captures.cameras import at_stored_poses, stored_cameras
-from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.datasets.queries import Photos, photo_files
-from bidnerf_core.datasets.reader import find_reader
-from bidnerf_core.datasets.rgbd import reading_at
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.captures import at_stored_poses, stored_cameras
+from bidnerf_core.datasets import Dataset, Photos, find_reader, open_dataset, photo_files, reading_at
 from bidnerf_core.errors import Cancelled, InputError, amount
-from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.fields.scaled import trained_field
-from bidnerf_core.frames.frame import Frame, SeenLandmarks, View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import locked
-from bidnerf_core.io.json import from_plain
-from bidnerf_core.localization import Localizer
-from bidnerf_core.localization.problem import landmark_cameras
+from bidnerf_core.fields import RadianceField, render_image, trained_field
+from bidnerf_core.frames import Frame, SeenLandmarks, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain, locked
+from bidnerf_core.localization import Localizer, landmark_cameras
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     BakeConfig,
@@ -43,9 +36,9 @@ from bidnerf_core.mapping import (
     SurfaceMap,
     TrackedViews,
     bake,
+    concatenated,
     tracked_views,
 )
-from bidnerf_core.mapping.landmarks.landmark_map import concatenated
 from bidnerf_core.maps.baking import bake_landmarks
 from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import cameras_of, load_info, longest_side

@@ -22,14 +22,19 @@ import torch
 from safetensors.torch import save as tensors_to_bytes
 from torch import nn
 
-from bidnerf_core.captures.report import CaptureReport
+from bidnerf_core.captures import CaptureReport
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.fields.scaled import ScaledField, trained_field
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.io.json import from_plain, read_json, to_plain
-from bidnerf_core.io.tensors import load_part, packed, read_tensors
+from bidnerf_core.fields import RadianceField, ScaledField, trained_field
+from bidnerf_core.io import (
+    from_plain,
+    load_part,
+    output_folder,
+    packed,
+    read_json,
+    read_tensors,
+    to_plain,
+    write_file,
+)
 from bidnerf_core.mapping import (
     LandmarkMap,
     SurfaceMap,

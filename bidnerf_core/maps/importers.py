@@ -11,11 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.captures.cameras import StoredCamera
+from bidnerf_core.captures import StoredCamera
 from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import SE3, Similarity
 from bidnerf_core.registry import Plugins, interface_defects
 
 UNMOVED = Similarity(1.0, SE3.identity())

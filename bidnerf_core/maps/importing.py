@@ -13,20 +13,15 @@ from typing import Any
 
 import torch
 
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, InputWarning, amount
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import draw, uniform
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.mapping import BakeConfig, find_features, surface_of_points
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.fields import RadianceField, SceneBounds, device_of, render
+from bidnerf_core.frames import View, draw, uniform
+from bidnerf_core.geometry import SE3, LengthUnit, Similarity
+from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.mapping import USUAL_FEATURES, BakeConfig, find_features, surface_of_points
 from bidnerf_core.maps.baking import bake_surface
 from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.files import map_folder, save_map

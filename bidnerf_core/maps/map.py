@@ -13,20 +13,21 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.camera.source import checked_side
-from bidnerf_core.captures.cameras import at_stored_poses, poses_of
-from bidnerf_core.captures.report import CaptureReport
-from bidnerf_core.captures.up_direction import UpDirection, given_up, up_direction
+from bidnerf_core.camera import checked_side
+from bidnerf_core.captures import (
+    CaptureReport,
+    UpDirection,
+    at_stored_poses,
+    given_up,
+    poses_of,
+    up_direction,
+)
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
-from bidnerf_core.fields.rendering import RenderedImage, render_image
-from bidnerf_core.fields.scaled import trained_field
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import locked
-from bidnerf_core.io.json import from_plain
-from bidnerf_core.io.tensors import read_tensors
-from bidnerf_core.localization.problem import on_device
+from bidnerf_core.fields import RadianceField, RenderedImage, SceneBounds, levels, render_image, trained_field
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.io import from_plain, locked, read_tensors
+from bidnerf_core.localization import on_device
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedViews, find_features
 from bidnerf_core.maps.anchor import Anchor, load_anchor
 from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface

@@ -8,12 +8,12 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets.splits import HOLD_OUT_EVERY
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import HOLD_OUT_EVERY
 from bidnerf_core.errors import amount
 from bidnerf_core.maps.views import Images
 from bidnerf_core.progress import Cancel, ProgressCallback
-from bidnerf_core.structure.sources import lacks_poses
+from bidnerf_core.structure import lacks_poses
 
 log = logging.getLogger("bidnerf")
 
@@ -38,7 +38,7 @@ def posed_images(
     if not isinstance(data, str | Path) or not lacks_poses(data):
         yield data, camera
         return
-    from bidnerf_core.structure.poses import find_poses
+    from bidnerf_core.structure import find_poses
 
     with (
         tempfile.TemporaryDirectory()

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from kornia.metrics import psnr
 from torch import Tensor
 
-from bidnerf_core.fields.rendering import RenderedImage
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.units import LengthUnit, symbol
+from bidnerf_core.fields import RenderedImage
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import LengthUnit, symbol
 
 
 @dataclass(frozen=True, eq=False)

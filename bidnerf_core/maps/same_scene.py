@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import RadianceField
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import colour_noise
 from bidnerf_core.maps.description import MapInfo
 

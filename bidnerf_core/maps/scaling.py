@@ -16,17 +16,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.captures.cameras import MatrixRows, RowMotion, StoredCamera
-from bidnerf_core.captures.report import CaptureReport
+from bidnerf_core.captures import CaptureReport, MatrixRows, RowMotion, StoredCamera
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.fields.contract import LARGEST_LENGTH, RadianceField, SceneBounds, device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.scaled import scaled_field, trained_field
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import fit_similarity, spread
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.images import IMAGE_SUFFIXES
+from bidnerf_core.fields import (
+    LARGEST_LENGTH,
+    RadianceField,
+    SceneBounds,
+    VoxelGrid,
+    device_of,
+    render,
+    scaled_field,
+    trained_field,
+)
+from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, spread
+from bidnerf_core.io import IMAGE_SUFFIXES
 from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
 from bidnerf_core.maps.anchor import scaled_anchor
 from bidnerf_core.maps.description import FieldFrame, MapInfo

@@ -8,14 +8,19 @@ from typing import Any
 
 from torch import nn
 
-from bidnerf_core.captures.advice import sentences
-from bidnerf_core.captures.cameras import MovedCamera, PoseRefinement, moved_cameras, pose_sentences
-from bidnerf_core.captures.report import CaptureReport
-from bidnerf_core.captures.up_direction import UpDirection
+from bidnerf_core.captures import (
+    CaptureReport,
+    MovedCamera,
+    PoseRefinement,
+    UpDirection,
+    moved_cameras,
+    pose_sentences,
+    sentences,
+)
 from bidnerf_core.errors import amount
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.fields import RadianceField, SceneBounds, levels
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.io import to_plain
 from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import duration_text

@@ -13,21 +13,23 @@ import torch
 from torch import nn
 
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import checked_side
-from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_cameras
-from bidnerf_core.captures.training_views import RefinementChoice, located, prepared
+from bidnerf_core.camera import Intrinsics, checked_side
+from bidnerf_core.captures import (
+    RefinementChoice,
+    as_given,
+    at_stored_poses,
+    located,
+    prepared,
+    stored_cameras,
+)
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets import Background
-from bidnerf_core.datasets.colmap import SparseChoice
+from bidnerf_core.datasets import SparseChoice
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount
-from bidnerf_core.fields.contract import device_of
-from bidnerf_core.frames.frame import View
-from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.io.tensors import packed
-from bidnerf_core.mapping import BakeConfig, TrackedViews, find_features
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.fields import device_of
+from bidnerf_core.frames import View
+from bidnerf_core.io import Background, from_plain, packed, to_plain
+from bidnerf_core.mapping import USUAL_FEATURES, BakeConfig, TrackedViews, find_features
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS, Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.files import load_state, map_folder

@@ -9,12 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.cameras import StoredCamera
-from bidnerf_core.fields.contract import RadianceField, Rays, SceneBounds, device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.geometry.looking import look_at
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import StoredCamera
+from bidnerf_core.fields import RadianceField, Rays, SceneBounds, device_of, render
+from bidnerf_core.geometry import SE3, look_at
 
 SIZE = 192
 """Width and height of an image in pixels."""

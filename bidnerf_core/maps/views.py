@@ -8,19 +8,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets import Background, Dataset, open_dataset
-from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.datasets.dataset import Georeferenced, ReadingProgress
-from bidnerf_core.datasets.rgbd import reading_at
-from bidnerf_core.datasets.whole import with_all
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import (
+    Dataset,
+    Georeferenced,
+    ReadingProgress,
+    SparseChoice,
+    SparsePoints,
+    open_dataset,
+    reading_at,
+    with_all,
+)
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import BLACK, Frame, View
-from bidnerf_core.frames.masks import INVERTED, WhollyHidden, masks_sentence
-from bidnerf_core.frames.pixel_store import PixelStore, bytes_of
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.images import background_colour
-from bidnerf_core.io.memory import available_memory
+from bidnerf_core.frames import (
+    BLACK,
+    INVERTED,
+    Frame,
+    PixelStore,
+    View,
+    WhollyHidden,
+    bytes_of,
+    masks_sentence,
+)
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.io import Background, available_memory, background_colour
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 
 log = logging.getLogger("bidnerf")

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.backend import UpgradingField
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.fields import RadianceField
 
 LARGEST_WEIGHT = 1e9
 """Limit of a field's parameters, beyond which products would overflow in float32; trained ones stay far below it."""

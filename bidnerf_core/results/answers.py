@@ -12,17 +12,21 @@ from typing import Any, TypeVar
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets.queries import Query, QuerySource
-from bidnerf_core.depth.noise import noise_remark
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import Query, QuerySource
+from bidnerf_core.depth import noise_remark
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit, symbol
-from bidnerf_core.io.files import write_file
-from bidnerf_core.localization import Localization, Localizer, Outcome
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, LandmarkThresholds
-from bidnerf_core.localization.problem import unit_of
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, LengthUnit, symbol
+from bidnerf_core.io import write_file
+from bidnerf_core.localization import (
+    LandmarkDiagnostics,
+    LandmarkThresholds,
+    Localization,
+    Localizer,
+    Outcome,
+    unit_of,
+)
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 from bidnerf_core.results.errors import PoseError, pose_error, rotation_angle
 from bidnerf_core.results.other_world import world_of_truth

@@ -13,10 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.captures.coverage import horizontal_axes
-from bidnerf_core.captures.report import CaptureReport, Gap, PhotoProblem, PhotoRecord
+from bidnerf_core.captures import CaptureReport, Gap, PhotoProblem, PhotoRecord, horizontal_axes
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.results.plot_style import COLOURS, new_figure, styled, write_figure
 
 LOOKS: dict[PhotoProblem, tuple[str, str]] = {

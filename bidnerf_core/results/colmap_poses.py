@@ -11,13 +11,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from bidnerf_core.camera.colmap_models import colmap_model
-from bidnerf_core.camera.exif import read_exif
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.camera import UPRIGHT, Intrinsics, colmap_model, read_exif
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import write_file
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import write_file
 from bidnerf_core.results.pose_files import PosedImage, as_stored, frame_of, require_finite
 
 HEAD = "# written by bidnerf"

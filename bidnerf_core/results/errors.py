@@ -13,9 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.robust import chi_squared_quantile
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit, symbol
+from bidnerf_core.geometry import SE3, LengthUnit, chi_squared_quantile, symbol
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.captures.inria_cameras import write_inria_cameras
+from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.folders import output_folder
-from bidnerf_core.maps.map import Map
+from bidnerf_core.io import output_folder, write_file
+from bidnerf_core.maps import Map
 from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.results.colmap_poses import write_colmap_poses
 from bidnerf_core.results.pose_files import PosedImage, frame_of, transforms_json

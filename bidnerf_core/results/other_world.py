@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.geometry import SE3, Similarity
 
 LEAST = 3
 """Smallest number of poses for which a common transformation means anything: it has seven degrees of freedom."""

@@ -13,13 +13,11 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.rendering import render_picture
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.images import reduced
-from bidnerf_core.localization import Localization, SceneMap
-from bidnerf_core.localization.localizer import Start, checked_map, start_pose
+from bidnerf_core.fields import render_picture
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import reduced, write_file
+from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, start_pose
 
 PICTURE_SIDE = 240
 """Maximum pixels on the longer side; larger photos are downscaled, since each rendered pixel takes time."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.maps.collection import MapCollection, Placement
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.maps import MapCollection, Placement
 from bidnerf_core.progress import Cancel, ProgressCallback
 from bidnerf_core.results.answers import Answer, Answers, Failure, answer_each
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf_core.errors import InputError, printable
-from bidnerf_core.io.files import write_file
+from bidnerf_core.io import write_file
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 """The colour-blind-safe palette of Okabe and Ito (2008), with brown instead of yellow, which is hard to see on white."""

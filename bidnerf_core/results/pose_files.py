@@ -17,15 +17,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.exif import read_exif
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.datasets.writing import frame_entry
+from bidnerf_core.camera import UPRIGHT, Intrinsics, Orientation, read_exif
+from bidnerf_core.datasets import frame_entry
 from bidnerf_core.errors import InputError, UsageError, printable, spelling_hint
-from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import read_file, write_file
-from bidnerf_core.io.json import parse_json
+from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix
+from bidnerf_core.io import parse_json, read_file, write_file
 from bidnerf_core.registry import Plugins, interface_defects
 
 TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"

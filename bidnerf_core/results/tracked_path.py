@@ -14,18 +14,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidnerf_core.captures.cameras import as_given
-from bidnerf_core.captures.up_direction import UpDirection
+from bidnerf_core.captures import UpDirection, as_given
 from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, open_sequence
 from bidnerf_core.errors import InputError, InputWarning, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.localization import Localization, Localizer, SceneMap, Tracker, TrackerConfig
-from bidnerf_core.localization.localizer import Start
-from bidnerf_core.localization.problem import landmark_cameras
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.localization import (
+    Localization,
+    Localizer,
+    SceneMap,
+    Start,
+    Tracker,
+    TrackerConfig,
+    landmark_cameras,
+)
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps import MapInfo
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 from bidnerf_core.results.answers import Answer, Answers, Failure
 from bidnerf_core.results.errors import standard_deviations, within

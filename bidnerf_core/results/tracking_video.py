@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame
 from bidnerf_core.localization import Localization, SceneMap
 from bidnerf_core.results.answers import Answer
 from bidnerf_core.results.overlays import Painter, tile

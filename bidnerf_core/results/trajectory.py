@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import fit_similarity
+from bidnerf_core.geometry import SE3, fit_similarity
 from bidnerf_core.results.errors import PoseError, pose_error
 
 LEAST_POSES = 3

@@ -9,9 +9,8 @@ from pathlib import Path
 import torch
 
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.io.files import write_file
+from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.io import write_file
 from bidnerf_core.results.pose_files import PosedImage, common_unit
 
 EUROC_HEAD = (

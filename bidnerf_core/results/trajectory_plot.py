@@ -12,10 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.captures.up_direction import UpDirection, up_direction
+from bidnerf_core.captures import UpDirection, up_direction
 from bidnerf_core.devices import moved
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.results.plot_style import new_figure, styled, write_figure
 

@@ -16,16 +16,13 @@ from typing import TypeVar
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import ReadingProgress
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.arcs import turned_about
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.map import Map
+from bidnerf_core.fields import SceneBounds, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3, turned_about
+from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.scenes.demo import demo_object, demo_room
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import look_around, orbit

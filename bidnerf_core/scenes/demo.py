@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import torch
 
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes.closed_form import ClosedFormScene, Hits, views
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.scenes.primitives import Box, Cylinder, Primitive, Shape, Sphere

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import FieldValues, Rays, RaySampler
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import FieldValues, Rays, RaySampler, Stratified
+from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes.primitives import Sphere
 
 

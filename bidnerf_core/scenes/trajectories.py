@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import torch
 
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.looking import look_at as look_at
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import look_at as look_at
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 """Angle (rad) whose successive multiples fill a circle evenly, however many there are."""

@@ -4,3 +4,7 @@ The listening process decodes nothing and does not import torch. It hands each r
 the one process that loaded the maps, so that a photo can only ever crash its own worker, and every map is in
 memory only once.
 """
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

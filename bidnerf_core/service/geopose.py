@@ -22,15 +22,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.colmap_models import MODELS
+from bidnerf_core.camera import MODELS
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.wgs84 import Geodetic
-from bidnerf_core.io.images import png_bytes
-from bidnerf_core.io.json import Record
+from bidnerf_core.geometry import SE3, Geodetic
+from bidnerf_core.io import Record, png_bytes
 from bidnerf_core.localization import Localization
-from bidnerf_core.maps.anchor import Anchor, GeographicPose
-from bidnerf_core.results.answers import Answer
+from bidnerf_core.maps import Anchor, GeographicPose
+from bidnerf_core.results import Answer
 from bidnerf_core.service.requests import LONGEST_NAME
 from bidnerf_core.service.upload import Upload
 

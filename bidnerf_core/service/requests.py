@@ -16,7 +16,7 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect, Request
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.io.json import parse_json
+from bidnerf_core.io import parse_json
 from bidnerf_core.service.settings import MEBIBYTE, ServiceLimits
 from bidnerf_core.settings import LARGEST_SEED
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.queries import Photos
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import Photos
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.images import Background, read_header
-from bidnerf_core.io.tensors import read_array
-from bidnerf_core.results.pose_files import read_pose
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import Background, read_array, read_header
+from bidnerf_core.results import read_pose
 
 NUMPY, HEIF_BRANDS = b"\x93NUMPY", (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"heim", b"heis")
 

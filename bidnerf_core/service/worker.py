@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import BLACK
+from bidnerf_core.frames import BLACK
 from bidnerf_core.localization import Localizer, settings_of
-from bidnerf_core.maps.collection import MapCollection
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.results.answers import Answer, localize_each
-from bidnerf_core.results.placements import place_each
+from bidnerf_core.maps import Map, MapCollection, load_map
+from bidnerf_core.results import Answer, localize_each, place_each
 from bidnerf_core.service import geopose, wire
 from bidnerf_core.service.settings import ChosenMethod
 from bidnerf_core.service.upload import Upload

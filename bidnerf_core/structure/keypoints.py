@@ -14,13 +14,20 @@ from typing import Any
 
 import torch
 
-from bidnerf_core.camera.exif import Exif, read_exif
-from bidnerf_core.camera.intrinsics import Intrinsics, reduced_size
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.camera.source import CameraSource, Raster, camera_from_exif
+from bidnerf_core.camera import (
+    UPRIGHT,
+    CameraSource,
+    Exif,
+    Intrinsics,
+    Orientation,
+    Raster,
+    camera_from_exif,
+    read_exif,
+    reduced_size,
+)
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.images import read_header, read_image
-from bidnerf_core.mapping.landmarks.features import Keypoints, Sift
+from bidnerf_core.io import read_header, read_image
+from bidnerf_core.mapping import Keypoints, Sift
 from bidnerf_core.structure.library import to_colmap
 from bidnerf_core.structure.sources import SourceImage
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bidnerf_core.camera.colmap_models import colmap_camera, colmap_model
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics, colmap_camera, colmap_model
 from bidnerf_core.errors import InputError
 
 NEWEST_NEEDED = "CancellationToken"

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from bidnerf_core.captures.up_direction import up_direction
+from bidnerf_core.captures import up_direction
 from bidnerf_core.errors import amount
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.structure.keypoints import Described, ListedPhoto
 from bidnerf_core.structure.matching import Overlaps
 

@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 import torch
 
-from bidnerf_core.mapping.landmarks.vocabulary import Vocabulary
+from bidnerf_core.mapping import Vocabulary
 
 Pairs: TypeAlias = list[tuple[int, int]]
 """Pairs (i < j) of indices of photos."""

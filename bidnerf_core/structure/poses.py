@@ -13,12 +13,10 @@ from typing import Any
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT
-from bidnerf_core.datasets.video import is_video
+from bidnerf_core.camera import UPRIGHT, Intrinsics
+from bidnerf_core.datasets import is_video
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.folders import output_folder
+from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 from bidnerf_core.structure import video_frames
 from bidnerf_core.structure.agreement import agreement

@@ -17,12 +17,11 @@ from typing import Any, TypeVar
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets.writing import frame_entry
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import frame_entry
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import converted, from_plain, read_json, to_plain
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import converted, from_plain, read_json, to_plain, write_file
 from bidnerf_core.structure.keypoints import DETECTOR, ListedPhoto
 from bidnerf_core.structure.library import from_colmap
 

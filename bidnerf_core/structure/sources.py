@@ -7,11 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.datasets.dataset import unique_names
-from bidnerf_core.datasets.reader import find_reader, no_dataset
-from bidnerf_core.datasets.video import VIDEO_SUFFIXES, is_video
+from bidnerf_core.datasets import VIDEO_SUFFIXES, find_reader, is_video, no_dataset, unique_names
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.photos import natural_order, photos_in
+from bidnerf_core.frames import natural_order, photos_in
 
 NOT_PHOTOS = ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
 """Names of folders whose images are not photos."""

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from bidnerf_core.camera.intrinsics import reduced_size
-from bidnerf_core.captures.photos import sharpness
-from bidnerf_core.datasets.video import frame_count, pictures
+from bidnerf_core.camera import reduced_size
+from bidnerf_core.captures import sharpness
+from bidnerf_core.datasets import frame_count, pictures
 from bidnerf_core.structure.sources import SourceImage
 
 STEP = 0.04

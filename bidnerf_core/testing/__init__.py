@@ -13,11 +13,6 @@ Readers, methods, detectors and faults have contracts of the same kind; they are
         name, folder = "mine", "a/small/capture"
 """
 
-from __future__ import annotations
+from lazy_loader import attach_stub
 
-from bidnerf_core.testing.contract import BackendContract
-from bidnerf_core.testing.image_contracts import FaultContract, FeaturesContract
-from bidnerf_core.testing.method_contract import MethodContract
-from bidnerf_core.testing.reader_contract import ReaderContract
-
-__all__ = ["BackendContract", "FaultContract", "FeaturesContract", "MethodContract", "ReaderContract"]
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend
-from bidnerf_core.fields.contract import RadianceField, levels
+from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.testing import derivatives, recipes, samples, values
 from bidnerf_core.testing.device import check_steps
 from bidnerf_core.testing.faults import calling, query, require_that

@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import RadianceField, render
+from bidnerf_core.geometry import SE3
 from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import SIDE, camera_rays, points, rgbd_views
 

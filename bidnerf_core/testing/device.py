@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
+from bidnerf_core.fields import RadianceField, SceneBounds, levels
 from bidnerf_core.localization import (
     AdamSettings,
+    AdamSteps,
     BidConfig,
     ColourSettings,
     DepthSettings,
@@ -30,10 +31,9 @@ from bidnerf_core.localization import (
     pivot,
     rig,
 )
-from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 from bidnerf_core.testing.faults import calling, require_that
-from bidnerf_core.testing.scene import BOUNDS, rgbd_views
+from bidnerf_core.testing.scene import SCENE_BOUNDS, rgbd_views
 from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
 from bidnerf_core.testing.values import close
 
@@ -45,7 +45,7 @@ OFF = (0.05, -0.03, 0.04, 0.01, -0.02, 0.01)
 @dataclass(frozen=True, eq=False)
 class _Scene:
     field: RadianceField
-    bounds: SceneBounds = BOUNDS
+    bounds: SceneBounds = SCENE_BOUNDS
     surface: SurfaceMap | None = None
     landmarks: LandmarkMap | None = None
     colour_noise: float | None = None

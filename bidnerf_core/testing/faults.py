@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySamples
+from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples
 
 
 def require_that(condition: bool, fault: str) -> None:

@@ -11,10 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import Fault, find_fault
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.mapping import Features, Keypoints, find_features
-from bidnerf_core.mapping.landmarks.features import squared_distances
+from bidnerf_core.evaluation import Fault, find_fault
+from bidnerf_core.frames import Frame
+from bidnerf_core.mapping import Features, Keypoints, find_features, squared_distances
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.textured_field import training_views
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import METHODS, Localization, Localizer, Method
 from bidnerf_core.registry import interface_defects
 from bidnerf_core.testing.faults import calling, require_that

@@ -11,13 +11,10 @@ from typing import Any, ClassVar
 
 import torch
 
-from bidnerf_core.captures.pose_conventions import pose_contradiction
-from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.reader import READERS, Reader, ReadOptions
-from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedViews, tracked_views
-from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
+from bidnerf_core.captures import pose_contradiction
+from bidnerf_core.datasets import READERS, Dataset, FrameSequence, Reader, ReadOptions
+from bidnerf_core.frames import View
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedViews, depth_ratio, tracked_views
 from bidnerf_core.testing.faults import calling, require_that
 
 ENOUGH_POINTS = 30

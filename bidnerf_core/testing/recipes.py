@@ -14,11 +14,10 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import RadianceField, SceneBounds, render
+from bidnerf_core.frames import View
 from bidnerf_core.testing.faults import calling, require_that
-from bidnerf_core.testing.scene import BOUNDS, DIMMED_BOUNDS, camera_rays, exposed_views, rgbd_views
+from bidnerf_core.testing.scene import DIMMED_BOUNDS, SCENE_BOUNDS, camera_rays, exposed_views, rgbd_views
 from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
 LEARNED = 0.8
@@ -184,7 +183,7 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
 
 def colour_error(field: RadianceField) -> float:
     """Return the mean squared colour error over all pixels of the training views."""
-    found = [rendered(field, view, BOUNDS) for view in rgbd_views()]
+    found = [rendered(field, view, SCENE_BOUNDS) for view in rgbd_views()]
     seen = torch.cat([view.frame.rgb.reshape(-1, 3) for view in rgbd_views()])
     return float((torch.cat(found) - seen).square().mean())
 

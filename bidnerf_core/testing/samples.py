@@ -5,9 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.fields.contract import HitField, RadianceField, RayHits, Rays, RaySamples
-from bidnerf_core.fields.rendering import Rendering, render, rendering_weights
-from bidnerf_core.fields.sampling import Stratified
+from bidnerf_core.fields import (
+    HitField,
+    RadianceField,
+    RayHits,
+    Rays,
+    RaySamples,
+    Rendering,
+    Stratified,
+    render,
+    rendering_weights,
+)
 from bidnerf_core.testing.faults import calling, require_that, sample
 from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
 from bidnerf_core.testing.values import close

@@ -10,22 +10,21 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import Rays, widened
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.scenes.closed_form import views as seen_from
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import Rays, widened
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.scenes import demo_object, orbit
+from bidnerf_core.scenes import views as seen_from
 
 SIZE = 24
 CAMERA = Intrinsics(32.0, 32.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
-BOUNDS = demo_object().bounds
-SIDE = max(BOUNDS.size)  # metres
+SCENE_BOUNDS = demo_object().bounds
+SIDE = max(SCENE_BOUNDS.size)  # metres
 DIMMED = 0.6
 """Brightness of the views of ``exposed_views`` and of the background behind them, so that no exposure saturates."""
-_R, _G, _B = BOUNDS.background
-DIMMED_BOUNDS = replace(BOUNDS, background=(DIMMED * _R, DIMMED * _G, DIMMED * _B))
+_R, _G, _B = SCENE_BOUNDS.background
+DIMMED_BOUNDS = replace(SCENE_BOUNDS, background=(DIMMED * _R, DIMMED * _G, DIMMED * _B))
 
 
 @cache
@@ -58,19 +57,19 @@ def camera_rays(T_world_camera: SE3) -> Rays:
     """Return rays through all pixels, in the precision of the pose and differentiable in it."""
     pixels = CAMERA.unproject(CAMERA.pixel_centres()).reshape(-1, 3).to(T_world_camera.translation)
     directions = T_world_camera.rotate(torch.nn.functional.normalize(pixels, dim=-1))
-    return BOUNDS.rays(T_world_camera.translation.expand_as(directions), directions)
+    return SCENE_BOUNDS.rays(T_world_camera.translation.expand_as(directions), directions)
 
 
 def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Return random positions within the box, and random unit directions."""
     generator = torch.Generator().manual_seed(seed)
-    lower, size = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.size)
+    lower, size = torch.tensor(SCENE_BOUNDS.lower), torch.tensor(SCENE_BOUNDS.size)
     return lower + size * torch.rand((count, 3), generator=generator), _directions(count, generator)
 
 
 def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
     """Return positions at which carelessly written fields index out of range or overflow."""
-    lower, upper = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.upper)
+    lower, upper = torch.tensor(SCENE_BOUNDS.lower), torch.tensor(SCENE_BOUNDS.upper)
     share = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     middle, corners = (lower + upper) / 2, lower + share * (upper - lower)
     return {
@@ -83,17 +82,19 @@ def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
 
 def awkward_rays() -> dict[str, Rays]:
     """Return rays of the kinds that occur in localization."""
-    middle = (torch.tensor(BOUNDS.lower) + torch.tensor(BOUNDS.upper)) / 2
+    middle = (torch.tensor(SCENE_BOUNDS.lower) + torch.tensor(SCENE_BOUNDS.upper)) / 2
     inside, away = points(24)
     outside = middle - 2 * SIDE * away
     across = torch.nn.functional.normalize(away + 0.3 * away.roll(1, 0), dim=-1)
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
     return {
-        "rays from outside": BOUNDS.rays(outside, across),
-        "rays from within the box": BOUNDS.rays(inside, away),
-        "rays along the axes": BOUNDS.rays(middle - 2 * SIDE * axes + 0.1 * SIDE * axes.roll(1, -1), axes),
-        "rays that are sampled twice as far": widened(BOUNDS.rays(outside, away), 2.0),
-        "rays that miss the scene": BOUNDS.rays(outside, -away),
+        "rays from outside": SCENE_BOUNDS.rays(outside, across),
+        "rays from within the box": SCENE_BOUNDS.rays(inside, away),
+        "rays along the axes": SCENE_BOUNDS.rays(
+            middle - 2 * SIDE * axes + 0.1 * SIDE * axes.roll(1, -1), axes
+        ),
+        "rays that are sampled twice as far": widened(SCENE_BOUNDS.rays(outside, away), 2.0),
+        "rays that miss the scene": SCENE_BOUNDS.rays(outside, -away),
     }
 
 

@@ -12,11 +12,11 @@ import torch
 from torch import nn
 
 from bidnerf_core.backend import load_backend
-from bidnerf_core.fields.contract import RadianceField, levels
-from bidnerf_core.io.json import from_plain, to_plain
+from bidnerf_core.fields import RadianceField, levels
+from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.testing import recipes
 from bidnerf_core.testing.faults import calling, query, require_that
-from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views
+from bidnerf_core.testing.scene import SCENE_BOUNDS, points, rgbd_views
 
 SUBJECT_STEPS = 40
 """Training steps if the test sets no ``config``."""
@@ -51,7 +51,7 @@ class Subject:
 
     def _build(self, config: Any = None) -> Any:
         with calling(f"{called(self._backend())}.build"):
-            return self._backend().build(self._config() if config is None else config, BOUNDS)
+            return self._backend().build(self._config() if config is None else config, SCENE_BOUNDS)
 
     def _trained(self) -> Any:
         """Return a field trained on RGB-D views and frozen like that of a loaded map; trained once per test class."""

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-from bidnerf_core.fields.contract import FieldValues, RadianceField
+from bidnerf_core.fields import FieldValues, RadianceField
 from bidnerf_core.testing.faults import query, require_that
 from bidnerf_core.testing.scene import awkward_points, points
 

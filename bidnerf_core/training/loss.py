@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.fields.rendering import Rendering
+from bidnerf_core.fields import Rendering
 from bidnerf_core.training.ray_bank import TrainingBatch
 
 

@@ -9,15 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.batch import CameraBatch
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import AT_REST, poses_of_rows
+from bidnerf_core.camera import AT_REST, CameraBatch, Intrinsics, poses_of_rows
 from bidnerf_core.devices import moved
-from bidnerf_core.fields.contract import Rays, SceneBounds
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import SPARSE, Frame, View
-from bidnerf_core.frames.image_pixels import ImagePixels
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Observations, Rays, SceneBounds
+from bidnerf_core.frames import SPARSE, Frame, ImagePixels, View
+from bidnerf_core.geometry import SE3
 
 MEASURED_SHARE = 0.25
 """Fraction of a batch's rays drawn from pixels with depth, if these are so few that hardly any would be drawn

@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.captures.photos import detail_kept
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.fields.rendering import Rendering, render
-from bidnerf_core.frames.frame import View
+from bidnerf_core.captures import detail_kept
+from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, render
+from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.colour_transform import ColourTransforms
 from bidnerf_core.training.loop import StepOutcome, cosine, fit

@@ -1,1 +1,5 @@
 """The page that shows a map and the localizations in it: as a file that needs no server, or live."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

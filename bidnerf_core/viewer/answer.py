@@ -11,20 +11,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.rendering import RenderedImage, render_picture
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.io.images import reduced, resampled
-from bidnerf_core.localization import METHODS, Localization
-from bidnerf_core.localization.advice import ADVICE
-from bidnerf_core.localization.landmarks.chance import probability_of
-from bidnerf_core.localization.landmarks.pose import LandmarkPose
-from bidnerf_core.localization.problem import SceneMap
-from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import RenderedImage, render_picture
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.io import reduced, resampled
+from bidnerf_core.localization import (
+    ADVICE,
+    METHODS,
+    LandmarkPose,
+    Localization,
+    SceneMap,
+    SearchRecord,
+    probability_of,
+)
 from bidnerf_core.registry import PluginError
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.viewer.explanations import APART, HERE, TURNED_DEG, Contest, contests, earlier, told
 from bidnerf_core.viewer.figures import Figure, acceptance_figures
 from bidnerf_core.viewer.packing import Packed, Picture, drawing, packed, photograph

@@ -24,19 +24,24 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.camera import CameraSource, Intrinsics
+from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import Cancelled, InputError
-from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps.map import Map
+from bidnerf_core.maps import Map
 from bidnerf_core.progress import stopped_by
-from bidnerf_core.service.access import SAFE, Access
-from bidnerf_core.service.app import problem
-from bidnerf_core.service.requests import Refused, body_of, json_of, query_of
-from bidnerf_core.service.settings import ServiceLimits
-from bidnerf_core.service.upload import Upload
+from bidnerf_core.service import (
+    SAFE,
+    Access,
+    Refused,
+    ServiceLimits,
+    Upload,
+    body_of,
+    json_of,
+    problem,
+    query_of,
+)
 from bidnerf_core.viewer.jobs import Busy, Jobs
 from bidnerf_core.viewer.packing import jpeg
 from bidnerf_core.viewer.page_state import PageState

@@ -5,22 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.localization import Localization
-from bidnerf_core.localization.acceptance import DescentDiagnostics, SurfaceDiagnostics
-from bidnerf_core.localization.beyond_chance import DISPLACEMENT, NO_RIVAL, Support
-from bidnerf_core.localization.landmarks.chance import DECISIVE, odds, probability_of
-from bidnerf_core.localization.landmarks.hypotheses import (
+from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.localization import (
+    DECISIVE,
+    DISPLACEMENT,
+    NO_RIVAL,
+    ComparedExplanation,
+    DescentDiagnostics,
     Explanation,
+    LandmarkPose,
+    Localization,
     Motion,
     Posterior,
+    SearchRecord,
     Stated,
+    Support,
+    SurfaceDiagnostics,
     Whose,
+    odds,
+    probability_of,
 )
-from bidnerf_core.localization.landmarks.pose import LandmarkPose
-from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.viewer.scene import rows_of
 
 LEAST_SHOWN = 0.001

@@ -6,21 +6,25 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from bidnerf_core.localization import Localization
-from bidnerf_core.localization.acceptance import (
+from bidnerf_core.localization import (
+    ACCEPTED,
+    DECISIVE,
+    LEAST_EXPLAINED,
+    SHARPEST,
+    ComparedExplanation,
     DescentDiagnostics,
     LandmarkDiagnostics,
+    LandmarkPose,
     LandmarkThresholds,
+    Localization,
+    Outcome,
+    SearchRecord,
+    Support,
     SurfaceDiagnostics,
     SurfaceThresholds,
     landmark_diagnostics,
+    probability_of,
 )
-from bidnerf_core.localization.beyond_chance import ACCEPTED, LEAST_EXPLAINED, Support
-from bidnerf_core.localization.by_landmarks import SHARPEST
-from bidnerf_core.localization.landmarks.chance import DECISIVE, probability_of
-from bidnerf_core.localization.landmarks.pose import LandmarkPose
-from bidnerf_core.localization.recording import ComparedExplanation, SearchRecord
-from bidnerf_core.localization.result import Outcome
 from bidnerf_core.viewer.explanations import earlier, support_of, told
 
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -9,13 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from bidnerf_core.datasets.queries import Query
+from bidnerf_core.datasets import Query
 from bidnerf_core.errors import Cancelled, InputError
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.localization import Localizer
-from bidnerf_core.localization.recording import SearchRecord
+from bidnerf_core.io import to_plain
+from bidnerf_core.localization import Localizer, SearchRecord
 from bidnerf_core.progress import stopped_by
-from bidnerf_core.results.answers import BAD_INPUT
+from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.viewer.answer import ShownAnswer
 from bidnerf_core.viewer.view import localized
 

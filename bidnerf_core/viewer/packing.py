@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from bidnerf_core.results.overlays import as_picture
+from bidnerf_core.results import as_picture
 
 JPEG_QUALITY = 85
 

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.io import to_plain
 from bidnerf_core.viewer.answer import ShownAnswer
 from bidnerf_core.viewer.scene import ShownMap
 from bidnerf_core.viewer.table import ShownRow

@@ -6,11 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.images import SurfaceRenderer
-from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import render_image
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import SceneMap, SurfaceRenderer
 
 PIXELS_AT_A_TIME = 4096
 """Number of pixels between two checks whether a rendering is still wanted, see ``stopped_by``."""

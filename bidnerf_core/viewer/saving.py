@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import write_file
+from bidnerf_core.io import write_file
 from bidnerf_core.viewer.page_state import PageState
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")

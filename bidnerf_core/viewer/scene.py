@@ -10,13 +10,12 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.cameras import StoredCamera, poses_of
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import StoredCamera, poses_of
 from bidnerf_core.devices import moved
-from bidnerf_core.fields.contract import SplatField
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import symbol
-from bidnerf_core.maps.map import Map
+from bidnerf_core.fields import SplatField
+from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.maps import Map
 from bidnerf_core.viewer.packing import (
     Packed,
     PackedPoints,

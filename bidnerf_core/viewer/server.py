@@ -7,13 +7,12 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.queries import QuerySource
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import QuerySource
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps.map import Map
-from bidnerf_core.service.server import run_app
-from bidnerf_core.service.settings import ServiceLimits, checked_token
+from bidnerf_core.maps import Map
+from bidnerf_core.service import ServiceLimits, checked_token, run_app
 from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.scene import shown_map
 from bidnerf_core.viewer.table import ShownRow
@@ -49,7 +48,7 @@ def serve_view(
     try:
         import uvicorn  # noqa: F401
 
-        from bidnerf_core.service.access import is_loopback
+        from bidnerf_core.service import is_loopback
         from bidnerf_core.viewer.app import Shown, viewer_app
     except ImportError as error:
         raise InputError(NEEDS) from error

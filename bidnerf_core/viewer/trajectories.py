@@ -11,13 +11,11 @@ from typing import Any
 
 import torch
 
-from bidnerf_core.datasets.trajectories import read_trajectory
+from bidnerf_core.datasets import read_trajectory
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import read_file
-from bidnerf_core.results.errors import standard_deviations
-from bidnerf_core.results.pose_files import pose_entries
+from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix
+from bidnerf_core.io import read_file
+from bidnerf_core.results import pose_entries, standard_deviations
 from bidnerf_core.viewer.packing import Packed, packed
 
 log = logging.getLogger("bidnerf")

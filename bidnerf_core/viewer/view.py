@@ -7,14 +7,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import Localization, Localizer
-from bidnerf_core.localization.recording import SearchRecord, recorded
-from bidnerf_core.maps.map import Map
-from bidnerf_core.results.answers import BAD_INPUT
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import Localization, Localizer, SearchRecord, recorded
+from bidnerf_core.maps import Map
+from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.viewer.answer import PICTURE_SIDE, ShownAnswer, shown_answer
 from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.saving import page_html, save_page

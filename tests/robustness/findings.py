@@ -20,6 +20,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from bidnerf_core import SE3, Frame, Intrinsics, Localizer, Tracker, load_map
 from damage import POSTSCRIPT, zeros_png
 from harness import (
     AUTO,
@@ -41,10 +45,6 @@ from harness import (
     sound_folder,
     tracker,
 )
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
-
-from bidnerf_core import SE3, Frame, Intrinsics, Localizer, Tracker, load_map
 
 
 class Work:

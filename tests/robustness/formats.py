@@ -14,10 +14,9 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from bidnerf_core.datasets import open_sequence
 from damage import OTHER_VALUES, at, counts, joined, parts_of, places_of, replaced_at, with_count
 from harness import SMALL_FIELD, Check, Checks, Door, defects, run, sound_folder, tracker, views_of
-
-from bidnerf_core.datasets import open_sequence
 
 LARGE_NUMBERS = ("1e400", "-1e308", "NaN", "1" + "0" * 400)
 

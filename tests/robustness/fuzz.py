@@ -25,6 +25,9 @@ from typing import Any
 
 import numpy as np
 import torch
+
+from bidnerf_core import SE3, Frame, Intrinsics, Localizer, load_map
+from bidnerf_core.localization import settings_of
 from damage import ARRAYS, BYTES, IMAGES, JSON, NUMBERS, POINTS, TENSORS, TEXTS, Damage, counts
 from harness import (
     AUTO,
@@ -42,9 +45,6 @@ from harness import (
     sound_folder,
     views_of,
 )
-
-from bidnerf_core import SE3, Frame, Intrinsics, Localizer, load_map
-from bidnerf_core.localization import settings_of
 
 FolderDoor = list[str] | Callable[[Path], object]
 """An entry point: the words of a command, in which ``{}`` stands for the folder, or a function of the folder."""

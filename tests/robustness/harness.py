@@ -34,9 +34,8 @@ from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localizer, Tracker,
 from bidnerf_core.cli import bake, evaluate, localize, main, render, report, track, train  # noqa: F401  (before a fork)
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.localization import settings_of
-from bidnerf_core.scenes.closed_form import views as seen_from
-from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.scenes import demo_object, orbit
+from bidnerf_core.scenes import views as seen_from
 
 CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 SMALL_FIELD = shlex.split(

@@ -29,6 +29,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+
+from bidnerf_core import Localizer, load_map
+from bidnerf_core.localization import settings_of
 from harness import (
     BAKED,
     QUICK,
@@ -47,9 +50,6 @@ from harness import (
     run,
     sound_folder,
 )
-
-from bidnerf_core import Localizer, load_map
-from bidnerf_core.localization import settings_of
 
 VARIES = ("seconds", "peak_memory_bytes")
 STEPS, TRIALS, FRAMES = "12", "8", 24

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+
 from counts import KINDS
 from findings import FINDINGS, Work
 from harness import Check

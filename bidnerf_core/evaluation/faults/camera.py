@@ -9,13 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import Orientation
-from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
+from bidnerf_core.camera import Intrinsics, Orientation, exposure_times, poses_of_rows
 from bidnerf_core.evaluation.faults.fault import random_direction
 from bidnerf_core.evaluation.faults.warp import nearest, warped
 from bidnerf_core.evaluation.protocols import random_units
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame
 
 
 def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:

@@ -8,7 +8,7 @@ import torch
 
 from bidnerf_core.evaluation.faults import camera, colour, depth, scene
 from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.settings import Above, Range, WholeNumbers
 
 FACTOR = Above(0.0, 100.0)

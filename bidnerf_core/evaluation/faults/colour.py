@@ -13,8 +13,8 @@ from kornia.filters import gaussian_blur2d
 from PIL import Image
 from torch import Generator, Tensor
 
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.localization.costs.images import KERNEL_REACH
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization import KERNEL_REACH
 
 
 def exposure(frame: Frame, factor: float, generator: Generator) -> Frame:

@@ -11,7 +11,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults.fault import find_fault
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames import Frame, View
 
 NO_FAULT = "none"
 """The name that leaves a view unchanged."""

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.evaluation.faults.fault import depth_of, random_direction, random_pixel
 from bidnerf_core.evaluation.faults.warp import nearest
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame
 
 PLANE_TRIALS, PLANE_SAMPLE = 256, 4096
 """Number of planes to try, and of points used to compare them."""

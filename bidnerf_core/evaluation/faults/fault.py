@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
 from bidnerf_core.registry import Plugins
 from bidnerf_core.settings import Range, WholeNumbers
 

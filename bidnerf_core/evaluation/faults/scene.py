@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.evaluation.faults.fault import depth_of, random_direction, random_pixel, uniform_number
 from bidnerf_core.evaluation.faults.warp import reflected, warped
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame
 
 NEAREST_QUANTILE = 0.02
 """Quantile of the measured depth that counts as the nearest part of the scene."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames import Frame
 
 
 def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:

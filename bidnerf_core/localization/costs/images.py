@@ -19,18 +19,14 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, interpolate, pad
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import constant
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import continued
-from bidnerf_core.geometry.robust import inlier_weight
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import RadianceField, SceneBounds, render
+from bidnerf_core.frames import View, continued
+from bidnerf_core.geometry import SE3, inlier_weight
 from bidnerf_core.localization.exposure import Exposure, clipped, fit_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.surface.casting import cast
+from bidnerf_core.mapping import SurfaceMap, cast
 
 KERNEL_REACH = 3.0
 """Radius of a blurring kernel in standard deviations."""

@@ -14,12 +14,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields.contract import HitField, RadianceField, Rays, RaySamples
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import Rendering, render, render_samples
-from bidnerf_core.fields.residuals import Residual
-from bidnerf_core.fields.sampling import rows_of
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import (
+    HitField,
+    Observations,
+    RadianceField,
+    Rays,
+    RaySamples,
+    Rendering,
+    Residual,
+    render,
+    render_samples,
+    rows_of,
+)
+from bidnerf_core.geometry import SE3
 
 MOST_AT_ONCE = 2**18
 """Number of samples, including copies, up to which all channels are differentiated in one pass."""

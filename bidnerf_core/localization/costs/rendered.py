@@ -14,13 +14,18 @@ from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields.contract import HitField, RadianceField, Rays
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.residuals import Objective
-from bidnerf_core.fields.sampling import AroundDepth, HitsAroundDepth, Resampled
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import DrawerName, continued, draw, drawer
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import (
+    AroundDepth,
+    HitField,
+    HitsAroundDepth,
+    Objective,
+    Observations,
+    RadianceField,
+    Rays,
+    Resampled,
+)
+from bidnerf_core.frames import DrawerName, View, continued, draw, drawer
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.exposure import EXPOSURE_ROUNDS, Exposure, clipped, robust_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations

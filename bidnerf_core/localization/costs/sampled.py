@@ -9,15 +9,22 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, SceneBounds, widened
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.residuals import Objective, masked_mean
-from bidnerf_core.fields.sampling import Resampled, Stratified
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.pixels import PixelDrawer, draw, drawer
-from bidnerf_core.geometry.robust import Robust
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import (
+    FieldValues,
+    Objective,
+    Observations,
+    RadianceField,
+    Rays,
+    RaySampler,
+    Resampled,
+    SceneBounds,
+    Stratified,
+    masked_mean,
+    render,
+    widened,
+)
+from bidnerf_core.frames import Frame, PixelDrawer, draw, drawer
+from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.costs.rendered import RayCounts
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import DescentSettings, ReachSettings

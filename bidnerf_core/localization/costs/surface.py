@@ -10,12 +10,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import moved
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.colours import colours_at
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import observe, visible_at
-from bidnerf_core.geometry.robust import inlier_weight
-from bidnerf_core.geometry.se3 import SE3, skew
+from bidnerf_core.fields import Observations
+from bidnerf_core.frames import View, colours_at, observe, visible_at
+from bidnerf_core.geometry import SE3, inlier_weight, skew
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap

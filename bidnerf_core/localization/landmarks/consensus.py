@@ -15,9 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping import GIVEN, Calibration, ObservedPoints
 
 SUCCESS = 0.9999
 """RANSAC stops once a sample without outliers has been drawn with this probability."""

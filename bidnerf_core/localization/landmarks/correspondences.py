@@ -9,12 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.landmarks.features import Features
-from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints, image_keypoints
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping import Features, ImageKeypoints, LandmarkMap, ObservedPoints, image_keypoints
 
 MIN_MATCHES = 6
 """Minimum number of correspondences from which a pose, or a scale of measured depth, is estimated."""

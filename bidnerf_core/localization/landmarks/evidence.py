@@ -9,18 +9,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.chance import log10_nfa
 from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.guided_pose import GuidedPose
 from bidnerf_core.localization.landmarks.hypotheses import Whose
 from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose, MatchEvidence
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.mapping.geometry.calibration import GIVEN
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.resection import ReprojectionFit
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import GIVEN, LandmarkMap, ObservedPoints, ReprojectionFit
 
 CELLS = 8
 """Number of rows and columns of cells by which the spread of correspondences over an image is measured."""

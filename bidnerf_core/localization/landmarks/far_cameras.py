@@ -12,17 +12,23 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.consensus import Candidate
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.evidence import described
 from bidnerf_core.localization.landmarks.guided_pose import refined_pose
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.mapping.geometry.calibration import ANY, STRETCHED, Calibration
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.reprojection import SCALE, ReprojectionErrors, State
-from bidnerf_core.mapping.geometry.resection import minimized
+from bidnerf_core.mapping import (
+    ANY,
+    SCALE,
+    STRETCHED,
+    Calibration,
+    ObservedPoints,
+    ReprojectionErrors,
+    State,
+    minimized,
+)
 
 UNSUSPECTED = 0.8
 """Minimum inlier fraction of the matches at which the stated intrinsics are not suspected."""

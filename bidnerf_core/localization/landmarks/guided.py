@@ -11,14 +11,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, moved_points
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import AT_REST, Intrinsics, exposure_times, moved_points
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches
-from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
-from bidnerf_core.mapping.landmarks.features import paired_squared_distances
-from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import GIVEN, Calibration, ImageKeypoints, LandmarkMap, paired_squared_distances
 
 CANDIDATES = 6
 """Maximum number of landmarks that are compared with a keypoint: the nearest ones in the image."""

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import STILL, MotionPrior
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.consensus import Candidate
 from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches
 from bidnerf_core.localization.landmarks.guided import ProjectedLandmarks, guided_matches, projected_landmarks
@@ -23,9 +23,15 @@ from bidnerf_core.localization.landmarks.hypotheses import (
     share_moving,
 )
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
+from bidnerf_core.mapping import (
+    FIXED,
+    GIVEN,
+    Calibration,
+    CalibrationPrior,
+    ObservedPoints,
+    ReprojectionFit,
+    resect,
+)
 
 RADII = (3.0, 1.5)
 """Radii of the rounds of guided matching, in units of the inlier threshold."""

@@ -19,12 +19,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import MotionPrior
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics, MotionPrior
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.chance import log_odds_of
 from bidnerf_core.localization.landmarks.map_camera import SHARE_SAME_CAMERA, MapCamera
-from bidnerf_core.mapping.geometry.calibration import (
+from bidnerf_core.mapping import (
     ANY,
     CALIBRATED,
     CROPPED,
@@ -34,18 +33,21 @@ from bidnerf_core.mapping.geometry.calibration import (
     MISTAKEN,
     MISTAKES,
     NOMINAL,
+    RESECTION_STEPS,
     RIGHT,
     USUAL,
     USUALLY,
+    Array,
     Calibration,
     CalibrationPrior,
+    Conditional,
+    EliminatedPose,
+    LandmarkMap,
+    ObservedPoints,
+    ReprojectionErrors,
+    State,
+    minimized,
 )
-from bidnerf_core.mapping.geometry.eliminated_pose import Conditional, EliminatedPose
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.projection import Array
-from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
-from bidnerf_core.mapping.geometry.resection import RESECTION_STEPS, minimized
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
 """Prior probability that an image has motion during readout, and the same if the map's images do.

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
+from bidnerf_core.camera import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
 from bidnerf_core.localization.landmarks.chance import log_odds_of
-from bidnerf_core.mapping.geometry.calibration import (
+from bidnerf_core.mapping import (
     CALIBRATED,
     CROPPED,
     CROPS,

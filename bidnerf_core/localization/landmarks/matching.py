@@ -17,16 +17,18 @@ from torch import Tensor
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, LandmarkMatches
-from bidnerf_core.mapping.landmarks.features import (
+from bidnerf_core.mapping import (
+    BLOCK,
     Features,
     FoundOnce,
+    ImageKeypoints,
+    LandmarkMap,
     detected,
     find_features,
+    k_means,
+    nearest_centre,
     squared_distances,
 )
-from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
-from bidnerf_core.mapping.landmarks.vocabulary import BLOCK, k_means, nearest_centre
 
 EXHAUSTIVE = 4_000
 """The number of landmarks up to which the search is exhaustive, without cells."""

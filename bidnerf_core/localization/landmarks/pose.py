@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.guided_pose import GuidedPose
 from bidnerf_core.localization.landmarks.hypotheses import Posterior, Whose
-from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration
+from bidnerf_core.mapping import FIXED, GIVEN, Calibration
 
 ESTIMATED_INFLATION = 3.0
 """Factor on the covariance of poses with estimated intrinsics.

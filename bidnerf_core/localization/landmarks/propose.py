@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.chance import CONVINCING
 from bidnerf_core.localization.landmarks.consensus import Candidate, focal_consensus, sample_consensus
 from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES, LandmarkMatches, query_images
@@ -26,8 +26,7 @@ from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
 from bidnerf_core.localization.landmarks.twins import second_of_plane, twin_of
 from bidnerf_core.localization.recording import current_record
-from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
-from bidnerf_core.mapping.landmarks.features import Features
+from bidnerf_core.mapping import FIXED, NOMINAL, Calibration, CalibrationPrior, Features
 
 MANY_VISIBLE, CONTRADICTED = 200, 1.5
 """Minimum number of visible landmarks for contradicting a pose, and multiple of the chance matches below which they contradict

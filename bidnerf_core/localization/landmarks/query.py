@@ -10,15 +10,18 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches, observed_points
 from bidnerf_core.localization.landmarks.hypotheses import Hypothesis, Stated, camera_hypotheses
 from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
-from bidnerf_core.mapping.geometry.calibration import FIXED, CalibrationPrior
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.landmarks.features import paired_squared_distances
-from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import (
+    FIXED,
+    CalibrationPrior,
+    ImageKeypoints,
+    LandmarkMap,
+    ObservedPoints,
+    paired_squared_distances,
+)
 
 THRESHOLD = 0.005
 """Maximum reprojection error of an inlier, as a fraction of the image's diagonal; at least 2 pixels."""

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
@@ -24,9 +24,15 @@ from bidnerf_core.localization.landmarks.guided_pose import RADII, confirmed
 from bidnerf_core.localization.landmarks.matching import LOOKED_UP, LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
-from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, CalibrationPrior
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_likelihood_ratio, resect
+from bidnerf_core.mapping import (
+    FIXED,
+    GIVEN,
+    CalibrationPrior,
+    ObservedPoints,
+    ReprojectionFit,
+    log_likelihood_ratio,
+    resect,
+)
 
 COMPARED = 100
 """Maximum number of correspondences for which similar landmarks at other places are searched for."""

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.devices import moved
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.images import (
     ColourScales,
     FieldRenderer,
@@ -25,8 +25,7 @@ from bidnerf_core.localization.costs.images import (
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
 from bidnerf_core.localization.solvers.pivots import Pivot
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.surface.casting import Cast, cast
+from bidnerf_core.mapping import Cast, SurfaceMap, cast
 
 APART, TURNED = 0.15, math.radians(20)
 """Distance (fraction of the extent, radians) beyond which two poses are different answers."""

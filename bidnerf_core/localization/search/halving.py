@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.errors import amount
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.normal_equations import Cost
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend

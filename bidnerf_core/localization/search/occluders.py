@@ -11,12 +11,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.acceptance import SIGHT_LINES
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import LEAST_POINTS
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.surface.casting import cast
+from bidnerf_core.mapping import SurfaceMap, cast
 
 JUMP = 0.05
 """Relative depth difference above which neighbouring pixels belong to different segments."""

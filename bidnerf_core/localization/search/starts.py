@@ -11,7 +11,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Generator, Tensor
 from torch.quasirandom import SobolEngine
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.solvers.pivots import Pivot
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant, noted, without_waiting
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.settings import AdamSettings
 from bidnerf_core.localization.solvers.history import WINDOW, History
 from bidnerf_core.localization.solvers.pivots import Pivot

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 WINDOW = 20
 """Steps over which the noisy loss of a few rays is averaged."""

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.normal_equations import Cost, NormalEquations
 from bidnerf_core.progress import check_stopped
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.frames.pixels import measured_middle
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import measured_middle
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.problem import Problem
 
 PivotName = Literal["scene", "camera", "world"]

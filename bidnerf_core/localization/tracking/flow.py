@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from bidnerf_core.mapping.landmarks.features import FIRST_CENTRE
+from bidnerf_core.mapping import FIRST_CENTRE
 
 FLOW_WINDOW = (13, 13)
 """Size of the compared patches, pixels."""

@@ -9,12 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import visible_at
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.depth import UNKNOWN, DepthSensorModel
+from bidnerf_core.frames import Frame, View, visible_at
+from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, refine_by_colour
 from bidnerf_core.localization.covariance import position_deviation

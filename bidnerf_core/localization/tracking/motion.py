@@ -17,9 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.rotations import retracted, update_between
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import LARGEST_NUMBER
+from bidnerf_core.geometry import SE3, retracted, update_between
+from bidnerf_core.io import LARGEST_NUMBER
 
 
 @dataclass(frozen=True)

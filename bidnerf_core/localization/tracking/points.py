@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import STILL, Intrinsics, MotionPrior, exposure_times
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
 from bidnerf_core.localization.landmarks.correspondences import MIN_MATCHES
 from bidnerf_core.localization.landmarks.hypotheses import (
@@ -23,11 +22,7 @@ from bidnerf_core.localization.landmarks.hypotheses import (
     posterior,
     share_moving,
 )
-from bidnerf_core.mapping.geometry.calibration import GIVEN
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
-from bidnerf_core.mapping.landmarks.image_keypoints import measured_depth
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import GIVEN, LandmarkMap, ObservedPoints, ReprojectionFit, measured_depth, resect
 
 INLIER = 3.0
 """Maximum reprojection error (norm) of an inlier, in standard deviations."""

@@ -11,12 +11,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.depth.sensors import UNKNOWN, DepthNoise
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import visible_at
-from bidnerf_core.geometry.independent import CORNERS_PER_INDEPENDENT
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.depth import UNKNOWN, DepthNoise
+from bidnerf_core.frames import Frame, View, visible_at
+from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3
 from bidnerf_core.localization.landmarks.chance import log10_nfa
 from bidnerf_core.localization.landmarks.correspondences import LandmarkMatches
 from bidnerf_core.localization.landmarks.evidence import (
@@ -38,10 +36,7 @@ from bidnerf_core.localization.landmarks.query import LandmarkQuery, pixel_thres
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
-from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN
-from bidnerf_core.mapping.landmarks.features import Features
-from bidnerf_core.mapping.landmarks.image_keypoints import image_keypoints, measured_depth
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import FIXED, GIVEN, Features, LandmarkMap, image_keypoints, measured_depth
 
 WIDE = 2.0
 """Multiple of the radius of guided matching above which keypoints are compared with all landmarks in view. Guided matching

@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks

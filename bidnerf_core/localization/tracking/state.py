@@ -12,21 +12,18 @@ import torch
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import LARGEST_LENGTH
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import from_plain, parse_json, to_plain
-from bidnerf_core.io.tensors import read_tensors_and_metadata
+from bidnerf_core.fields import LARGEST_LENGTH
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain, parse_json, read_tensors_and_metadata, to_plain, write_file
 from bidnerf_core.localization.landmarks.pose import CameraDoubt
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Clock, Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
-from bidnerf_core.mapping.geometry.calibration import Calibration
-from bidnerf_core.mapping.tensors import Kinds, check_kinds, check_range
+from bidnerf_core.mapping import Calibration, Kinds, check_kinds, check_range
 
 
 @dataclass(frozen=True)

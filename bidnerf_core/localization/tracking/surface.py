@@ -15,12 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.depth.sensors import EXACT
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import observe
-from bidnerf_core.geometry.independent import USUAL
-from bidnerf_core.geometry.rotations import retracted
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.depth import EXACT
+from bidnerf_core.frames import Frame, View, observe
+from bidnerf_core.geometry import SE3, USUAL, retracted
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (

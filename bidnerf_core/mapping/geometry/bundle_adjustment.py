@@ -16,9 +16,8 @@ from scipy.sparse import block_diag, bsr_array, csc_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
-from bidnerf_core.geometry.robust import cauchy_loss, inlier_weight
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
+from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.geometry.projection import by_update, projected
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import moved_points
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import moved_points
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.geometry.calibration import Calibration
 from bidnerf_core.mapping.geometry.projection import NEAREST, reprojection_errors
 

@@ -11,10 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import AT_REST, moved_array
-from bidnerf_core.geometry.robust import cauchy_loss, inlier_weight, mad_deviation
-from bidnerf_core.geometry.rotations import rotation_matrix
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import AT_REST, moved_array
+from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight, mad_deviation, rotation_matrix
 from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.projection import Array, by_update, projected

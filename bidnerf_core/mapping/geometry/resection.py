@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import STILL, MotionPrior
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.projection import Array

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.geometry.robust import inlier_weight, mad_deviation
+from bidnerf_core.geometry import inlier_weight, mad_deviation
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.geometry.projection import projected
 

@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.frames.frame import SeenLandmarks, View
-from bidnerf_core.geometry.robust import chi_squared_quantile, inlier_weight
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.frames import SeenLandmarks, View
+from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
 from bidnerf_core.mapping.geometry.observations import ObservedPoints, Sightings
 from bidnerf_core.mapping.geometry.resection import resect
 from bidnerf_core.mapping.geometry.triangulation import (

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import reduced_size
+from bidnerf_core.camera import reduced_size
 from bidnerf_core.errors import enumeration
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.depth.sensors import UNKNOWN
-from bidnerf_core.geometry.robust import mad_deviation
+from bidnerf_core.depth import UNKNOWN
+from bidnerf_core.geometry import mad_deviation
 from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.landmarks.tracks import TrackedKeypoints
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 MOST_IN_CELL = 128
 """Maximum number of landmarks in a cell."""

@@ -11,10 +11,9 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import moved, working_device
-from bidnerf_core.geometry.independent import KEYPOINTS_PER_INDEPENDENT
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, unrelated_distance
 from bidnerf_core.mapping.landmarks.landmark_cells import LandmarkCells
 

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera.rolling_shutter import poses_of_rows
-from bidnerf_core.frames.frame import SeenLandmarks, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import poses_of_rows
+from bidnerf_core.frames import SeenLandmarks, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.landmarks.features import MANY, byte_of_zero, squared_distances
 from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints

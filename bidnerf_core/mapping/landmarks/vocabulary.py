@@ -16,8 +16,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.landmarks.features import squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 

@@ -13,14 +13,11 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of
-from bidnerf_core.fields.rendering import render, render_image
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import draw, uniform
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import RadianceField, SceneBounds, VoxelGrid, device_of, render, render_image
+from bidnerf_core.frames import Frame, View, draw, uniform
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.surface.cell_size import chosen_grid, comparison_noise, finest_cell, spacing
 from bidnerf_core.mapping.surface.posed_depth import (
     WITNESSES,

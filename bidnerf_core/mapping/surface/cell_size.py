@@ -11,11 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.depth.sensors import UNKNOWN
+from bidnerf_core.depth import UNKNOWN
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.geometry.robust import mad_deviation
+from bidnerf_core.fields import SceneBounds, VoxelGrid
+from bidnerf_core.geometry import mad_deviation
 from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, witnesses
 from bidnerf_core.mapping.surface.surface_map import surfel_bytes
 from bidnerf_core.mapping.surface.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes

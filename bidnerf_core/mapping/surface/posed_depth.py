@@ -11,12 +11,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.fields.rendering import RenderedImage, render_image
-from bidnerf_core.frames.colours import colours_at
-from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import RadianceField, RenderedImage, SceneBounds, render_image
+from bidnerf_core.frames import View, colours_at
+from bidnerf_core.geometry import SE3
 
 WITNESSES = 8
 """Maximum number of other images with which each point is compared."""

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.devices import moved, working_device
-from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
 
 SURFEL_NEIGHBOURS = 12

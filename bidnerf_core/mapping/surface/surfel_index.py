@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.fields import VoxelGrid
 
 BLOCK_SIDE = 8
 """Cells along the side of a block."""

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidnerf_core.mapping import Keypoints
-from bidnerf_core.mapping.landmarks.features import FIRST_CENTRE, grey_image
+from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, grey_image
 
 BITS = 256
 STEP = 32

@@ -9,7 +9,7 @@ import torch
 from torch import Generator
 
 from bidnerf_core import Frame
-from bidnerf_core.evaluation.faults import Fault
+from bidnerf_core.evaluation import Fault
 from bidnerf_core.settings import Range
 
 PERIOD = 24.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from bidnerf_core import InputError, Localization
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Method, Outcome, Problem, propose
 from bidnerf_core.settings import Settings
 

@@ -23,7 +23,7 @@ from bidnerf_core.datasets import (
     ReadOptions,
     SequenceEntry,
 )
-from bidnerf_core.io.images import background_colour
+from bidnerf_core.io import background_colour
 
 TABLE, CAMERA = "poses.csv", "camera.json"
 

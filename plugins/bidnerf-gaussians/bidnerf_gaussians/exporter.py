@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core import Map
-from bidnerf_core.captures.inria_cameras import write_inria_cameras
+from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.scaled import ScaledField
+from bidnerf_core.fields import ScaledField
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.formats import write_gaussians

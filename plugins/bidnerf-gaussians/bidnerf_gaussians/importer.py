@@ -11,11 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.captures.cameras import StoredCamera
-from bidnerf_core.captures.inria_cameras import cameras_beside
+from bidnerf_core.captures import StoredCamera, cameras_beside
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.maps.importers import UNMOVED, ImportedField, bounds_about
+from bidnerf_core.geometry import Similarity
+from bidnerf_core.maps import UNMOVED, ImportedField, bounds_about
 from bidnerf_core.settings import NotNegative, Range, Settings
 from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.formats import Format, format_of

@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 from torch import Generator, Tensor
 
 from bidnerf_core.carving import occupied_voxels
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import SceneBounds, VoxelGrid
+from bidnerf_core.frames import View
 from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.gaussians import Gaussians
 from bidnerf_gaussians.spherical_harmonics import C0

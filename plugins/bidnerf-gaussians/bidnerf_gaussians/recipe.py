@@ -10,9 +10,8 @@ from typing import Annotated, Any
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.fields.contract import device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import device_of, render
+from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, cosine
 from bidnerf_gaussians.field import FieldConfig, GaussiansField

@@ -10,10 +10,8 @@ import pytest
 import torch
 
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.fields.contract import Rays, SceneBounds, SplatField
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.scaled import scaled_field
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import Rays, SceneBounds, SplatField, render, scaled_field
+from bidnerf_core.geometry import SE3
 from bidnerf_gaussians import Gaussians, GaussiansConfig, GaussiansField, quaternions
 from bidnerf_gaussians.gaussians import LEAST_OPACITY
 from bidnerf_gaussians.spherical_harmonics import basis, colours

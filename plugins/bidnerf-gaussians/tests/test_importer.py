@@ -13,12 +13,11 @@ import pytest
 import torch
 
 from bidnerf_core import import_map, load_map
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.cameras import StoredCamera
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import StoredCamera
 from bidnerf_core.errors import InputWarning
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.geometry.looking import look_at
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import render_image
+from bidnerf_core.geometry import SE3, look_at
 from bidnerf_gaussians import Gaussians, write_gaussians
 from bidnerf_gaussians.importer import with_dilation
 

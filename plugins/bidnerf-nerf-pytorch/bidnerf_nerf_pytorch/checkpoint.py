@@ -12,7 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.torch_files import check_sizes, outline_of, read_saved
+from bidnerf_core.io import check_sizes, outline_of, read_saved
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 
 EXPECTED = "a nerf-pytorch checkpoint"

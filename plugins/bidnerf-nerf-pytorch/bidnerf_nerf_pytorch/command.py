@@ -10,10 +10,8 @@ from typing import Annotated, Literal
 import tyro
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.files import map_folder, save_map
-from bidnerf_core.maps.importers import UNMOVED
+from bidnerf_core.io import to_plain
+from bidnerf_core.maps import UNMOVED, MapInfo, map_folder, save_map
 from bidnerf_core.training import TrainingState
 from bidnerf_nerf_pytorch.importer import Box, ImportSettings, importer
 

@@ -8,8 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.fields.sampling import HierarchicalField, Importance, Stratified
+from bidnerf_core.fields import (
+    FieldValues,
+    HierarchicalField,
+    Importance,
+    RaySampler,
+    SceneBounds,
+    Stratified,
+)
 from bidnerf_core.settings import Count
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Literal
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.io.images import background_colour
-from bidnerf_core.maps.importers import ImportedField
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import Similarity
+from bidnerf_core.io import background_colour
+from bidnerf_core.maps import ImportedField
 from bidnerf_core.settings import Count, Settings
 from bidnerf_nerf_pytorch.checkpoint import is_checkpoint, read_checkpoint
 from bidnerf_nerf_pytorch.field import NerfPytorchField

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bidnerf_core.fields.encoding import encoded_width, frequency_encoding
-from bidnerf_core.fields.encoding import octaves as powers_of_two
+from bidnerf_core.fields import encoded_width, frequency_encoding
+from bidnerf_core.fields import octaves as powers_of_two
 from bidnerf_core.settings import Count, Range, Settings
 
 

@@ -10,9 +10,8 @@ from typing import Annotated
 from torch import Generator
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import device_of, render
+from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
 from bidnerf_nerf_pytorch.checkpoint import read_checkpoint

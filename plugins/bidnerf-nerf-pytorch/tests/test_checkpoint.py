@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields import SceneBounds
 from bidnerf_nerf_pytorch import NerfPytorchConfig, backend, read_checkpoint
 from bidnerf_nerf_pytorch.network import NetworkConfig
-from conftest import SMALL, Writer, contents
+from checkpoints import SMALL, Writer, contents
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
 

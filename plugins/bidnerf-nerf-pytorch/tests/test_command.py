@@ -10,16 +10,14 @@ import torch
 
 from bidnerf_core.backend import load_backend
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.io.files import locked
-from bidnerf_core.maps.description import load_info
-from bidnerf_core.maps.map import load_map
-from bidnerf_core.testing.recipes import Recorder
-from bidnerf_core.testing.scene import BOUNDS, rgb_views
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.io import locked
+from bidnerf_core.maps import load_info, load_map
+from bidnerf_core.testing import SCENE_BOUNDS, Recorder, rgb_views
 from bidnerf_core.training import Silent
 from bidnerf_nerf_pytorch import NerfPytorchConfig, NerfPytorchField, backend, read_checkpoint
 from bidnerf_nerf_pytorch.command import main
-from conftest import SMALL, Writer, contents
+from checkpoints import SMALL, Writer, contents
 
 
 def test_the_map_holds_the_networks(write: Writer, tmp_path: Path) -> None:
@@ -103,7 +101,7 @@ def test_training_goes_on_from_a_checkpoint(write: Writer) -> None:
         **vars(SMALL), coarse_samples=8, fine_samples=4, steps=1, rays_per_step=16, learning_rate=0.0,
         checkpoint=str(path),
     )  # fmt: skip
-    field = backend.build(config, BOUNDS)
+    field = backend.build(config, SCENE_BOUNDS)
     backend.train(field, rgb_views(), config, Silent())
     for name, value in read_checkpoint(path).tensors.items():
         assert torch.equal(field.state_dict()[name], value)
@@ -114,7 +112,7 @@ def test_a_resumed_training_does_not_need_the_checkpoint(write: Writer) -> None:
     config = NerfPytorchConfig(
         **vars(SMALL), coarse_samples=8, fine_samples=4, steps=3, rays_per_step=16, checkpoint=str(path)
     )
-    first, second = backend.build(config, BOUNDS), backend.build(config, BOUNDS)
+    first, second = backend.build(config, SCENE_BOUNDS), backend.build(config, SCENE_BOUNDS)
     before = Recorder(due=(2,))
     backend.train(first, rgb_views(), config, before)
     path.unlink()
@@ -126,4 +124,4 @@ def test_a_resumed_training_does_not_need_the_checkpoint(write: Writer) -> None:
 def test_a_checkpoint_of_another_architecture_is_refused(write: Writer) -> None:
     config = NerfPytorchConfig(width=SMALL.width, layers=2, checkpoint=str(write()))
     with pytest.raises(InputError, match="layers 3, but the config says 2"):
-        backend.train(backend.build(config, BOUNDS), rgb_views(), config, Silent())
+        backend.train(backend.build(config, SCENE_BOUNDS), rgb_views(), config, Silent())

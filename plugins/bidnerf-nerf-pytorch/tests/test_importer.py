@@ -6,9 +6,9 @@ import pytest
 
 from bidnerf_core import import_map
 from bidnerf_core.errors import InputError
-from bidnerf_core.maps.importers import importer_of
+from bidnerf_core.maps import importer_of
 from bidnerf_nerf_pytorch.importer import importer
-from conftest import Writer
+from checkpoints import Writer
 
 
 def test_a_checkpoint_is_recognised_and_imported(write: Writer, monkeypatch: pytest.MonkeyPatch) -> None:

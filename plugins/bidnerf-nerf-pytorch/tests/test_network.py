@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from bidnerf_core.fields.encoding import encoded_width
+from bidnerf_core.fields import encoded_width
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig, encoded
 
 

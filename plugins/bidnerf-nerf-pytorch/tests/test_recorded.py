@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import SceneBounds, render
+from bidnerf_core.frames import View
 from bidnerf_nerf_pytorch import NerfPytorchConfig, NerfPytorchField, backend, read_checkpoint
 from bidnerf_nerf_pytorch.network import NetworkConfig
 

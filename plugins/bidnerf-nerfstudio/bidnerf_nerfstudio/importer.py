@@ -12,11 +12,10 @@ from torch import Tensor, nn
 
 from bidnerf_core.backend import load_backend
 from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.io.images import background_colour
-from bidnerf_core.io.json import Record
-from bidnerf_core.maps.importers import ImportedField
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import Similarity
+from bidnerf_core.io import Record, background_colour
+from bidnerf_core.maps import ImportedField
 from bidnerf_core.settings import Settings
 from bidnerf_nerfstudio import models
 from bidnerf_nerfstudio.placement import Placement, after, inverse

@@ -13,9 +13,8 @@ from torch import Generator, Tensor, nn
 
 from bidnerf_core.backend import RecipeBackend
 from bidnerf_core.devices import constant, may_wait
-from bidnerf_core.fields.contract import Rays, RaySampler, RaySamples, SceneBounds, crossed_box, device_of
-from bidnerf_core.fields.sampling import gathered
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import Rays, RaySampler, RaySamples, SceneBounds, crossed_box, device_of, gathered
+from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
 from bidnerf_nerfstudio.nerfacto import PlacedSampler

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidnerf_core.io.json import Record
+from bidnerf_core.io import Record
 from bidnerf_nerfstudio.instant_ngp import NgpConfig
 from bidnerf_nerfstudio.nerfacto import NerfactoConfig
 from bidnerf_nerfstudio.networks import HashConfig

@@ -12,9 +12,8 @@ from torch import Generator, Tensor, nn
 
 from bidnerf_core.backend import RecipeBackend
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import Rays, RaySampler, RaySamples, SceneBounds, device_of
-from bidnerf_core.fields.rendering import render_samples
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import Rays, RaySampler, RaySamples, SceneBounds, device_of, render_samples
+from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
 from bidnerf_nerfstudio.networks import HashConfig, HashNetwork, density_of, unit_cube

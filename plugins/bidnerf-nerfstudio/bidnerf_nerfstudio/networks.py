@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.contraction import contract
+from bidnerf_core.fields import SceneBounds, contract_points
 from bidnerf_core.settings import Count, Layers, Range, Settings
 
 PRIMES = (1, 2654435761, 805459861)
@@ -132,7 +131,7 @@ def unit_cube(
     regardless of its box.
     """
     if box.contracted:
-        points = (contract(positions) + 2) / 4
+        points = (contract_points(positions) + 2) / 4
     else:
         points = (positions - constant(box.lower, positions)) / constant(box.size, positions)
     inside = ((points > 0) & (points < 1)).all(-1)

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import Rays, RaySamples, SceneBounds
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
+from bidnerf_core.fields import Rays, RaySamples, SceneBounds
+from bidnerf_core.geometry import SE3, Similarity
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.fields.contract import Rays, RaySamples
-from bidnerf_core.fields.rendering import rendering_weights
-from bidnerf_core.fields.sampling import inverse_transform
+from bidnerf_core.fields import Rays, RaySamples, inverse_transform, rendering_weights
 
 PADDING = 0.01
 """Added to the weight of every interval before the next ones are placed, as in nerfstudio's PDFSampler."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import FieldValues, SceneBounds
+from bidnerf_core.fields import FieldValues, SceneBounds
 from bidnerf_core.settings import Count, Layers, Positive, Settings
 from bidnerf_nerfstudio.networks import (
     HashConfig,

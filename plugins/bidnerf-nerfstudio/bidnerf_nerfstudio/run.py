@@ -16,11 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import Record, read_record
-from bidnerf_core.io.torch_files import check_sizes, read_saved
+from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.io import Record, check_sizes, read_file, read_record, read_saved
 from bidnerf_nerfstudio.placement import after, inverse
 
 CONFIG = "config.yml"

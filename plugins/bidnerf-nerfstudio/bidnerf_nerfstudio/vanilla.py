@@ -14,11 +14,19 @@ from torch.nn.functional import softplus
 
 from bidnerf_core.backend import RecipeBackend
 from bidnerf_core.devices import constant
-from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds, device_of
-from bidnerf_core.fields.encoding import encoded_width, frequency_encoding
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import HierarchicalField, Importance, Stratified
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import (
+    FieldValues,
+    HierarchicalField,
+    Importance,
+    RaySampler,
+    SceneBounds,
+    Stratified,
+    device_of,
+    encoded_width,
+    frequency_encoding,
+    render,
+)
+from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, Layers, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
 from bidnerf_nerfstudio.networks import Perceptron

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
 from drawn import drawn
+from stored_runs import RUNS, RunOf
 
 torch.set_num_threads(1)
 
-RUNS = Path(__file__).parent / "runs"
 PREFIX = "_model."
-
-RunOf = Callable[[str], Path]
 
 
 @pytest.fixture

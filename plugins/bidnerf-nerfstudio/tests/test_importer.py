@@ -13,14 +13,13 @@ import yaml
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.io.torch_files import read_saved
-from bidnerf_core.maps.importers import UNMOVED, ImportedField, importer_of
+from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.io import read_saved
+from bidnerf_core.maps import UNMOVED, ImportedField, importer_of
 from bidnerf_nerfstudio.importer import ImportSettings, importer
 from bidnerf_nerfstudio.placement import Placement, after, inverse
 from bidnerf_nerfstudio.run import read_run
-from conftest import RunOf
+from stored_runs import RunOf
 
 
 def read(folder: Path, placement: Similarity = UNMOVED, **config: Any) -> ImportedField:

@@ -12,17 +12,14 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from bidnerf_core import Map
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import FieldValues, levels
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import to_plain
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.importers import UNMOVED
-from bidnerf_core.maps.map import frozen_field
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import FieldValues, levels, render
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import to_plain
+from bidnerf_core.maps import UNMOVED, MapInfo, frozen_field
 from bidnerf_nerfstudio.importer import ImportSettings, importer
 from bidnerf_nerfstudio.placement import inverse
-from conftest import RUNS, RunOf
+from stored_runs import RUNS, RunOf
 
 SPACING = 4
 OPENGL = torch.tensor([1.0, -1.0, -1.0, 1.0])

@@ -21,9 +21,8 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 
 from bidnerf_core import Dataset, InputError, Intrinsics
-from bidnerf_core.camera.intrinsics import same_aspect
-from bidnerf_core.datasets.reader import Reader, ReadOptions
-from bidnerf_core.datasets.sequence import FrameSequence, TimedFrame
+from bidnerf_core.camera import same_aspect
+from bidnerf_core.datasets import FrameSequence, Reader, ReadOptions, TimedFrame
 from bidnerf_ros2.conversions import seconds
 from bidnerf_ros2.messages import frame_of, intrinsics, is_depth
 

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from bidnerf_core import SE3, Corrector, Frame, Localization, Localizer, Tracker
-from bidnerf_core.geometry.pose_covariance import covariance_in
-from bidnerf_core.results.errors import standard_deviations
+from bidnerf_core.geometry import covariance_in
+from bidnerf_core.results import standard_deviations
 from bidnerf_ros2.conversions import covariance_elsewhere, fill, seconds
 from bidnerf_ros2.messages import frame_of, intrinsics
 

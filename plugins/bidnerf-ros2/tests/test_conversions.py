@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core import SE3
-from bidnerf_core.geometry.pose_covariance import covariance_in
+from bidnerf_core.geometry import covariance_in
 from bidnerf_ros2.conversions import (
     R_BODY_OPTICAL,
     body_pose,

@@ -12,11 +12,10 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core import Map
-from bidnerf_core.captures.cameras import StoredCamera
-from bidnerf_core.captures.inria_cameras import write_inria_cameras
+from bidnerf_core.captures import StoredCamera, write_inria_cameras
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.io.files import write_file
-from bidnerf_core.results.export import head, ply
+from bidnerf_core.io import write_file
+from bidnerf_core.results import head, ply
 from bidnerf_scan.meshing import Mesh, mesh_of_surface
 
 T_WORLD_FILE = "T_world_file.json"

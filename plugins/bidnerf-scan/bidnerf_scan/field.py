@@ -10,14 +10,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.fields.box_tree import level_sizes, tree_of
-from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples, SceneBounds
-from bidnerf_core.fields.met_pieces import (
+from bidnerf_core.fields import (
+    FieldValues,
     Meeting,
+    RayHits,
+    Rays,
+    RaySamples,
+    SceneBounds,
     flattened,
+    level_sizes,
     listed,
     met_pieces,
     pieces_about,
+    tree_of,
     values_of_pieces,
 )
 from bidnerf_core.settings import NotNegative, Range

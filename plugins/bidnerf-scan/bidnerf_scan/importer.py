@@ -11,12 +11,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.captures.cameras import StoredCamera
-from bidnerf_core.captures.inria_cameras import cameras_beside
+from bidnerf_core.captures import StoredCamera, cameras_beside
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import Rays, SceneBounds
-from bidnerf_core.geometry.similarity import Similarity
-from bidnerf_core.maps.importers import UNMOVED, ImportedField, bounds_about
+from bidnerf_core.fields import Rays, SceneBounds
+from bidnerf_core.geometry import Similarity
+from bidnerf_core.maps import UNMOVED, ImportedField, bounds_about
 from bidnerf_core.settings import Range, Settings
 from bidnerf_scan.field import ScanField
 from bidnerf_scan.formats import Format, format_of

@@ -19,8 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.surface.casting import cast
+from bidnerf_core.mapping import SurfaceMap, cast
 from bidnerf_scan.extras import library
 
 NEIGHBOURS = 8

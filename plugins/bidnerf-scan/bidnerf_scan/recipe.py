@@ -11,10 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.fields.contract import SceneBounds, device_of
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.frames.frame import View
-from bidnerf_core.frames.pixels import draw, uniform
+from bidnerf_core.fields import SceneBounds, device_of, render
+from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.settings import Count, NotNegative, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, cosine
 from bidnerf_scan.field import FieldConfig, ScanField

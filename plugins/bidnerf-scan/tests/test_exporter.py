@@ -13,17 +13,15 @@ import torch
 import trimesh
 
 from bidnerf_core import Map, export_map, import_map
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.looking import look_at
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.mapping import SurfaceMap, surface_of_points
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.viewpoints import sphere
-from bidnerf_core.results.pose_files import read_pose
-from bidnerf_core.testing.textured_field import BOUNDS, textured_map, training_views
+from bidnerf_core.maps import MapInfo, sphere
+from bidnerf_core.results import read_pose
+from bidnerf_core.testing import BOUNDS, textured_map, training_views
 from bidnerf_scan import meshing, read_scan
 from bidnerf_scan.meshing import Mesh, mesh_of_surface
 

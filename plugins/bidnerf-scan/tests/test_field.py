@@ -12,9 +12,8 @@ import trimesh
 from PIL import Image
 
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.fields.contract import Rays, SceneBounds
-from bidnerf_core.fields.rendering import render
-from bidnerf_core.maps.importers import UNMOVED
+from bidnerf_core.fields import Rays, SceneBounds, render
+from bidnerf_core.maps import UNMOVED
 from bidnerf_scan import Scan, ScanField, importer
 from bidnerf_scan.importer import ScanSettings, imported
 from bidnerf_scan.pieces import Pieces, cloud_pieces, mesh_pieces, spacing, thinned

@@ -13,11 +13,10 @@ import torch
 import trimesh
 
 from bidnerf_core import import_map, load_map
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.geometry.looking import look_at
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.fields import render_image
+from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.mapping import surface_of_points
 from bidnerf_scan import Scan
 from bidnerf_scan.importer import ScanSettings, imported

@@ -31,23 +31,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
-from bidnerf_core.camera.source import Raster
-from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.reader import Reader, ReadOptions
-from bidnerf_core.datasets.rgbd import largest_side, read_rgbd
-from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.depth.images import MILLIMETRE, DepthImage, read_depth_image
+from bidnerf_core.camera import Intrinsics, Raster, same_aspect
+from bidnerf_core.datasets import (
+    Dataset,
+    FrameSequence,
+    Reader,
+    ReadOptions,
+    SplitDataset,
+    Splits,
+    hold_out,
+    largest_side,
+    read_rgbd,
+)
+from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.frames.photos import fit_depth
-from bidnerf_core.geometry.pose_rows import pose_of_rows
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.geometry.units import LengthUnit
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.images import Background, decode, reduced
-from bidnerf_core.io.json import Record, read_record
+from bidnerf_core.frames import Frame, fit_depth
+from bidnerf_core.geometry import SE3, LengthUnit, pose_of_rows
+from bidnerf_core.io import Background, Record, decode, read_file, read_record, reduced
 
 LARGEST_SIDE = 640
 """Default limit of the pixels on a photo's longer side."""

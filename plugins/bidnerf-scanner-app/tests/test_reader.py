@@ -15,11 +15,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.datasets import Dataset, FileSequence, open_dataset, open_sequence
-from bidnerf_core.datasets.rgbd import reading_at
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import Dataset, FileSequence, open_dataset, open_sequence, reading_at
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames import View
 from bidnerf_scanner_app.reader import LARGEST_SIDE, RANGE, ScannerAppReader
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 960, 720, 800.0, (473.5, 363.25)

@@ -9,9 +9,8 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.fields.contract import FieldValues, SceneBounds, device_of
-from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.frames.frame import View
+from bidnerf_core.fields import FieldValues, SceneBounds, Stratified, device_of
+from bidnerf_core.frames import View
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
 
 __all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]

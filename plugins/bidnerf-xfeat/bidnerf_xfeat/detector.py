@@ -28,8 +28,7 @@ from torch.nn import Sequential
 from torch.nn.functional import interpolate, max_pool2d, normalize, pad, pixel_shuffle
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from bidnerf_core.mapping import Keypoints
-from bidnerf_core.mapping.landmarks.features import FIRST_CENTRE, quantized
+from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantized
 from bidnerf_core.settings import Range, Settings
 
 CELL = 8

@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from bidnerf_core.mapping import Keypoints, Sift
-from bidnerf_core.mapping.landmarks.features import SIFT
+from bidnerf_core.mapping import SIFT, Keypoints, Sift
 from bidnerf_xfeat.detector import XFeat
 
 ZERO = 128

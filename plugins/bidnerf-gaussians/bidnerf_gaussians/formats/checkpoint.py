@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.torch_files import check_sizes, outline_of, read_saved
+from bidnerf_core.io import check_sizes, outline_of, read_saved
 from bidnerf_gaussians.gaussians import Gaussians
 
 EXPECTED = "a checkpoint of gsplat or splatfacto"

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import parse_json
+from bidnerf_core.io import parse_json, read_file
 from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, joined, logit
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import write_file
-from bidnerf_core.io.ply import PlyHeader, read_ply, read_ply_header
+from bidnerf_core.io import PlyHeader, read_ply, read_ply_header, write_file
 from bidnerf_gaussians.formats.parts import gaussians_of, logit, smallest_three
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 from bidnerf_gaussians.spherical_harmonics import C0

@@ -14,8 +14,7 @@ import numpy as np
 from PIL import Image
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import parse_json
+from bidnerf_core.io import parse_json, read_file
 from bidnerf_gaussians.formats.parts import gaussians_of, logit, smallest_three
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file
+from bidnerf_core.io import read_file
 from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, logit
 from bidnerf_gaussians.gaussians import Gaussians
 from bidnerf_gaussians.spherical_harmonics import C0

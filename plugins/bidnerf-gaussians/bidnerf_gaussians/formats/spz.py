@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file, write_file
+from bidnerf_core.io import read_file, write_file
 from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, logit, smallest_three
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import open_binary
+from bidnerf_core.io import open_binary
 from bidnerf_scan.formats import by_trimesh
 from bidnerf_scan.scan import Scan
 

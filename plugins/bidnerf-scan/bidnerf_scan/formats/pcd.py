@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file
+from bidnerf_core.io import read_file
 from bidnerf_scan.scan import Scan
 
 EXPECTED = "a PCD file"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.ply import PlyHeader, read_ply, read_ply_header
+from bidnerf_core.io import PlyHeader, read_ply, read_ply_header
 from bidnerf_scan.formats import by_trimesh
 from bidnerf_scan.scan import Scan
 

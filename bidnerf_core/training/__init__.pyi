@@ -1,0 +1,16 @@
+from .colour_transform import ColourTransforms as ColourTransforms
+from .colour_transform import fitted_colours as fitted_colours
+from .loop import StepOutcome as StepOutcome
+from .loop import cosine as cosine
+from .loop import fit as fit
+from .loss import ray_termination as ray_termination
+from .loss import supervised_loss as supervised_loss
+from .ray_bank import RayBank as RayBank
+from .ray_bank import TrainingBatch as TrainingBatch
+from .report import Report as Report
+from .report import Silent as Silent
+from .report import TrainingState as TrainingState
+from .report import TrainingStep as TrainingStep
+from .report import TrainingStopped as TrainingStopped
+from .supervision import Supervision as Supervision
+from .supervision import SupervisionConfig as SupervisionConfig

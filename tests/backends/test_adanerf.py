@@ -1,0 +1,413 @@
+"""AdaNeRF: bins, the oracle's choice among them, and a training in phases."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
+from bidnerf_adanerf.bins import Bins, chosen
+from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_weights
+from bidnerf_adanerf.oracle_loss import ENOUGH, by_depth, by_weight, oracle_loss
+from bidnerf_adanerf.recipe import Phase, phase_at, room_for_matter, sparsity
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, render, rendering_weights
+from bidnerf_core.frames import View
+from bidnerf_core.scenes import demo_object, demo_room, look_around
+from bidnerf_core.scenes import views as seen_from
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing import (
+    SIDE,
+    BackendContract,
+    Recorder,
+    awkward_rays,
+    colour_error,
+    points,
+    rgbd_views,
+)
+from bidnerf_core.training import RayBank, TrainingBatch
+from tiny import black_batch
+
+SMALL = AdaNerfConfig(
+    width=32, layers=2, position_frequencies=4, oracle_width=32, oracle_layers=2, ray_points=4, ray_frequencies=2,
+    bins=16, max_samples=5, steps=60, samples_per_step=4096, rays_at_most=256, learning_rate=0.02, room_resolution=16,
+)  # fmt: skip
+
+
+class TestAdaNerf(BackendContract):
+    backend = backend
+    config = SMALL
+
+
+@pytest.fixture
+def field() -> AdaNerfField:
+    """Untrained, with an oracle whose scores differ from bin to bin."""
+    made = backend.build(SMALL, BOUNDS)
+    with torch.no_grad():
+        made.oracle.scores.weight.mul_(20)
+        made.oracle.scores.bias.zero_()
+    return made.requires_grad_(False)
+
+
+@pytest.fixture
+def rays() -> Rays:
+    return awkward_rays()["rays from outside"]
+
+
+def hit(rays: Rays) -> Tensor:
+    return rays.far > rays.near
+
+
+# Bins.
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+def test_bins_tile_the_way_through_the_box(rays: Rays, generator: Generator, jitter: bool) -> None:
+    samples = Bins(BOUNDS, 16)(rays, generator if jitter else None)
+    met = hit(rays)
+    assert bool(samples.valid[met].all())
+    assert not bool(samples.valid[~met].any())
+    torch.testing.assert_close(samples.starts[met][:, 0], rays.near[met])
+    torch.testing.assert_close(samples.ends[met][:, -1], rays.far[met])
+    torch.testing.assert_close(samples.ends[met][:, :-1], samples.starts[met][:, 1:])
+    if not jitter:
+        width = (rays.far - rays.near)[:, None].expand(-1, 16) / 16
+        torch.testing.assert_close((samples.ends - samples.starts)[met], width[met], atol=1e-5, rtol=0)
+
+
+def test_bins_do_not_move_with_the_limits_of_a_ray(rays: Rays) -> None:
+    whole = Bins(BOUNDS, 16)(rays)
+    wide = Bins(BOUNDS, 16)(replace(rays, near=0 * rays.near, far=2 * rays.far))
+    torch.testing.assert_close(wide.starts[hit(rays)], whole.starts[hit(rays)])
+    half = replace(rays, near=(rays.near + rays.far) / 2)
+    narrow = Bins(BOUNDS, 16)(half)
+    kept = narrow.valid & hit(rays)[:, None]
+    assert int(kept.sum(-1).max()) in (8, 9)  # rounding may cut a sliver off the bin before
+    assert bool((narrow.starts >= half.near[:, None] - 1e-5)[kept].all())
+
+
+# The choice.
+
+
+def test_at_least_one_and_at_most_n_bins_are_chosen(field: AdaNerfField, rays: Rays) -> None:
+    for threshold, most in ((0.0, 3), (0.5, 5), (0.999, 2), (1.0, 16), (0.5, 100)):
+        sampler = replace(field.sampler, threshold=threshold, most=most)
+        count = sampler(rays).valid.sum(-1)
+        assert int(count[hit(rays)].min()) >= 1
+        assert int(count.max()) <= most
+        assert int(count[~hit(rays)].max()) == 0
+
+
+def test_a_higher_threshold_chooses_fewer_bins(field: AdaNerfField, rays: Rays) -> None:
+    chosen_bins = [replace(field.sampler, threshold=t, most=16)(rays) for t in (0.0, 0.3, 0.5, 0.7, 1.0)]
+    counts = torch.stack([s.valid.sum(-1) for s in chosen_bins])
+    assert bool((counts[1:] <= counts[:-1]).all())
+    assert int(counts[0].sum()) > int(counts[2].sum()) > int(counts[-1].sum())
+
+
+def test_the_best_bins_are_chosen_nearest_first() -> None:
+    edges = torch.linspace(0, 6, 7)
+    samples = RaySamples(edges[None, :-1], edges[None, 1:], torch.ones(1, 6, dtype=torch.bool))
+    scores = torch.tensor([[0.1, 0.9, 0.2, 0.05, 0.8, 0.3]])
+    found = chosen(samples, scores, threshold=0.15, most=3)
+    assert found.starts[found.valid].tolist() == [1.0, 4.0, 5.0]
+    assert chosen(samples, scores, threshold=0.85, most=3).valid.sum() == 1
+    few = chosen(samples, scores, threshold=0.95, most=3)
+    assert few.starts[few.valid].tolist() == [1.0]
+
+
+def test_no_bin_is_chosen_beyond_the_limits_of_a_ray(field: AdaNerfField, rays: Rays) -> None:
+    near = rays.near + 0.4 * (rays.far - rays.near)
+    narrow = replace(rays, near=near, far=near + 0.3 * (rays.far - rays.near))
+    found = field.sampler(narrow)
+    assert bool((found.starts >= narrow.near[:, None] - 1e-5)[found.valid].all())
+    assert bool((found.ends <= narrow.far[:, None] + 1e-5)[found.valid].all())
+    assert int(found.valid.sum(-1)[hit(narrow)].min()) >= 1
+
+
+def test_the_oracle_is_asked_once_a_call(field: AdaNerfField, rays: Rays) -> None:
+    asked: list[int] = []
+    field.oracle.register_forward_hook(lambda module, given, found: asked.append(len(given[0])))
+    render(field, rays)
+    assert asked == [len(rays.near)]
+
+
+def test_the_pose_is_felt_through_positions_and_not_through_the_choice(
+    field: AdaNerfField, rays: Rays
+) -> None:
+    """Gradients are the same when the choice is made beforehand and put on the moving ray."""
+    origins = rays.origins.clone().requires_grad_()
+    samples = field.sampler(rays)
+    assert not field.sampler(replace(rays, origins=origins)).starts.requires_grad
+    (found,) = torch.autograd.grad(render(field, replace(rays, origins=origins)).rgb.sum(), origins)
+    moved = replace(rays, origins=origins)
+    values = query_samples(field, moved, samples)
+    weights = rendering_weights(values.density, samples)
+    (expected,) = torch.autograd.grad((weights[..., None] * values.rgb).sum(), origins)
+    torch.testing.assert_close(found, expected)
+    assert float(found.abs().max()) > 0
+
+
+def test_the_dense_field_is_shaded_in_all_bins(field: AdaNerfField, rays: Rays) -> None:
+    everything = replace(field.sampler, threshold=-1.0, most=SMALL.bins)
+    all_bins = render(field.dense, rays)
+    found = everything(rays)
+    assert torch.equal(found.valid, all_bins.samples.valid)
+    torch.testing.assert_close(found.starts, all_bins.samples.starts)
+
+
+# Dense training.
+
+
+def made_values(count: int, seed: int = 0) -> FieldValues:
+    generator = torch.Generator().manual_seed(seed)
+    return FieldValues(
+        20 * torch.rand((count, 16), generator=generator), torch.rand((count, 16, 3), generator=generator)
+    )
+
+
+def test_scores_of_one_are_volume_rendering_and_of_zero_are_nothing(rays: Rays) -> None:
+    samples, values = Bins(BOUNDS, 16)(rays), made_values(len(rays.near))
+    background = torch.full((len(rays.near), 3), 0.3)
+    full = render_softly(values, samples, torch.ones_like(samples.starts), background)
+    torch.testing.assert_close(full.weights, rendering_weights(values.density, samples), atol=2e-5, rtol=0)
+    none = render_softly(values, samples, torch.zeros_like(samples.starts), background)
+    torch.testing.assert_close(none.rgb, background)
+    assert float(none.opacity.abs().max()) == 0
+
+
+def test_a_score_weighs_the_opacity_of_its_bin(rays: Rays) -> None:
+    samples, values = Bins(BOUNDS, 16)(rays), made_values(len(rays.near))
+    scores = torch.rand(samples.starts.shape, generator=torch.Generator().manual_seed(1))
+    width = samples.ends - samples.starts
+    thinner = -torch.log1p(scores * torch.expm1(-values.density * width)) / width.clamp(min=1e-9)
+    expected = rendering_weights(torch.where(samples.valid, thinner, 0.0), samples)
+    found = render_softly(values, samples, scores, torch.zeros(len(width), 3)).weights
+    torch.testing.assert_close(found, expected, atol=2e-5, rtol=0)
+
+
+def test_bins_that_will_be_shaded_count_fully_in_the_soft_phase() -> None:
+    scores = torch.tensor([[0.0, 0.05, 0.1, 0.2, 0.7, 1.0]], requires_grad=True)
+    counted = soft_weights(scores, 0.2)
+    torch.testing.assert_close(counted.detach(), torch.tensor([[0.0, 0.25, 0.5, 1.0, 1.0, 1.0]]))
+    counted.sum().backward()
+    assert scores.grad is not None
+    assert bool((scores.grad[0, :3] > 0).all())  # what a picture lacks, the oracle can call back
+    assert torch.equal(soft_weights(scores.detach(), 0.0)[0, 1:], torch.ones(5))
+
+
+def test_opacity_is_that_of_the_bins_asked_about(rays: Rays) -> None:
+    samples, values = Bins(BOUNDS, 16)(rays), made_values(len(rays.near))
+    which = samples.valid & (torch.arange(16) == 3)
+    expected = 1 - torch.exp(-values.density * (samples.ends - samples.starts))
+    torch.testing.assert_close(opacity(values, samples, which), expected[which].mean())
+    assert float(opacity(values, samples, torch.zeros_like(which))) == 0
+
+
+def test_gradients_of_soft_rendering_are_finite_where_all_is_opaque(rays: Rays) -> None:
+    samples = Bins(BOUNDS, 16)(rays)
+    density = torch.full_like(samples.starts, 1e6).requires_grad_()
+    scores = torch.ones_like(density).requires_grad_()
+    values = FieldValues(density, torch.rand((*density.shape, 3)))
+    render_softly(values, samples, scores, torch.zeros(len(density), 3)).rgb.sum().backward()
+    assert density.grad is not None
+    assert scores.grad is not None
+    assert bool(density.grad.isfinite().all() and scores.grad.isfinite().all())
+
+
+def test_bins_without_room_for_matter_are_shaded_now_and_then(
+    field: AdaNerfField, generator: Generator
+) -> None:
+    views = list(rgbd_views())
+    room = room_for_matter(views, BOUNDS, 16)
+    rays = RayBank(views, BOUNDS).draw(512, generator).rays
+    samples, empty = dense_samples(field, rays, room, generator)
+    every = field.bins(rays)
+    assert 0 < int(empty.sum()) < 0.2 * int(every.valid.sum())
+    assert int(samples.valid.sum()) < 0.8 * int(every.valid.sum())
+    assert not bool((empty & ~samples.valid).any())
+    assert not bool(room.holds(rays.at(samples.middles))[empty].any())
+    assert int(dense_samples(field, rays, None, generator)[0].valid.sum()) == int(every.valid.sum())
+
+
+# What the oracle is taught.
+
+
+@pytest.fixture
+def lessons(rays: Rays) -> tuple[RaySamples, TrainingBatch]:
+    """All bins of rays that meet the scene in the middle of their sixth bin."""
+    rays = Rays(*(x[hit(rays)] for x in (rays.origins, rays.directions, rays.near, rays.far)))
+    samples = Bins(BOUNDS, 16)(rays)
+    return samples, black_batch(rays, samples.middles[:, 5])
+
+
+def test_measured_depth_teaches_the_oracle(lessons: tuple[RaySamples, TrainingBatch]) -> None:
+    samples, batch = lessons
+    logits = torch.zeros_like(samples.starts, requires_grad=True)
+    oracle_loss(logits, samples, torch.zeros_like(logits), batch).backward()
+    assert logits.grad is not None
+    assert bool((logits.grad[:, 5] < 0).all())  # the score is to rise at the surface
+    assert bool((logits.grad[:, [0, 1, 2, 8, 9, 15]] > 0).all())  # and to fall elsewhere
+    unmeasured = black_batch(batch.rays, torch.zeros(len(batch)))
+    assert float(by_depth(samples, unmeasured).max()) == 0
+    torch.testing.assert_close(by_depth(samples, batch)[:, 5], torch.ones(len(samples.starts)))
+
+
+def test_shaded_bins_teach_the_oracle_without_depth(lessons: tuple[RaySamples, TrainingBatch]) -> None:
+    samples, batch = lessons
+    unmeasured = black_batch(batch.rays, torch.zeros(len(batch)))
+    logits = torch.zeros_like(samples.starts, requires_grad=True)
+    weights = torch.zeros_like(logits)
+    weights[:, 9] = 0.9
+    weights.requires_grad_()
+    oracle_loss(logits, samples, weights, unmeasured).backward()
+    assert logits.grad is not None
+    assert weights.grad is None  # the shading network is the teacher
+    assert bool((logits.grad[:, 9] < 0).all())
+    assert bool((logits.grad[:, :8] > 0).all() and (logits.grad[:, 11:] > 0).all())
+
+
+def test_a_bin_matters_more_the_more_weight_it_has() -> None:
+    weights = torch.zeros(5, 16)
+    weights[:, 7] = torch.tensor([0.0, 0.1, 0.4, 1.0, 3.0]) * ENOUGH
+    target = by_weight(weights)
+    torch.testing.assert_close(target[:, 7], torch.tensor([0.0, 0.1, 0.4, 1.0, 1.0]))
+    assert bool((target[1:4, 6] < target[1:4, 7]).all())
+    assert torch.equal(target[:, 6], target[:, 8])
+    assert float(target[:, [5, 9]].max()) == 0
+
+
+def test_rays_that_miss_the_scene_teach_nothing(rays: Rays) -> None:
+    samples, batch = Bins(BOUNDS, 16)(rays), black_batch(rays, torch.zeros_like(rays.near))
+    logits = torch.ones_like(samples.starts, requires_grad=True)
+    oracle_loss(logits, samples, torch.zeros_like(logits), batch).backward()
+    assert logits.grad is not None
+    assert float(logits.grad[~hit(rays)].abs().max()) == 0
+    assert float(logits.grad[hit(rays)].abs().min()) > 0
+
+
+# Phases.
+
+
+def test_sparsity_comes_by_schedule() -> None:
+    config = replace(SMALL, steps=100, dense_part=0.4, soft_part=0.2)
+    weights = [sparsity(step, config) for step in range(60)]
+    assert set(weights[:41]) == {0.0}
+    assert weights[40:51] == sorted(weights[40:51])
+    assert len(set(weights[40:51])) == 11
+    assert set(weights[50:]) == {config.sparsity_weight}
+
+
+@pytest.mark.parametrize("parts", [(0.4, 0.2), (0.0, 0.5), (1.0, 0.0), (0.0, 0.0), (0.5, 0.5)])
+def test_phases_follow_each_other(parts: tuple[float, float]) -> None:
+    config = replace(SMALL, steps=100, dense_part=parts[0], soft_part=parts[1])
+    found = [phase_at(step, config) for step in range(100)]
+    counts = [found.count(phase) for phase in (Phase.DENSE, Phase.SOFT, Phase.SPARSE)]
+    assert found == sorted(found, key=list(Phase).index)
+    assert counts == [round(100 * part) for part in (*parts, 1 - sum(parts))]
+
+
+def phases(field: AdaNerfField, config: AdaNerfConfig, report: Any) -> list[bool]:
+    """Return whether the oracle learned in each step."""
+    learned, last = [], [p.clone() for p in field.oracle.parameters()]
+    step = report.step
+
+    def watch(progress: Any) -> None:
+        now = [p.detach().clone() for p in field.oracle.parameters()]
+        learned.append(not all(torch.equal(a, b) for a, b in zip(last, now, strict=True)))
+        last[:] = now
+        step(progress)
+
+    report.step = watch
+    backend.train(field, rgbd_views(), config, report)
+    return learned
+
+
+def test_phases_advance_by_schedule_and_the_oracle_is_frozen_in_the_last() -> None:
+    config = replace(SMALL, steps=20, dense_part=0.3, soft_part=0.3)
+    learned = phases(backend.build(config, BOUNDS), config, Recorder())
+    assert learned == [True] * 12 + [False] * 8
+
+
+@pytest.mark.parametrize("at", [3, 6, 9, 12, 16])
+def test_training_resumes_in_any_phase(at: int) -> None:
+    config = replace(SMALL, steps=20, dense_part=0.3, soft_part=0.3)
+    whole, report = backend.build(config, BOUNDS), Recorder(due=[at])
+    backend.train(whole, rgbd_views(), config, report)
+    rest, resumed = backend.build(config, BOUNDS), Recorder(state=report.saved[0])
+    backend.train(rest, rgbd_views(), config, resumed)
+    assert [p.step for p in resumed.steps] == list(range(at + 1, 21))
+    assert [p.loss for p in resumed.steps] == [p.loss for p in report.steps[at:]]
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, rest.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_samples_become_fewer_and_the_picture_stays(depth: bool) -> None:
+    views = [v if depth else replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views()]
+    config = replace(SMALL, steps=300, sparsity_weight=0.2)
+    field, report = backend.build(config, BOUNDS), Recorder()
+    before = colour_error(field)
+    backend.train(field, views, config, report)
+    taken = torch.tensor([p.samples_per_ray for p in report.steps])
+    first, last = taken[:20].mean(), taken[-20:].mean()
+    assert float(last) < 0.5 * float(first)
+    assert float(last) <= config.max_samples
+    assert colour_error(field) < 0.5 * before
+
+
+def test_rooms_are_learnt_from_within() -> None:
+    """Seen from its middle."""
+    room = demo_room()
+    camera = Intrinsics(16.0, 16.0, 12.0, 12.0, 24, 24)
+    views: list[View] = seen_from(room, camera, look_around(room.bounds, 8))
+    field, report = backend.build(replace(SMALL, steps=150), room.bounds), Recorder()
+    backend.train(field, views, replace(SMALL, steps=150), report)
+    losses = [p.psnr for p in report.steps]
+    assert sum(losses[-20:]) / 20 > sum(losses[:20]) / 20 + 2
+    batch = RayBank(views, room.bounds).draw(256, torch.Generator().manual_seed(1))
+    rendering = render(field, batch.rays, batch.background)
+    away = (rendering.distance - batch.observed.distance).abs()
+    assert float(away.detach().median()) < 0.15 * max(room.bounds.size)
+
+
+# Settings.
+
+
+def test_settings_are_judged() -> None:
+    with pytest.raises(InputError, match="bins is 0, expected 1 to"):
+        AdaNerfConfig(bins=0)
+    with pytest.raises(InputError, match=r"sum to 1\.2, expected at most 1"):
+        AdaNerfConfig(dense_part=0.7, soft_part=0.5)
+    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
+        AdaNerfConfig(learning_rate=0)
+
+
+def test_presets() -> None:
+    paper = AdaNerfConfig.paper()
+    assert (paper.width, paper.layers, paper.bins) == (256, 8, 128)
+
+
+def test_no_unit_of_length_matters(rays: Rays) -> None:
+    """A scene twice as large has densities half as high and looks the same."""
+    double = replace(
+        BOUNDS,
+        lower=tuple(2 * x for x in BOUNDS.lower),
+        upper=tuple(2 * x for x in BOUNDS.upper),
+        near=2 * BOUNDS.near,
+        far=2 * BOUNDS.far,
+    )
+    small, large = backend.build(SMALL, BOUNDS), backend.build(SMALL, double)
+    positions, directions = points(50)
+    a, b = small.query(positions, directions), large.query(2 * positions, directions)
+    torch.testing.assert_close(a.density, 2 * b.density)
+    seen = render(large, Rays(2 * rays.origins, rays.directions, 2 * rays.near, 2 * rays.far))
+    torch.testing.assert_close(render(small, rays).rgb, seen.rgb, atol=1e-4, rtol=0)
+    assert math.isclose(large.side, 2 * SIDE)
+    assert max(demo_object().bounds.size) == SIDE

@@ -1,0 +1,73 @@
+"""Composing a backend of a config, a field and a recipe, and the config for small scenes that a backend may offer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from bidnerf_adanerf import backend as adanerf
+from bidnerf_core.backend import Backend, QuickConfig, RecipeBackend, quick_config
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.training import Silent
+from bidnerf_hashgrid import HashGridConfig
+from bidnerf_hashgrid import backend as hashgrid
+from bidnerf_vanilla import backend as vanilla
+
+
+@dataclass(frozen=True)
+class Settings:
+    seed: int = 0
+    steps: int = 3
+
+
+class Linear(nn.Module):
+    def __init__(self, config: Settings, bounds: object) -> None:
+        super().__init__()
+        self.layer = nn.Linear(3, 4)
+
+
+class Plain:
+    """A backend without settings for small scenes."""
+
+    summary, config_type = "plain", Settings
+
+    def build(self, config: Any, bounds: Any) -> Any: ...
+
+    def train(self, field: Any, views: Any, config: Any, report: Any) -> None: ...
+
+
+def test_the_seed_alone_decides_the_initial_weights() -> None:
+    backend = RecipeBackend("linear", Settings, Linear, lambda field, views, config, report: None)
+    before = torch.get_rng_state()
+    first, again, other = (backend.build(Settings(seed), BOUNDS).layer.weight for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_recipe_gets_what_train_was_given() -> None:
+    given: list[object] = []
+    backend = RecipeBackend("linear", Settings, Linear, lambda *arguments: given.extend(arguments))
+    field, config, report = backend.build(Settings(), BOUNDS), Settings(5), Silent()
+    backend.train(field, [], config, report)
+    assert given == [field, [], config, report]
+
+
+@pytest.mark.parametrize("backend", [vanilla, adanerf, hashgrid], ids=lambda b: b.config_type.__name__)
+def test_bundled_backends_are_backends(backend: Any) -> None:
+    assert isinstance(backend, Backend)
+    assert isinstance(quick_config(backend), backend.config_type)
+
+
+def test_small_scenes_get_the_settings_that_a_backend_offers_and_else_its_defaults() -> None:
+    quick = quick_config(hashgrid)
+    changed = {f.name for f in fields(quick) if getattr(quick, f.name) != getattr(HashGridConfig(), f.name)}
+    assert changed == {"steps", "colour_layers", "coarse_every"}
+    assert quick.steps == 800
+    assert quick_config(vanilla) == vanilla.config_type()
+    assert not isinstance(Plain(), QuickConfig)
+    assert quick_config(Plain()) == Settings()

@@ -1,0 +1,91 @@
+"""Training of a hash-grid field: its threads, and its settings in contracted scenes."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.training import Silent
+from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
+from bidnerf_hashgrid.recipe import adapted
+from bidnerf_hashgrid.threads import THREADED, pools_only, threads_for
+
+BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def usual_threads() -> Iterator[None]:
+    usual = torch.get_num_threads()
+    yield
+    torch.set_num_threads(usual)
+
+
+def trained(threads: int) -> HashGridField:
+    torch.set_num_threads(threads)
+    views, config = tiny.views(), tiny.config(8, samples_per_step=4 * THREADED, rays_at_most=4 * THREADED)
+    field = backend.build(config, estimate_bounds(views, tiny.BACKGROUND))
+    backend.train(field, views, config, Silent())
+    assert torch.get_num_threads() == threads
+    return field
+
+
+def test_the_number_of_threads_does_not_change_what_is_learned() -> None:
+    one, three = trained(1).state_dict(), trained(3).state_dict()
+    for name, value in one.items():
+        assert torch.equal(value, three[name]), name
+
+
+def test_pools_keep_the_threads_that_torch_gives_up() -> None:
+    torch.set_num_threads(3)
+    with pools_only(CPU):
+        assert torch.get_num_threads() == 1
+        assert threads_for(THREADED, CPU) == 3
+        assert threads_for(THREADED - 1, CPU) == 1
+    assert torch.get_num_threads() == 3
+
+
+def test_pools_follow_torch_again_after_an_error() -> None:
+    torch.set_num_threads(3)
+    with pytest.raises(KeyboardInterrupt), pools_only(CPU):
+        raise KeyboardInterrupt
+    assert torch.get_num_threads() == 3
+    torch.set_num_threads(2)
+    assert threads_for(THREADED, CPU) == 2
+
+
+def test_on_a_gpu_torch_keeps_its_threads() -> None:
+    torch.set_num_threads(3)
+    with pools_only(torch.device("cuda")):
+        assert torch.get_num_threads() == 3
+
+
+@pytest.mark.parametrize(
+    ("footprint", "contracted", "finest"),
+    [(0.02, False, 250), (0.02, True, 500), (0.001, False, 1024), (1.0, False, 16), (0.0, False, 1024)],
+)
+def test_the_finest_level_follows_the_images(footprint: float, contracted: bool, finest: int) -> None:
+    """The scene is 2 wide; 2.5 cells are as wide as what a pixel shows, from the coarsest level's 16 cells to 1024 at most."""
+    bounds = replace(BOX, footprint=footprint, contracted=contracted)
+    assert backend.build(HashGridConfig(), bounds).encoding.levels[-1].resolution == finest
+    fixed = backend.build(HashGridConfig(cells_per_pixel=0), bounds)
+    assert fixed.encoding.levels[-1].resolution == (2048 if contracted else 1024)
+
+
+def test_settings_stay_where_the_scene_is_not_contracted() -> None:
+    assert adapted(HashGridConfig(), BOX) == HashGridConfig()
+
+
+def test_contracted_scenes_are_pruned_later_and_learned_more_slowly() -> None:
+    usual = HashGridConfig()
+    slower = adapted(usual, replace(BOX, contracted=True))
+    assert slower.learning_rate == usual.learning_rate / 2
+    assert usual.prune_fade < slower.prune_fade < 1
+    assert slower.prune_threshold < usual.prune_threshold
+    assert slower.grow_until > usual.grow_until
+    kept = replace(usual, grow_until=1.0)
+    assert adapted(kept, replace(BOX, contracted=True)).grow_until == 1.0

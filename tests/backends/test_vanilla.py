@@ -1,0 +1,368 @@
+"""NeRF: encoding, network, hierarchical sampling, room for matter, and a training that learns."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core.carving import occupied_voxels
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields import (
+    Importance,
+    OccupancyMask,
+    OccupiedOnly,
+    RadianceField,
+    RaySampler,
+    RaySamples,
+    SceneBounds,
+    Stratified,
+    VoxelGrid,
+    encoded_width,
+    frequency_encoding,
+    levels,
+    octaves,
+    query_samples,
+    render,
+)
+from bidnerf_core.frames import View
+from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.maps import MapInfo, load_map, save_map
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing import SIDE, BackendContract, Recorder, points, rgb_views, rgbd_views
+from bidnerf_core.training import RayBank, Supervision, TrainingState, ray_termination, supervised_loss
+from bidnerf_vanilla import VanillaConfig, VanillaField, backend
+from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
+from bidnerf_vanilla.recipe import step_outcome
+from voxels import cell_centres
+
+SMALL = VanillaConfig(
+    layers=3, width=32, skip=1, position_frequencies=4, direction_frequencies=1, coarse_samples=24, fine_samples=8,
+    room_resolution=16, steps=60, samples_per_step=2048, rays_at_most=256, learning_rate=0.01,
+)  # fmt: skip
+
+
+class TestVanilla(BackendContract):
+    backend = backend
+    config = SMALL
+
+
+def built(**changes: object) -> VanillaField:
+    return backend.build(replace(SMALL, **changes), BOUNDS)  # type: ignore[arg-type]
+
+
+def rays_of_view(count: int = 200):  # type: ignore[no-untyped-def]
+    return RayBank(rgbd_views(), BOUNDS).draw(count, torch.Generator().manual_seed(0)).rays
+
+
+# Encoding.
+
+
+@pytest.mark.parametrize("include_input", [True, False])
+@pytest.mark.parametrize("frequencies", [0, 1, 4, 10])
+def test_encoding_is_equation_4(frequencies: int, include_input: bool) -> None:
+    given = torch.rand(9, 3, dtype=torch.float64) * 2 - 1
+    found = frequency_encoding(given, octaves(frequencies, given), include_input)
+    assert found.shape == (9, encoded_width(frequencies, include_input))
+    for row, point in zip(found.tolist(), given.tolist(), strict=True):
+        expected = list(point) if include_input else []
+        for k in range(frequencies):
+            expected += [math.sin(2**k * math.pi * x) for x in point]
+            expected += [math.cos(2**k * math.pi * x) for x in point]
+        assert row == pytest.approx(expected, abs=1e-10)
+
+
+def test_encoding_of_nothing_is_nothing() -> None:
+    nothing = torch.zeros(0, 3)
+    assert frequency_encoding(nothing, octaves(3, nothing)).shape == (0, 21)
+
+
+def test_the_order_of_sines_and_cosines_is_all_that_differs() -> None:
+    given = torch.rand(5, 2, 3)
+    found = frequency_encoding(given, octaves(4, given), False, sines_first=True).unflatten(-1, (2, 4, 3))
+    usual = frequency_encoding(given, octaves(4, given), False).unflatten(-1, (4, 2, 3))
+    assert torch.equal(found, usual.transpose(-3, -2))
+
+
+# The network.
+
+
+def test_each_layer_takes_what_it_should() -> None:
+    net = NerfNetwork(NetworkConfig(5, 16, 3, 2, 1))
+    seen, turned = encoded_width(2, True), encoded_width(1, True)
+    assert [layer.in_features for layer in net.trunk] == [seen, 16, 16, 16 + seen, 16]
+    assert (net.view.in_features, net.view.out_features) == (16 + turned, 8)
+
+
+@pytest.mark.parametrize(("skip", "fed"), [(0, False), (1, True), (2, True), (3, False), (9, False)])
+def test_the_position_comes_again_after_skip_layers(skip: int, fed: bool) -> None:
+    """What the layers before forget does not matter to one that is fed the position itself."""
+    net = NerfNetwork(NetworkConfig(3, 16, skip, 2, 1))
+    torch.nn.init.zeros_(net.trunk[0].weight)
+    given = torch.rand(20, 3)
+    density, _ = net(given, torch.rand(20, 3))
+    assert (float(density.detach().std()) > 1e-6) == fed
+
+
+def test_density_does_not_depend_on_the_direction_and_colour_does() -> None:
+    net = NerfNetwork(NetworkConfig())
+    given = torch.rand(20, 3)
+    (density, rgb), (again, other) = net(given, torch.rand(20, 3)), net(given, -torch.rand(20, 3))
+    assert torch.equal(density, again)
+    assert bool((rgb != other).any())
+
+
+def test_the_paper_has_the_papers_network() -> None:
+    net = NerfNetwork(VanillaConfig.paper())
+    assert [layer.in_features for layer in net.trunk] == [63, 256, 256, 256, 256, 319, 256, 256]
+    assert (net.view.in_features, net.view.out_features) == (256 + 27, 128)
+
+
+# The field.
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_derivatives_by_position_and_direction(level: int) -> None:
+    field = levels(built().double().requires_grad_(False))[level]
+    positions, directions = (x.double().requires_grad_() for x in points(6))
+
+    def ask(p: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        values = field.query(p, d)
+        return values.density, values.rgb
+
+    assert torch.autograd.gradcheck(ask, (positions, directions), eps=1e-7, atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1000.0])
+def test_neither_unit_nor_origin_of_the_world_matters(scale: float) -> None:
+    """A scaled and moved world has the same colours at the same places, and as much is absorbed on the way."""
+    shift = torch.tensor([3.0, -2.0, 5.0]) * scale
+    lower, upper = (tuple((torch.tensor(c) * scale + shift).tolist()) for c in (BOUNDS.lower, BOUNDS.upper))
+    bounds = SceneBounds(lower, upper, BOUNDS.near * scale, BOUNDS.far * scale)  # type: ignore[arg-type]
+    moved = backend.build(SMALL, bounds)
+    positions, directions = points(50)
+    here, there = built().query(positions, directions), moved.query(positions * scale + shift, directions)
+    torch.testing.assert_close(there.density * scale, here.density, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(there.rgb, here.rgb, rtol=1e-3, atol=1e-3)
+
+
+def test_an_untrained_field_is_nearly_transparent() -> None:
+    rays = rays_of_view()
+    across = rays.far > rays.near
+    for level in levels(built()):
+        opacity = render(level, rays).opacity
+        assert 0.5 < float(opacity[across].mean()) < 0.9999
+        assert float(opacity[~across].abs().sum()) == 0
+
+
+# Hierarchical sampling.
+
+
+def inner(sampler: RaySampler) -> RaySampler:
+    assert isinstance(sampler, OccupiedOnly)
+    return sampler.sampler
+
+
+def test_the_fine_level_is_asked_where_the_coarse_one_says() -> None:
+    field = built()
+    coarse, fine = levels(field)
+    assert coarse is field.coarse
+    assert fine is field
+    assert inner(coarse.sampler) == Stratified(24, BOUNDS)
+    placed = inner(fine.sampler)
+    assert isinstance(placed, Importance)
+    assert placed.field is field.coarse
+    assert placed.count == 8
+
+
+def test_levels_have_weights_of_their_own() -> None:
+    field = built()
+    shared = {id(p) for p in field.coarse.parameters()} & {id(p) for p in field.fine.parameters()}
+    assert not shared
+    positions, directions = points(10)
+    assert bool(
+        (field.coarse.query(positions, directions).rgb != field.query(positions, directions).rgb).any()
+    )
+
+
+def test_more_samples_go_near_the_surface() -> None:
+    """The coarse network is a wall at x = 0: most of the samples that the fine level adds are at its front."""
+    field = built(coarse_samples=32, fine_samples=32, position_frequencies=0).double()
+    with torch.no_grad():
+        for parameter in field.coarse.parameters():
+            parameter.zero_()
+        field.coarse.network.trunk[0].weight[0, 0] = 1.0
+        for layer in list(field.coarse.network.trunk)[1:]:
+            layer.weight[0, 0] = 1.0
+        field.coarse.network.density.weight[0, 0] = 5000.0
+        field.coarse.network.density.bias[0] = -20.0
+    bounds = field.bounds
+    origins = torch.tensor([[-3.0, 0.1, 0.2]], dtype=torch.float64)
+    rays = bounds.rays(origins, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    rough, placed = field.coarse.sampler(rays), field.sampler(rays)
+    step = float(rays.far - rays.near) / 32
+
+    def near_front(samples: RaySamples) -> int:
+        return int(((samples.middles - 3.0).abs() < 1.5 * step).sum())
+
+    assert placed.starts.shape == (1, 64)
+    assert near_front(placed) >= near_front(rough) + 28
+
+
+def test_no_gradient_flows_through_the_choice_of_place() -> None:
+    field = built()
+    render(field, rays_of_view()).rgb.sum().backward()
+    assert all(p.grad is None for p in field.coarse.parameters())
+    assert all(p.grad is not None for p in field.fine.parameters())
+
+
+# Room for matter.
+
+
+def test_room_is_everywhere_until_it_is_carved() -> None:
+    room = OccupancyMask(VoxelGrid.cube(BOUNDS, 8))
+    positions = torch.randn(100, 3) * 3 * SIDE
+    assert bool(room.holds(positions).all())
+    room.cells[:] = False
+    room.cells[2, 3, 5] = True
+    assert torch.equal(room.holds(cell_centres(room.grid)), room.cells)
+
+
+def carve(field: VanillaField, views: Sequence[View]) -> None:
+    field.room.cells.copy_(occupied_voxels(views, field.room.grid))
+
+
+def test_nothing_is_asked_where_there_is_no_room() -> None:
+    field = built()
+    carve(field, rgbd_views())
+    rays = rays_of_view()
+    for level in levels(field):
+        everywhere, found = inner(level.sampler)(rays), level.sampler(rays)
+        assert torch.equal(found.starts, everywhere.starts)
+        held = field.room.holds(rays.at(found.middles))
+        assert torch.equal(found.valid, everywhere.valid & held)
+        possible = int((rays.far > rays.near).sum()) * found.valid.shape[-1]
+        assert int(found.valid.sum()) < 0.6 * possible
+
+
+def test_carving_leaves_what_is_seen() -> None:
+    """Each pixel that shows matter has room on its ray where its depth was measured."""
+    field = built(room_resolution=32)
+    carve(field, rgbd_views())
+    batch = RayBank(rgbd_views(), BOUNDS).draw(2000, torch.Generator().manual_seed(1))
+    hit = batch.observed.distance > 0
+    places = batch.rays.at(batch.observed.distance[:, None])[:, 0]
+    assert float(field.room.holds(places[hit]).float().mean()) > 0.99
+
+
+def test_views_without_silhouette_or_depth_carve_nothing() -> None:
+    field = built()
+    carve(field, rgb_views())
+    assert bool(field.room.cells.all())
+
+
+# Training.
+
+
+def test_what_is_compared_with_measured_depth() -> None:
+    """One ray: the mean distance of its weight from the measurement, what it lacks counted as at the camera."""
+    field = built()
+    batch = RayBank(rgbd_views(), BOUNDS).draw(300, torch.Generator().manual_seed(0))
+    rendering = render(field, batch.rays, batch.background)
+    total, count = 0.0, 0
+    for w, t, d in zip(rendering.weights, rendering.samples.middles, batch.observed.distance, strict=True):
+        if d > 0:
+            total += float((w * (t - d).abs()).sum() + (1 - w.sum()) * d)
+            count += 1
+    assert count > 10
+    assert float(ray_termination(rendering, batch)) == pytest.approx(total / count, rel=1e-4)
+    loss, mse = supervised_loss(rendering, batch, SIDE, 0.5)
+    assert mse == pytest.approx(float(((rendering.rgb - batch.observed.rgb) ** 2).mean()))
+    assert float(loss) == pytest.approx(mse + 0.5 * total / count / SIDE, rel=1e-4)
+
+
+def test_without_depth_only_colour_is_compared() -> None:
+    batch = RayBank(rgb_views(), BOUNDS).draw(50, torch.Generator().manual_seed(0))
+    loss, mse = supervised_loss(render(built(), batch.rays, batch.background), batch, SIDE, 0.5)
+    assert float(loss.detach()) == pytest.approx(mse)
+
+
+def test_both_levels_learn_from_a_step() -> None:
+    field = built()
+    generator = torch.Generator().manual_seed(0)
+    supervision = Supervision(rgbd_views(), BOUNDS, SMALL)
+    outcome = step_outcome(field, supervision, supervision.draw(64, generator), generator)
+    outcome.loss.backward()
+    assert all(float(p.grad.abs().sum()) > 0 for p in field.parameters() if p.grad is not None)
+    assert all(p.grad is not None for p in field.parameters())
+    assert outcome.samples_per_ray > 0
+
+
+@pytest.mark.slow
+def test_loss_falls_at_both_levels() -> None:
+    field = built()
+    views = rgbd_views()
+
+    def error(level: RadianceField) -> float:
+        batch = RayBank(views, BOUNDS).draw(1000, torch.Generator().manual_seed(5))
+        return float(((render(level, batch.rays, batch.background).rgb - batch.observed.rgb) ** 2).mean())
+
+    before = [error(level) for level in levels(field)]
+    backend.train(field, views, replace(SMALL, steps=150), Recorder())
+    after = [error(level) for level in levels(field)]
+    assert all(b < 0.3 * a for a, b in zip(before, after, strict=True))
+
+
+def test_a_step_takes_more_rays_where_there_is_little_room() -> None:
+    counted = []
+    for carve in (True, False):
+        report = Recorder()
+        config = replace(SMALL, steps=3, carve=carve, rays_at_most=100_000, coarse_samples=48)
+        backend.train(built(coarse_samples=48), rgbd_views(), config, report)
+        counted.append(report.steps[-1].samples_per_ray)
+    assert counted[0] < 0.7 * counted[1]
+
+
+# Configuration and storage.
+
+
+@pytest.mark.parametrize("config", [VanillaConfig(), VanillaConfig.paper(), SMALL])
+def test_configs_survive_json(config: VanillaConfig) -> None:
+    assert from_plain(VanillaConfig, json.loads(json.dumps(to_plain(config))), "config") == config
+
+
+NUMBERS = [f.name for f in fields(VanillaConfig) if type(getattr(VanillaConfig(), f.name)) is not bool]
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_settings_that_make_no_sense_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"{name} is -1, expected "):
+        VanillaConfig(**{name: -1})
+
+
+def test_a_learning_rate_of_zero_is_refused() -> None:
+    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
+        VanillaConfig(learning_rate=0)
+
+
+def test_an_encoding_of_nothing_is_refused() -> None:
+    with pytest.raises(InputError, match="expected one of them"):
+        VanillaConfig(position_frequencies=0, include_input=False)
+
+
+def test_a_stored_map_renders_the_same(tmp_path: Path) -> None:
+    field = built()
+    backend.train(field, rgbd_views(), replace(SMALL, steps=5), Recorder())
+    info = MapInfo("vanilla", to_plain(SMALL), BOUNDS, 5, True)
+    save_map(tmp_path / "map", info, TrainingState(5, dict(field.state_dict()), {}))
+    stored = load_map(tmp_path / "map")
+    rays = rays_of_view()
+    for one, two in zip(levels(field), levels(stored.field), strict=True):
+        assert torch.equal(render(one, rays).rgb, render(two, rays).rgb)
+    assert not bool(query_samples(stored.field, rays, stored.field.sampler(rays)).rgb.requires_grad)

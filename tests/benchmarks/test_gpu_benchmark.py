@@ -1,0 +1,49 @@
+"""The benchmark for GPUs where there is none: it says so, and its steps are those of ``bid``."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "gpu.py"
+PLACE = "demo:blobs"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), PLACE, "--map", PLACE, "--out", str(tmp_path)],
+        check=False, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "no GPU here: nothing was measured, and no record was written\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_its_steps_leave_the_pose_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    gpu = importlib.import_module("gpu")
+    steps = gpu.made_steps(PLACE, PLACE, 0, torch.device("cpu"), rays=32)
+    start = steps.T
+    steps()
+    _, losses, finite = steps.block()
+    assert bool(finite[0])
+    assert float(losses[0]) > 0
+    torch.testing.assert_close(steps.T.matrix(), start.matrix(), rtol=0, atol=1e-7)
+
+
+def test_a_row_that_fails_says_why_and_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    gpu = importlib.import_module("gpu")
+
+    def broken() -> None:
+        raise RuntimeError("out of memory\nand a second line")
+
+    assert gpu.attempted("a row", broken) == {"failed": "RuntimeError: out of memory"}
+    assert gpu.attempted("a row", lambda: {"ms": 1.0}) == {"ms": 1.0}

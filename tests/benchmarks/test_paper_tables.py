@@ -1,0 +1,73 @@
+"""The script behind the paper's tables, on a closed-form scene with few rays."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bidnerf_core.evaluation import Plan, planned
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "paper_tables.py"
+PLACE = "demo:blobs"
+CELLS = {
+    "table1": (4, 3, 8, {"bid"}),  # conditions, sizes, trials of each, methods
+    "depth_weight": (2, 3, 8, {"bid"}),
+    "table2": (3, 3, 16, {"bid"}),
+    "inerf": (2, 1, 25, {"bid", "inerf"}),
+}
+
+
+@pytest.mark.parametrize("part", CELLS)
+def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(
+    part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    plans = importlib.import_module("paper_tables").PARTS[part](
+        Plan(PLACE, PLACE, method="bid", seed=0), lambda method: {"rays": 8, "max_steps": 2}, None
+    )
+    conditions, sizes, each, methods = CELLS[part]
+    assert len(plans) == conditions
+    assert {plan.method for plan in plans} == methods
+    trials = [planned(plan) for plan in plans]  # raises where a method has no such setting
+    assert all(len(cell) == sizes * each for cell in trials)
+    for same in zip(*trials, strict=True):
+        assert len({(trial.frame, trial.size, trial.seed) for trial in same}) == 1
+
+
+@pytest.mark.slow
+def test_a_part_is_recorded(tmp_path: Path) -> None:
+    few = ("--trials", "1", "--rays", "8", "--steps", "1", "--workers", "1", "--part", "inerf")
+    subprocess.run(
+        [sys.executable, str(SCRIPT), PLACE, "--map", PLACE, "--out", str(tmp_path), *few],
+        check=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    cells = json.loads((tmp_path / "inerf_demo_blobs.json").read_text())["results"]["cells"]
+    assert [cell["condition"] for cell in cells] == ["bid", "inerf"]
+    assert len((tmp_path / "inerf_demo_blobs.jsonl").read_text().splitlines()) == 2
+
+
+def test_each_variant_of_bid_can_be_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    module = importlib.import_module("bid_variants")
+    for group, (_, variants, sizes) in module.GROUPS.items():
+        found = module.plans(group, Plan(PLACE, PLACE, method="bid", trials=2, seed=0), None, None)
+        trials = [planned(plan) for plan in found]  # raises where there is no such setting
+        assert [len(some) for some in trials] == [2 * len(sizes)] * len(variants)
+        assert len({some[0].config for some in trials}) == len(variants)
+
+
+def test_presets_become_settings_of_each_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    settings_of_preset = importlib.import_module("paper_tables").preset_settings
+    bid = settings_of_preset("paper", {"rays": 7}, "bid")
+    assert bid == {
+        "rays": 7, "pivot": "camera", "max_steps": 1000, "learning_rate": 0.02, "decay": 0.8, "decay_steps": 100,
+        "candidates": 1, "box_weight": 0.0,
+    }  # fmt: skip
+    assert settings_of_preset("paper-scene", {}, "inerf") == {"max_steps": 1000}

@@ -1,0 +1,257 @@
+"""Camera files of other programs, cameras of OpenCV's matrices, and focal lengths that cannot be pixels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bidnerf_core.camera import CameraSource, CentralLens, Intrinsics, read_camera
+from bidnerf_core.datasets import Photos, depth_files
+from bidnerf_core.frames import Frame
+from photo_files import noise, write_photo
+from refusals import refused
+
+SIZE = (640, 480)
+K = np.array([[500.0, 0, 310.5], [0, 510.0, 240.25], [0, 0, 1]])
+D = (0.1, -0.2, 0.001, 0.002, 0.05)
+CAMERA = Intrinsics(500.0, 510.0, 311.0, 240.75, *SIZE, D)
+IDEAL = Intrinsics(500.0, 510.0, 311.0, 240.75, *SIZE)
+
+
+def matrix(camera: Intrinsics) -> list[float]:
+    """The camera matrix in rows, as OpenCV has it: the centre of the first pixel is (0, 0)."""
+    return [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0]
+
+
+ROS_INFO = """image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: {K}
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: {D}
+"""
+KALIBR = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: {four}
+  distortion_model: radtan
+  intrinsics: {focal_and_centre}
+  resolution: [640, 480]
+"""
+ORB_SLAM = """%YAML:1.0
+#--- ORB-SLAM ---
+Camera.type: "PinHole"
+"""
+HLOC = """dir/a.jpg PINHOLE 640 480 {camera.fx} {camera.fy} {camera.cx} {camera.cy}
+dir/b.jpg SIMPLE_RADIAL 640 480 500 311 240.75 0.1
+"""
+
+
+def ros_info(camera: Intrinsics) -> str:
+    return ROS_INFO.format(K=matrix(camera), D=list(camera.distortion))
+
+
+def ros_topic(camera: Intrinsics) -> str:
+    values = {"height": 480, "width": 640, "distortion_model": "plumb_bob", "d": list(camera.distortion)}
+    return yaml.safe_dump({"header": {"frame_id": "camera"}, **values, "k": matrix(camera)}) + "---\n"
+
+
+def orb_slam(camera: Intrinsics) -> str:
+    numbers = (camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5, *camera.distortion, *SIZE)
+    names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "width", "height"]
+    return ORB_SLAM + "".join(f"Camera.{name}: {x}\n" for name, x in zip(names, numbers, strict=True))
+
+
+def kalibr(camera: Intrinsics) -> str:
+    numbers = [camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5]
+    return KALIBR.format(four=list(camera.distortion[:4]), focal_and_centre=numbers)
+
+
+def opencv(camera: Intrinsics, *names: str, **sizes: int) -> str:
+    storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    arrays = (np.array(matrix(camera)).reshape(3, 3), np.array(camera.distortion))
+    for name, value in (*sizes.items(), *zip(names, arrays, strict=True)):
+        storage.write(name, value)
+    return str(storage.releaseAndGetString())
+
+
+def open3d(camera: Intrinsics) -> dict[str, object]:
+    columns = np.array(matrix(camera)).reshape(3, 3).T.ravel().tolist()
+    return {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns}
+
+
+def splats(*cameras: Intrinsics) -> str:
+    named = zip(("a", "b.png"), cameras, strict=False)
+    return json.dumps(
+        [{"img_name": x, "width": 640, "height": 480, "fx": c.fx, "fy": c.fy} for x, c in named]
+    )
+
+
+NAMES = ("camera_matrix", "distortion_coefficients")
+FILES: dict[str, tuple[Callable[[Intrinsics], str], int]] = {
+    "info.yaml": (ros_info, 5),
+    "topic.yml": (ros_topic, 5),
+    "opencv.yml": (lambda camera: opencv(camera, *NAMES, image_width=640, image_height=480), 5),
+    "no_size": (lambda camera: opencv(camera, "cameraMatrix", "distCoeffs"), 5),
+    "slam.yaml": (orb_slam, 5),
+    "kalibr.yaml": (kalibr, 4),
+    "open3d.json": (lambda camera: json.dumps(open3d(camera)), 0),
+    "view.json": (lambda camera: json.dumps({"extrinsic": [1.0] * 16, "intrinsic": open3d(camera)}), 0),
+    "path.json": (lambda camera: json.dumps({"parameters": [{"intrinsic": open3d(camera)}] * 3}), 0),
+    "splats.json": (splats, 0),
+    "list.txt": (lambda camera: HLOC.format(camera=camera), 0),
+}
+"""What writes a camera as other programs do, and how many of its coefficients the format keeps."""
+
+CAMERAS = st.builds(
+    lambda fx, fy, cx, cy, k1, others: Intrinsics(fx, fy, cx, cy, *SIZE, (k1, *others)),
+    *(st.floats(100, 2000), st.floats(100, 2000), st.floats(1, 639), st.floats(1, 479), st.floats(0.01, 0.2)),
+    st.tuples(*[st.floats(-0.2, 0.2)] * 4),
+)
+
+
+@pytest.mark.parametrize("name", FILES)
+@given(camera=CAMERAS)
+def test_camera_files_of_other_programs_give_their_camera_back(
+    name: str, camera: Intrinsics, tmp_path: Path
+) -> None:
+    write, kept = FILES[name]
+    (tmp_path / name).write_text(write(camera))
+    found = read_camera(tmp_path / name, SIZE, "elsewhere/a.jpg")
+    assert isinstance(found, Intrinsics)
+    centre = (320.0, 240.0) if write is splats else (camera.cx, camera.cy)
+    assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx((camera.fx, camera.fy, *centre))
+    assert (found.width, found.height) == SIZE
+    assert found.distortion == pytest.approx(camera.distortion[:kept], abs=1e-15)
+
+
+def test_a_matrix_of_opencv_gives_the_camera_with_the_half_pixel() -> None:
+    tensor = torch.tensor(D, dtype=torch.float64)
+    lenses: list[Any] = [D, np.array(D), np.array(D)[None], np.array(D)[:, None], tensor]
+    for lens in (*lenses, list(D)):
+        for each in (K, K.tolist(), torch.from_numpy(K), K.ravel(), K.astype(np.float32)):
+            assert Intrinsics.from_opencv(each, lens, SIZE) == CAMERA
+    assert all(Intrinsics(500.0, 510.0, 311.0, 240.75, *SIZE, lens) == CAMERA for lens in lenses)
+    assert Intrinsics.from_opencv(K, np.zeros((5, 1)), np.array(SIZE)) == IDEAL
+    assert Intrinsics.from_opencv(K, size=SIZE) == IDEAL
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(D))
+    pixels = CAMERA.project(torch.from_numpy(points)).numpy() - 0.5  # OpenCV's: the first pixel is (0, 0)
+    np.testing.assert_allclose(pixels, expected[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found", "expected"),
+    [
+        ((K[:2], None, SIZE), "K has shape (2, 3)", "3 x 3"),
+        ((K.T, None, SIZE), "K is", "(fx 0 cx), (0 fy cy), (0 0 1)"),
+        ((K, None, None), "size is None", "(width, height)"),
+        ((K, None, (640.5, 480)), "width is 640.5", "whole number"),
+        ((K, D[:3], SIZE), "3 coefficients", "0, 4, 5"),
+        ((K * np.nan, None, SIZE), "K has values that are NaN", "finite"),
+        (("K", None, SIZE), "K is 'K'", "array of numbers"),
+        ((np.diag([4.2, 4.2, 1]), None, SIZE), "focal length is 4.2 px", None),
+    ],
+)
+def test_what_is_no_camera_of_opencv(arguments: tuple[Any, ...], found: str, expected: str | None) -> None:
+    with refused(found=found, expected=expected):
+        Intrinsics.from_opencv(*arguments)
+
+
+def test_a_bare_matrix_is_told_how_to_become_a_camera(tmp_path: Path) -> None:
+    path: Any = write_photo(tmp_path / "a.png", noise(480, 640))
+    for make, image, where in ((Frame.open, path, path), (Frame.from_numpy, noise(480, 640), None)):
+        with refused(where=where, found="ndarray", expected="Intrinsics.from_opencv(K, distortion"):
+            make(image, camera=K)
+
+
+def test_focal_lengths_in_millimetres_are_questioned(tmp_path: Path) -> None:
+    path = write_photo(tmp_path / "a.png", noise(300, 400))
+    with refused(where=path, found="focal length is 4.2 px for an image of 400x300, which would see 178"):
+        Frame.open(path, focal=4.2)
+    assert Frame.open(path, focal=60.0).intrinsics.fx == 60
+    assert Intrinsics.from_focal(4.2, 24, 16).fx == 4.2, "small images have short focal lengths"
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps({"fl_x": 26, "w": 4000, "h": 3000}))
+    with refused(where=camera, found="(2000 to 8000)"):
+        Frame.open(path, camera=camera)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        ros_info(replace(CAMERA, distortion=D[:4]))
+        .replace("plumb_bob", "equidistant")
+        .replace("cols: 5", "cols: 4"),
+        kalibr(CAMERA).replace("radtan", "equidistant"),
+        orb_slam(CAMERA).replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4"),
+    ],
+    ids=["ROS", "Kalibr", "ORB-SLAM"],
+)
+def test_fisheye_calibrations(content: str, tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text(content)
+    found = read_camera(tmp_path / "c.yaml", SIZE)
+    assert isinstance(found, CentralLens)
+    assert (found.fx, found.cx, found.cy) == (500.0, 311.0, 240.75)
+    assert found.coefficients[:2] == (0.1, -0.2)
+
+
+def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text(HLOC.format(camera=IDEAL))
+    (tmp_path / "splats.json").write_text(splats(IDEAL, replace(IDEAL, fx=600.0, fy=610.0)))
+    assert read_camera(tmp_path / "list.txt", SIZE, "dir/b.jpg") != IDEAL
+    for name in ("b.png", "folder/b.png", "b", "C:\\photos\\b.png"):
+        found = read_camera(tmp_path / "splats.json", SIZE, name)
+        assert isinstance(found, Intrinsics)
+        assert found.fx == 600
+    for file in (tmp_path / "list.txt", tmp_path / "splats.json"):
+        with refused(where=file, found="2 cameras", expected="exactly one, or one named after the photo"):
+            read_camera(file, SIZE, "c.jpg")
+    for name in ("a", "b"):
+        write_photo(tmp_path / f"{name}.png", noise(48, 64))
+    queries = Photos([tmp_path / "a.png", tmp_path / "b.png"], CameraSource(tmp_path / "splats.json"))
+    assert [queries.read(place).frame.intrinsics.fx for place in range(2)] == [50, 60]
+
+
+@pytest.mark.parametrize(
+    ("content", "found", "expected"),
+    [
+        ("a: [1, 2", "is not YAML", None),
+        ("just words", None, "YAML from ROS"),
+        ("image_width: 640\n", "no camera matrix", None),
+        (ros_info(CAMERA).replace("plumb_bob", "double_sphere"), "model double_sphere", "plumb_bob"),
+        (ros_info(CAMERA).replace("500.0", "fast"), "fast", "numbers"),
+        (ros_info(CAMERA).replace("500.0", "-500.0"), "focal length fx is -500.0", "positive"),
+        (kalibr(CAMERA) + kalibr(CAMERA).replace("cam0", "cam1"), "2 cameras", "one"),
+        (kalibr(CAMERA).replace("pinhole", "omni"), "camera_model is omni", "pinhole"),
+        ("x: !!python/object/apply:os.system ['true']", "no camera matrix", None),
+    ],
+)
+def test_calibrations_that_are_none(
+    content: str, found: str | None, expected: str | None, tmp_path: Path
+) -> None:
+    (tmp_path / "c.yaml").write_text(content)
+    with refused(where=tmp_path / "c.yaml", found=found, expected=expected):
+        read_camera(tmp_path / "c.yaml", SIZE)
+
+
+def test_photos_of_equal_names_need_no_depth() -> None:
+    photos = [Path("cam0/0001.jpg"), Path("cam1/0001.jpg")]
+    assert depth_files(photos, []) == {}
+    assert Photos(photos).names == ["cam0_0001", "cam1_0001"]

@@ -1,0 +1,306 @@
+"""The record of a capture: damaged photos are named, sound ones are not, and the words say so."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
+from bidnerf_core.captures import (
+    CaptureReport,
+    Gap,
+    PhotoRecord,
+    UpDirection,
+    given_up,
+    sentences,
+    summary,
+    surveyed,
+)
+from bidnerf_core.captures.advice import SUMMARY_LINES
+from bidnerf_core.captures.links import groups
+from bidnerf_core.captures.photos import exposures, nearby, photo_measures
+from bidnerf_core.captures.report import CoverageRecord
+from bidnerf_core.fields import render_image
+from bidnerf_core.geometry import look_at
+from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.mapping import HeldOutTrial, LandmarkConfig, tracked_views
+from bidnerf_core.results import draw_capture
+from bidnerf_core.scenes import demo_object, orbit, views
+from bidnerf_core.testing import BOUNDS, TexturedGround
+from landmark_scene import Points, looking_in, ring
+
+CAMERA = Intrinsics(162.0, 162.0, 80.0, 60.0, 160, 120)
+
+
+@functools.cache
+def photos() -> tuple[View, ...]:
+    """Photos of the textured ground from all sides."""
+    poses = orbit(1.8, 16, elevation=(45.0, 75.0), seed=0)
+    field = TexturedGround()
+    fine = torch.tensor([1.0, 3.0]).repeat(12)  # half of the waves are short, so that there is detail to lose
+    object.__setattr__(field, "waves", field.waves * fine)
+    images = [render_image(field, CAMERA, T, BOUNDS).rgb for T in poses]
+    return tuple(
+        View(Frame(f"{i:02d}", rgb, CAMERA), T) for i, (rgb, T) in enumerate(zip(images, poses, strict=True))
+    )
+
+
+def survey(views: list[View]) -> CaptureReport:
+    return surveyed(tracked_views(views), views)
+
+
+def changed(views: list[View], number: int, rgb: torch.Tensor) -> None:
+    views[number] = replace(views[number], frame=replace(views[number].frame, rgb=rgb))
+
+
+@functools.cache
+def damaged() -> CaptureReport:
+    """The record of the photos with one damage of each kind."""
+    views = list(photos())
+    T = views[2].T_ref_camera
+    views[2] = replace(
+        views[2], T_ref_camera=T @ SE3.exp(torch.tensor([0.1, 0, 0, 0, 0.15, 0], dtype=torch.float64))
+    )
+    changed(views, 5, views[5].frame.rgb.flip(0, 1))
+    changed(views, 8, views[8].frame.rgb.flip(1))
+    changed(views, 11, torch.from_numpy(cv2.blur(views[11].frame.rgb.numpy(), (7, 1))))
+    changed(views, 14, views[14].frame.rgb * 2 ** (-3 / 2.2))
+    return survey(views)
+
+
+def names(report: CaptureReport, problem: str) -> list[str]:
+    return [photo.name for photo in report.with_problem(problem)]  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_nothing_is_named_of_sound_photos() -> None:
+    report = survey(list(photos()))
+    assert [photo.problems for photo in report.photos] == [()] * 16
+    assert report.coverage.arrangement == "around"
+    assert report.coverage.gaps == ()
+    assert [len(group) for group in report.groups] == [16]
+    assert torch.tensor(report.coverage.centre).norm() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("problem", "number"),
+    [("badly posed", 2), ("turned", 5), ("mirrored", 8), ("blurred", 11), ("badly exposed", 14)],
+)
+def test_each_damage_is_named_and_nothing_else(problem: str, number: int) -> None:
+    assert names(damaged(), problem) == [f"{number:02d}"]
+
+
+def test_how_far_a_pose_is_off_is_measured() -> None:
+    photo = damaged().photos[2]
+    assert photo.pose_translation == pytest.approx(0.1, abs=0.02)
+    assert photo.pose_rotation_deg == pytest.approx(math.degrees(0.15), abs=0.5)
+    turned = damaged().photos[5]
+    assert turned.pose_rotation_deg == pytest.approx(180, abs=1)
+
+
+def test_exposure_is_measured_in_stops() -> None:
+    assert damaged().photos[14].exposure == pytest.approx(-3, abs=0.3)
+    stops = [photo.exposure for photo in damaged().photos[:5]]
+    assert max(map(abs, stops)) < 0.2
+
+
+def test_a_missing_side_is_named_by_the_photos_beside_it() -> None:
+    views = ring(points := Points(noise=0.3), 60)
+    left = [view for i, view in enumerate(views) if not 20 <= i < 30]
+    named = [replace(view, frame=replace(view.frame, name=f"{i}")) for i, view in enumerate(left)]
+    report = surveyed(tracked_views(named, points), named)
+    assert report.coverage.arrangement == "around"
+    (gap,) = report.coverage.gaps
+    assert {gap.after, gap.before} == {"19", "20"}  # of those that are left
+    assert gap.degrees == pytest.approx(math.degrees(11 * 0.105), abs=3)
+
+
+def test_one_side_is_no_gap() -> None:
+    views = ring(points := Points(), 12)
+    report = surveyed(tracked_views(views, points), views)
+    assert report.coverage.arrangement == "one side"
+    assert report.coverage.gaps == ()
+    assert report.coverage.open_side is not None
+    assert report.coverage.open_side.degrees == pytest.approx(360 - 11 * math.degrees(0.105), abs=3)
+
+
+def towards(eye: tuple[float, float, float], forward: tuple[float, float, float]) -> SE3:
+    return look_at(eye, [e + f for e, f in zip(eye, forward, strict=True)])
+
+
+def surroundings(poses: list[SE3], stretch: float, up: UpDirection | None = None) -> CaptureReport:
+    """Survey photos of points in a box, which is long along x."""
+    points = Points(count=900)
+    points.positions = points.positions * points.positions.new_tensor([stretch, 1, 1])
+    views = [
+        replace(view := points.view(T), frame=replace(view.frame, name=f"{i}")) for i, T in enumerate(poses)
+    ]
+    return surveyed(tracked_views(views, points), views, up=up)
+
+
+def test_photos_from_inside_a_room_have_no_open_side() -> None:
+    """All look to one half of the room, from its middle, and down."""
+    angles = [math.pi * (i / 23 - 0.5) for i in range(24)]
+    poses = [
+        towards((0.4 * math.cos(3 * a), 0.4 * math.sin(3 * a), 0.2), (math.cos(a), math.sin(a), -0.4))
+        for a in angles
+    ]
+    report = surroundings(poses, 1)
+    assert report.coverage.arrangement == "inside"
+    assert (report.coverage.open_side, report.coverage.gaps) == (None, ())
+    words = sentences(report)
+    assert any("taken from inside the scene, looking 22° to 22° down" in sentence for sentence in words)
+    assert not any("no photos" in sentence for sentence in words)
+
+
+def test_photos_along_a_corridor_are_inside_although_their_axes_meet_far_ahead() -> None:
+    poses = [
+        towards((-7.5 + 0.5 * i, 0.1 * (-1) ** i, 0.0), (1.0, -0.01 * (-1) ** i, 0.05)) for i in range(24)
+    ]
+    report = surroundings(poses, 8)
+    assert report.coverage.arrangement == "inside"
+    assert report.coverage.open_side is None
+
+
+def test_photos_past_a_facade_are_from_one_side_and_above() -> None:
+    """Parallel axes meet nowhere, but the scene is in front of all cameras."""
+    poses = [towards((0.3 * i - 1.5, -5.0, 3.0), (0.0, 1.0, -0.6)) for i in range(11)]
+    report = surroundings(poses, 1, given_up((0, 0, 1)))
+    assert report.coverage.arrangement == "one side"
+    assert report.coverage.heights_deg == pytest.approx((31, 31), abs=3)
+
+
+@pytest.mark.parametrize(
+    ("tilts", "words"),
+    [((-62, -10), "62° to 10° down"), ((-5, 8), "5° down to 8° up"), ((2, 30), "2° to 30° up")],
+)
+def test_tilts_in_words(tilts: tuple[float, float], words: str) -> None:
+    report = CaptureReport((), CoverageRecord("inside", heights_deg=tilts, landmarks=9))
+    assert f"inside the scene, looking {words}; " in sentences(report)[0]
+
+
+def test_photos_of_two_places_are_two_groups() -> None:
+    one = Points(noise=0.3)
+    two = Points(noise=0.3)
+    generator = torch.Generator().manual_seed(9)
+    two.descriptors = one.descriptors[:, torch.randperm(64, generator=generator)]
+    two.positions = two.positions[torch.randperm(two.count, generator=generator)]
+    views = ring(one, 10)
+    two.seen = one.seen  # both number their images in one list
+    views += [two.view(looking_in(0.105 * i + 0.05), seed=i) for i in range(5)]
+    views = [replace(view, frame=replace(view.frame, name=f"{i}")) for i, view in enumerate(views)]
+    report = surveyed(tracked_views(views, one), views)
+    assert names(report, "apart") == ["10", "11", "12", "13", "14"]
+    assert [len(group) for group in report.groups] == [10, 5]
+    assert any("another place" in sentence for sentence in sentences(report))
+
+
+def test_photos_from_one_place_have_no_parallax() -> None:
+    points = Points()
+    T = looking_in(0.0)
+    turns = [SE3.exp(torch.tensor([0, 0, 0, 0, 0.02 * i, 0.01 * i], dtype=torch.float64)) for i in range(9)]
+    views = [points.view(T @ turn) for turn in turns]
+    report = surveyed(tracked_views(views, points), views)
+    assert report.coverage.arrangement == "one place"
+    assert report.coverage.parallax_deg < 0.1
+    assert not report.with_problem("isolated", "apart", "badly posed")
+    assert any("from one place do not determine distances" in sentence for sentence in sentences(report))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_photos_are_recorded_and_more_are_asked_for(count: int) -> None:
+    report = survey(list(photos()[:count]))
+    assert len(report.photos) == count
+    assert not any(photo.problems for photo in report.photos)
+    assert any("hardly enough" in sentence for sentence in sentences(report))
+
+
+def test_photos_without_texture_are_recorded() -> None:
+    plain = [
+        replace(view, frame=replace(view.frame, rgb=torch.full((120, 160, 3), 0.5))) for view in photos()[:9]
+    ]
+    report = survey(plain)
+    assert report.coverage.landmarks == 0
+    assert "no landmark" in sentences(report)[0]
+
+
+def test_a_dark_scene_and_a_light_one_have_the_same_sharpness() -> None:
+    views = list(photos()[:4])
+    dark = [replace(view, frame=replace(view.frame, rgb=0.4 * view.frame.rgb)) for view in views]
+    assert torch.allclose(photo_measures(views).sharpness, photo_measures(dark).sharpness, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [(5, 1), (1, 5), (5, 5)])
+def test_blur_in_any_direction_costs_sharpness(size: tuple[int, int]) -> None:
+    view = photos()[0]
+    soft = replace(
+        view, frame=replace(view.frame, rgb=torch.from_numpy(cv2.blur(view.frame.rgb.numpy(), size)))
+    )
+    before, after = photo_measures([view, soft]).sharpness.tolist()
+    assert after < before - 0.3
+
+
+def test_exposure_of_photos_without_landmarks_is_that_of_the_whole_image() -> None:
+    views = list(photos())
+    changed(views, 3, views[3].frame.rgb * 2 ** (-2 / 2.2))
+    seen, _ = tracked_views(views).triangulated(LandmarkConfig())
+    nothing = seen[seen.image != 3].compacted()[0]
+    found = exposures(views, nothing, photo_measures(views).brightness, nearby(views))
+    assert float(found[3]) == pytest.approx(-2, abs=0.6)
+
+
+def test_groups_are_numbered_by_size() -> None:
+    links = torch.zeros((9, 9), dtype=torch.bool)
+    for i, j in [(0, 1), (1, 2), (3, 4), (4, 5), (5, 6), (7, 8)]:
+        links[i, j] = links[j, i] = True
+    assert groups(links).tolist() == [1, 1, 1, 0, 0, 0, 0, -1, -1]
+
+
+def test_a_record_comes_back_from_json() -> None:
+    report = replace(damaged(), trial=HeldOutTrial(2, 1, 0.1, 0.2))
+    assert from_plain(CaptureReport, json.loads(json.dumps(to_plain(report))), "record") == report
+
+
+def test_a_summary_has_five_lines_and_the_gravest_first() -> None:
+    lines = summary(damaged())
+    assert len(lines) == SUMMARY_LINES
+    assert "08 is mirrored" in lines[1]
+    assert "more remarks" in lines[-1]
+
+
+def test_long_lists_are_cut() -> None:
+    photo = PhotoRecord("p", (0, 0, 0), (0, 0, 1), 0, 0, 0, 0, 9, 9, 9, 0, problems=("blurred",))
+    many = CaptureReport(tuple(replace(photo, name=f"p{i}") for i in range(20)), CoverageRecord())
+    (line,) = [sentence for sentence in sentences(many) if "blurred" in sentence]
+    assert "p5 and 14 more are blurred" in line
+    assert "p6" not in line
+
+
+@pytest.mark.slow
+def test_a_picture_is_drawn_of_cameras_gaps_and_landmarks(tmp_path: Path) -> None:
+    report = damaged()
+    gap = Gap(40.0, report.photos[0].name, report.photos[1].name)
+    report = replace(report, coverage=replace(report.coverage, gaps=(gap,)))
+    draw_capture(report, torch.rand(50, 3) - 0.5, torch.arange(50), tmp_path / "a" / "capture.png")
+    image = cv2.imread(str(tmp_path / "a" / "capture.png"))
+    assert image.shape[0] > 500
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
+    with pytest.raises(InputError, match="cannot be written"):
+        draw_capture(report, None, None, tmp_path)
+
+
+@pytest.mark.slow
+def test_exact_poses_of_small_images_are_not_called_wrong() -> None:
+    """A pose by twenty landmarks scatters more than the usual one by forty."""
+    small = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
+    images = views(demo_object(), small, orbit(3.5, 60, seed=0))
+    found = surveyed(tracked_views(images), images)
+    assert [photo.name for photo in found.photos if "badly posed" in photo.problems] == []

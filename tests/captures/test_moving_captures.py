@@ -1,0 +1,302 @@
+"""Captures by moving cameras with rolling shutters: how it is noticed, what is estimated, and what training makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import degrees
+from statistics import median
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core import SE3, View
+from bidnerf_core.camera import STILL
+from bidnerf_core.captures import (
+    PoseRefinement,
+    at_stored_poses,
+    pose_sentences,
+    stored_cameras,
+    training_views,
+    tried_landmarks,
+)
+from bidnerf_core.captures.cameras import moved_from
+from bidnerf_core.captures.shutter_evidence import common_motion
+from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
+from bidnerf_core.fields import render, render_image
+from bidnerf_core.frames import all_pixels, observe
+from bidnerf_core.localization import LandmarkMatcher, Motion, propose
+from bidnerf_core.localization.landmarks.hypotheses import (
+    SHARE_AS_MAP,
+    SHARE_MOVING,
+    camera_hypotheses,
+    posterior,
+    share_moving,
+)
+from bidnerf_core.mapping import (
+    GIVEN,
+    LandmarkConfig,
+    TrackedViews,
+    landmark_tensors,
+    landmarks_from_tensors,
+    observed_at_rest,
+    pose_updates,
+    resect,
+    tracked_views,
+)
+from bidnerf_core.testing import BOUNDS, CAMERA, ground, unseen
+from bidnerf_core.training import RayBank
+from landmark_scene import PINHOLE, Points, looking_in
+
+VIEWS, NOISE = 16, 0.3
+METRES, RADIANS = 0.01, 0.008  # what a hand does in a few hundredths of a second: about three pixels
+
+
+def motions(scale: float) -> Tensor:
+    size = scale * torch.tensor([METRES] * 3 + [RADIANS] * 3, dtype=torch.float64)
+    return size * torch.randn(VIEWS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+
+
+def capture(moved: Tensor, pose_error: float = 0.0) -> tuple[Points, list[View], SE3]:
+    """Views of a ring of cameras that moved, with errors of the given poses (metres, and as many radians), and the true ones."""
+    points = Points(noise=NOISE)
+    poses = SE3.stack([looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(VIEWS)])
+    generator = torch.Generator().manual_seed(3)
+    given = poses.retract(pose_error * torch.randn(VIEWS, 6, dtype=torch.float64, generator=generator))
+    views = [points.view(poses[i], T_ref_camera=given[i], seed=i, motion=moved[i]) for i in range(VIEWS)]
+    named = [replace(v, frame=replace(v.frame, name=f"{i}")) for i, v in enumerate(views)]
+    return points, named, poses
+
+
+def refined(moved: Tensor, pose_error: float = 0.004) -> tuple[TrainingPoses, list[View], SE3]:
+    points, views, true = capture(moved, pose_error)
+    return training_poses(tracked_views(views, points), views), views, true
+
+
+def evidence_prior(tracked: TrackedViews) -> object:
+    return common_motion(*tracked.triangulated(LandmarkConfig()), 1.0)
+
+
+def last_row(T: SE3, motion: Tensor) -> Tensor:
+    """Where each camera sees each point in its last row, pixels: translation and rotation may make up for each other."""
+    return PINHOLE.project((T @ SE3.exp(0.5 * motion))[:, None].inverse().apply(Points().positions))
+
+
+def turned(T: SE3, true: SE3) -> Tensor:
+    """The error (radians) of each rotation relative to the one before, which no common rotation changes."""
+    steps = [x[:-1].inverse() @ x[1:] for x in (T, true)]
+    return (steps[1].inverse() @ steps[0]).log()[:, 3:].norm(dim=-1)
+
+
+def test_cameras_that_moved_are_told_from_those_at_rest() -> None:
+    for scale, expected in ((0.0, True), (1.0, False)):
+        points, views, _ = capture(motions(scale))
+        assert (evidence_prior(tracked_views(views, points)) == STILL) == expected
+
+
+def test_one_image_is_no_evidence_against_all_others() -> None:
+    moved = torch.zeros(VIEWS, 6, dtype=torch.float64)
+    moved[5] = 3 * motions(1.0)[5]
+    points, views, _ = capture(moved)
+    assert evidence_prior(tracked_views(views, points)) == STILL
+
+
+def test_few_images_are_no_evidence() -> None:
+    points, views, _ = capture(motions(1.0))
+    assert evidence_prior(tracked_views(views[:5], points)) == STILL
+
+
+def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
+    found, views, poses = refined(motions(1.0))
+    assert found.refined
+    assert found.consistency is not None
+    assert found.consistency.noise_after == pytest.approx(NOISE, rel=0.15)
+    true, estimated, none = (last_row(poses, m) for m in (motions(1.0), found.tracked.motion, motions(0.0)))
+    assert float((estimated - true).norm(dim=-1).median()) < 0.35 * float((true - none).norm(dim=-1).median())
+    given = SE3.stack([view.T_ref_camera for view in views])
+    assert float(turned(found.tracked.T_world_camera, poses).median()) < 0.5 * float(
+        turned(given, poses).median()
+    )
+
+
+def test_motions_are_noticed_though_the_poses_are_right() -> None:
+    """Structure from motion gives such poses for the frames of a video; the keypoints alone contradict a camera at rest."""
+    found, _, _ = refined(motions(1.0), pose_error=0.0)
+    assert found.refined
+    assert bool((found.tracked.motion != 0).any())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pose_error", [0.0, 0.004])
+@pytest.mark.parametrize(
+    "wrong", [{"fy": 1.05 * PINHOLE.fy}, {"cx": PINHOLE.cx + 10}, {"distortion": (0.2, 0, 0, 0)}]
+)
+def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float) -> None:
+    points, views, _ = capture(motions(0.0), pose_error)
+    camera = replace(PINHOLE, **wrong)
+    views = [replace(view, frame=replace(view.frame, intrinsics=camera)) for view in views]
+    found = training_poses(tracked_views(views, points), views)
+    assert bool((found.tracked.motion == 0).all())
+
+
+@pytest.mark.slow
+def test_cameras_at_rest_get_no_motion() -> None:
+    found, _, _ = refined(motions(0.0))
+    assert found.refined
+    assert bool((found.tracked.motion == 0).all())
+
+
+def test_known_motions_leave_only_the_noise_of_keypoints() -> None:
+    """What is built from the same tracks, landmarks and the scatter of poses, takes the motions into account."""
+    moved = motions(1.0)
+    points, views, true = capture(moved)
+    tracked = tracked_views(views, points)
+    known = tracked.at(true, moved)
+    seen, positions = known.triangulated(LandmarkConfig())
+    blind, elsewhere = tracked.triangulated(LandmarkConfig())
+    off, before = (
+        torch.stack([update[3:].norm() for update in pose_updates(*pair, NOISE).values()]).median()
+        for pair in ((seen, positions), (blind, elsewhere))
+    )
+    assert len(seen.point) > len(blind.point)
+    assert float(off) < 0.5 * float(before)
+
+
+def test_views_with_a_motion_are_tracked_with_it() -> None:
+    points, views, _ = capture(motions(1.0))
+    moving = [replace(view, motion=motion) for view, motion in zip(views, motions(1.0), strict=True)]
+    assert torch.equal(tracked_views(moving, points).motion, motions(1.0))
+
+
+@pytest.mark.slow
+def test_the_motion_is_stored_with_the_pose() -> None:
+    found, views, _ = refined(motions(1.0))
+    poses, moved = found.tracked.T_world_camera, found.tracked.motion
+    trained = [replace(v, T_ref_camera=poses[i], motion=moved[i]) for i, v in enumerate(views)]
+    cameras = moved_from(views, stored_cameras(trained), found.pixels.tolist())
+    again = at_stored_poses(views, cameras)
+    for one, other in zip(again, trained, strict=True):
+        assert one.motion is not None
+        assert other.motion is not None
+        assert torch.equal(one.motion, other.motion)
+    assert found.consistency is not None
+    noise = found.consistency.noise_before, found.consistency.noise_after
+    lines = pose_sentences(cameras, PoseRefinement(*noise, True))
+    assert len(lines) == 2
+    assert "rolling shutter" in lines[1]
+    metres, radians = (median(moved[:, part].norm(dim=-1).tolist()) for part in (slice(3), slice(3, 6)))
+    assert f"by {metres:.2g} and {degrees(radians):.2g}°" in lines[1]
+
+
+@pytest.mark.slow
+def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, views, _ = capture(motions(1.0), 0.004)
+    monkeypatch.setattr(
+        training_views,
+        "tracked_views",
+        lambda given, features, progress: tracked_views(given, points, progress=progress),
+    )
+    found = training_views.prepared(views)
+    moving = [view.motion is not None and bool(view.motion.any()) for view in found.views]
+    assert sum(moving) >= VIEWS - 1  # an image whose keypoints are all left out keeps its pose
+    assert [camera.motion is not None and any(camera.motion) for camera in found.cameras] == moving
+    assert stored_cameras(views) != found.cameras
+
+
+def test_training_draws_the_rays_of_the_rows() -> None:
+    view = replace(unseen(), motion=motions(1.0)[2], landmarks=None)
+    still = replace(unseen(), landmarks=None)
+    batch = RayBank([still, view], BOUNDS).draw(500, torch.Generator().manual_seed(0))
+    for number, one in enumerate((still, view)):
+        expected = observe(one, all_pixels(one.frame))
+        here = batch.image == number
+        nearest = torch.cdist(batch.rays.directions[here], expected.directions).argmin(1)
+        close = {"rtol": 0.0, "atol": 1e-5}
+        torch.testing.assert_close(batch.rays.directions[here], expected.directions[nearest], **close)
+        torch.testing.assert_close(batch.rays.origins[here], expected.origins[nearest], **close)
+    assert int((batch.image == 1).sum()) > 100
+
+
+def test_an_image_is_rendered_row_by_row() -> None:
+    view, motion = unseen(), motions(2.0)[1]
+    image = render_image(ground(), CAMERA, view.T_ref_camera, BOUNDS, motion=motion)
+    rays = observe(replace(view, motion=motion), all_pixels(view.frame))
+    rendered = render(ground(), BOUNDS.rays(rays.origins, rays.directions), BOUNDS.background)
+    expected = rendered.rgb.clamp(0, 1).reshape_as(image.rgb)
+    torch.testing.assert_close(image.rgb, expected, rtol=0, atol=1e-3)
+    at_rest = render_image(ground(), CAMERA, view.T_ref_camera, BOUNDS)
+    assert float((image.rgb - at_rest.rgb).abs().max()) > 0.1
+    zero = render_image(ground(), CAMERA, view.T_ref_camera, BOUNDS, motion=torch.zeros(6).double())
+    assert torch.equal(zero.rgb, at_rest.rgb)
+
+
+def test_the_columns_of_a_portrait_image_are_the_rows_of_its_sensor() -> None:
+    upright = replace(PINHOLE, cx=PINHOLE.cy, cy=PINHOLE.cx, width=PINHOLE.height, height=PINHOLE.width)
+    points = Points(noise=NOISE)
+    moved = motions(1.0)
+    views = [
+        points.view(looking_in(0.105 * i, 0.3 * (i % 3)), upright, seed=i, motion=moved[i])
+        for i in range(VIEWS)
+    ]
+    assert evidence_prior(tracked_views(views, points)) != STILL
+
+
+@pytest.mark.slow
+def test_a_trial_finds_the_motions_that_the_map_knows() -> None:
+    """If it took the images of moving cameras as still, their keypoints would seem to have large common errors."""
+    count = 48
+    points, moved = Points(noise=NOISE), motions(2.0).repeat(3, 1)
+    poses = [looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(count)]
+    seen = [points.view(T, seed=i, motion=moved[i]) for i, T in enumerate(poses)]
+    views = [replace(view, motion=motion) for view, motion in zip(seen, moved, strict=True)]
+    landmarks = tried_landmarks(tracked_views(views, points), views)
+    assert landmarks.trial.found == 8
+    assert landmarks.trial.rotation_deg < 0.08
+    assert landmarks.correlation < 5
+
+
+def test_landmarks_tell_how_many_of_their_images_moved() -> None:
+    moved = motions(1.0)
+    moved[:4] = 0
+    points, views, true = capture(moved)
+    landmarks = tracked_views(views, points).at(true, moved).landmarks(LandmarkConfig())
+    assert landmarks.moving == 0.75
+    assert landmarks_from_tensors(landmark_tensors(landmarks)).moving == 0.75
+    tensors = landmark_tensors(landmarks)
+    with pytest.raises(ValueError, match=r"moving is 1\.5, expected a fraction"):
+        landmarks_from_tensors(tensors | {"moving": torch.tensor(1.5, dtype=torch.float64)})
+    assert share_moving(landmarks) == 0.75 * SHARE_AS_MAP
+    assert share_moving(replace(landmarks, moving=0.0)) == SHARE_MOVING
+
+
+def test_weaker_motions_are_believed_where_the_map_moved() -> None:
+    """Images whose motion is about as probable as none are judged by either prior probability."""
+    points, views, true = capture(motions(0.35))
+    seen, positions = tracked_views(views, points).at(true).triangulated(LandmarkConfig())
+    taken, sure = {SHARE_MOVING: 0, 0.8: 0}, torch.full((4,), 1e-4, dtype=torch.float64)
+    for number in range(VIEWS):
+        own = (seen.image == number).nonzero()[:, 0]
+        data = observed_at_rest(seen.sightings[own], positions, true[number])
+        fit = resect(data, true[number], NOISE)
+        for share in taken:
+            judged = posterior(
+                data, fit.T_world_rig, NOISE, camera_hypotheses([]), 1.0, GIVEN, sure, share
+            ).with_stated
+            taken[share] += judged.best.motion is Motion.MOVING
+    assert taken[SHARE_MOVING] < taken[0.8]
+
+
+def test_slow_motions_are_taken_from_queries_of_a_moving_map() -> None:
+    moved = motions(0.2)
+    points, views, true = capture(moved)
+    landmarks = tracked_views(views, points).at(true, moved).landmarks(LandmarkConfig())
+    sure = torch.full((4,), 1e-4, dtype=torch.float64)
+    landmarks = replace(landmarks, correlation=1.0, calibration_scatter=sure)
+    seen = {}
+    for share in (0.0, 1.0):
+        matcher = LandmarkMatcher(replace(landmarks, moving=share))
+        found = [propose(matcher, [View(v.frame, SE3.identity())], points) for v in views]
+        assert all(pose is not None for pose in found)
+        seen[share] = sum(pose is not None and pose.has_motion for pose in found)
+    assert seen[1.0] > seen[0.0] > 0

@@ -1,0 +1,274 @@
+"""Poses that contradict their images: which mistakes are recognised, and what is never mistaken for one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
+from torch import Tensor
+
+from bidnerf_core import SE3, InputError, register
+from bidnerf_core.captures import pose_contradiction, prepared
+from bidnerf_core.captures.pose_conventions import PoseContradiction
+from bidnerf_core.captures.pose_readings import AS_GIVEN, Y_AND_Z_REVERSED, readings, signed_permutations
+from bidnerf_core.mapping import ImageKeypoints, posed_keypoints
+from landmark_scene import Points, looking_in, ring
+
+REVERSED = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+CYCLED = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+
+
+def images(points: Points, poses: list[SE3]) -> list[ImageKeypoints]:
+    """The keypoints of a ring of cameras, with other ``poses`` than the true ones."""
+    views = ring(points, len(poses))
+    found = posed_keypoints(views, points)
+    return [replace(image, T_ref_camera=T) for image, T in zip(found, poses, strict=True)]
+
+
+def true_poses(count: int = 14) -> list[SE3]:
+    return [view.T_ref_camera for view in ring(Points(), count)]
+
+
+def with_axes(T: SE3, axes: Tensor) -> SE3:
+    return SE3(T.rotation @ axes, T.translation)
+
+
+def judged(poses: list[SE3], noise: float = 0.4, outliers: float = 0.2) -> PoseContradiction | None:
+    return pose_contradiction(images(Points(noise=noise, outliers=outliers), poses))
+
+
+def test_right_poses_are_in_the_expected_convention() -> None:
+    assert judged(true_poses()) is None
+
+
+def test_axes_of_opengl_are_recognised() -> None:
+    found = judged([with_axes(T, REVERSED) for T in true_poses()])
+    assert found is not None
+    assert found.reading is not None
+    assert (found.reading.axes, found.reading.inverted) == (Y_AND_Z_REVERSED, False)
+    assert found.agreeing == found.pairs
+    assert found.agreeing_as_given < 0.3 * found.pairs
+    assert "diag(1, -1, -1, 1)" in found.sentence
+
+
+@pytest.mark.parametrize("axes", [torch.eye(3, dtype=torch.float64), REVERSED])
+def test_inverse_matrices_are_recognised(axes: Tensor) -> None:
+    found = judged([with_axes(T, axes).inverse() for T in true_poses()])
+    assert found is not None
+    assert found.reading is not None
+    assert found.reading.inverted
+    assert "inverses" in found.sentence
+
+
+def test_permuted_axes_are_named() -> None:
+    found = judged([with_axes(T, CYCLED) for T in true_poses()])
+    assert found is not None
+    assert found.reading is not None
+    assert not found.reading.inverted
+    # The given camera looks along the true one's x axis, so the true one's right is its forward.
+    assert "right, down and forward are the given ones' forward, right and down" in found.sentence
+    axes = torch.tensor(found.reading.axes, dtype=torch.float64)
+    assert torch.equal(CYCLED @ axes, torch.eye(3, dtype=torch.float64))
+
+
+def test_a_moved_world_changes_nothing() -> None:
+    T = SE3.exp(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.1, 2.0], dtype=torch.float64))
+    assert judged([T @ pose for pose in true_poses()]) is None
+    found = judged([T @ with_axes(pose, REVERSED) for pose in true_poses()])
+    assert found is not None
+    assert found.reading is not None
+    assert found.reading.axes == Y_AND_Z_REVERSED
+
+
+def test_a_few_wrong_poses_are_accepted_and_random_ones_refused_without_a_reading() -> None:
+    generator = torch.Generator().manual_seed(0)
+    some = true_poses()
+    some[3], some[8] = with_axes(some[3], REVERSED), with_axes(some[8], CYCLED)
+    assert judged(some) is None
+    tangents = 2 * torch.randn(14, 6, dtype=torch.float64, generator=generator)
+    found = judged([SE3.exp(tangent) for tangent in tangents])
+    assert found is not None
+    assert found.reading is None
+    assert f"agree with the keypoints of {found.agreeing_as_given} of {found.pairs}" in found.sentence
+
+
+def test_few_images_tell_nothing() -> None:
+    assert judged([with_axes(T, REVERSED) for T in true_poses(4)]) is None
+
+
+def looking_at(centre: list[float], target: list[float]) -> SE3:
+    """A camera with a level x axis, where y points down."""
+    place, aim = torch.tensor(centre, dtype=torch.float64), torch.tensor(target, dtype=torch.float64)
+    z = (aim - place) / (aim - place).norm()
+    x = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), z)
+    x = x / x.norm()
+    return SE3(torch.stack([x, torch.linalg.cross(z, x), z], dim=-1), place)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_right_poses_before_a_wall_are_not_refused(seed: int) -> None:
+    """Two rotations fit the images of a plane, so rotations alone would contradict right poses."""
+    points = Points(count=600, noise=0.4, outliers=0.1)
+    points.positions[:, 2] = 0
+    places = [-2 + 0.3 * i for i in range(14)]
+    poses = [looking_at([x, -0.3, -3.0], [0.5 * x + 1, 0.0, 0.0]) for x in places]
+    views = [points.view(T, seed=14 * seed + i) for i, T in enumerate(poses)]
+    seen = posed_keypoints(views, points)
+    assert pose_contradiction(seen) is None
+    found = pose_contradiction(
+        [replace(image, T_ref_camera=with_axes(T, REVERSED)) for image, T in zip(seen, poses, strict=True)]
+    )
+    assert found is None or found.reading is None or found.reading.axes == Y_AND_Z_REVERSED
+
+
+@pytest.mark.parametrize("axes", [torch.eye(3, dtype=torch.float64), REVERSED])
+def test_inverse_matrices_of_cameras_on_one_level_are_not_called_axes(axes: Tensor) -> None:
+    """Cameras that turn about one axis only: other axes explain their rotations as well as the inverses do."""
+    points = Points(noise=0.4)
+    poses = [looking_in(0.105 * i, 0.0) for i in range(14)]
+    views = [points.view(T, seed=i) for i, T in enumerate(poses)]
+    seen = posed_keypoints(views, points)
+    found = pose_contradiction(
+        [
+            replace(image, T_ref_camera=with_axes(T, axes).inverse())
+            for image, T in zip(seen, poses, strict=True)
+        ]
+    )
+    assert found is not None
+    assert found.reading is not None
+    assert found.reading.inverted
+
+
+def test_pure_rotation_and_pure_translation_are_not_refused() -> None:
+    points = Points(noise=0.4)
+    start = looking_in(0.0)
+    for step in ([0, 0, 0, 0, 0.02, 0], [0.05, 0, 0, 0, 0, 0], [0, 0, 0.05, 0, 0, 0]):
+        poses = [start @ SE3.exp(i * torch.tensor(step, dtype=torch.float64)) for i in range(14)]
+        views = [points.view(T, seed=i) for i, T in enumerate(poses)]
+        assert pose_contradiction(posed_keypoints(views, points)) is None
+
+
+def test_images_that_share_nothing_tell_nothing() -> None:
+    found = images(Points(), [with_axes(T, REVERSED) for T in true_poses()])
+    generator = torch.Generator().manual_seed(0)
+    blind = [
+        replace(
+            image,
+            keypoints=replace(
+                image.keypoints,
+                descriptors=torch.randint(
+                    0, 256, image.keypoints.descriptors.shape, generator=generator, dtype=torch.uint8
+                ),
+            ),
+        )
+        for image in found
+    ]
+    assert pose_contradiction(blind) is None
+    assert pose_contradiction([]) is None
+
+
+def opengl(change: Callable[[SE3], SE3]) -> Callable[[SE3], SE3]:
+    """A change of matrices in a file whose y and z axes a reader reverses."""
+    return lambda T: with_axes(change(with_axes(T, REVERSED)), REVERSED)
+
+
+def reordered(T: SE3, order: list[int]) -> SE3:
+    quaternion = rotation_matrix_to_quaternion(T.rotation.contiguous())
+    return SE3(quaternion_to_rotation_matrix(quaternion[:, order]), T.translation)
+
+
+def mirrored(T: SE3, signs: list[float]) -> SE3:
+    S = torch.diag(torch.tensor(signs, dtype=torch.float64))
+    return SE3(S @ T.rotation @ S, T.translation @ S)
+
+
+def positions(T: SE3, *factors: float) -> SE3:
+    return SE3(T.rotation, T.translation * torch.tensor(factors, dtype=torch.float64))
+
+
+WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
+    "transposed": (opengl(lambda T: SE3(T.rotation.mT, T.translation)), "transpose the upper left 3x3"),
+    "half an inverse": (opengl(lambda T: SE3(T.rotation, T.inverse().translation)), "-R t"),
+    "no minus": (opengl(lambda T: SE3(T.rotation.mT, -T.inverse().translation)), "lack the minus"),
+    "negated": (lambda T: positions(T, -1, -1, -1), "by -1"),
+    "x reversed": (lambda T: positions(T, -1, 1, 1), "x of their positions is reversed"),
+    "z doubled": (lambda T: positions(T, 1, 1, 2), "diag(1, 1, 0.5)"),
+    "swapped": (lambda T: SE3(T.rotation, T.translation[:, [0, 2, 1]]), "the given ones' x, z, y"),
+    "quaternions": (lambda T: reordered(T, [1, 2, 3, 0]), "x y z w, but w x y z"),
+    "quaternions of COLMAP": (lambda T: reordered(T.inverse(), [1, 2, 3, 0]).inverse(), "quaternions"),
+    "Unity": (opengl(lambda T: mirrored(T, [1, 1, -1])), "from both sides by diag(1, 1, -1, 1)"),
+    "next image": (lambda T: T[[*range(1, 14), 13]], "that of the next image"),
+    "text order": (lambda T: T[sorted(range(14), key=str)], "text order"),
+    "reverse": (lambda T: T[list(range(14))[::-1]], "reverse order"),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_mistakes_are_refused_with_the_remedy_that_works(mistake: str) -> None:
+    change, words = WRONG[mistake]
+    truth = SE3.stack(irregular_poses())
+    given = change(truth)
+    found = pose_contradiction(seen_from(truth, given))
+    assert found is not None
+    assert found.reading is not None
+    assert words in found.sentence
+    assert found.agreeing >= 0.9 * found.pairs
+    corrected = found.reading.understand(given)
+    known = corrected.translation.isfinite().all(-1)
+    assert (
+        pose_contradiction([x for x, there in zip(seen_from(truth, corrected), known, strict=True) if there])
+        is None
+    )
+
+
+def irregular_poses(count: int = 14) -> list[SE3]:
+    """Cameras that look at the points from places on no ring, so that no two mistakes look alike."""
+    generator = torch.Generator().manual_seed(4)
+    shifts = 0.25 * torch.randn(count, 6, dtype=torch.float64, generator=generator)
+    shifts[:, 3:] *= 0.3
+    return [looking_in(0.12 * i, 0.15 * (-1) ** i) @ SE3.exp(shifts[i]) for i in range(count)]
+
+
+def seen_from(truth: SE3, given: SE3) -> list[ImageKeypoints]:
+    """The keypoints of images from true poses, with given ones."""
+    points = Points(noise=0.4, outliers=0.1)
+    found = posed_keypoints([points.view(truth[i], seed=i) for i in range(len(truth.translation))], points)
+    return [replace(image, T_ref_camera=given[i]) for i, image in enumerate(found)]
+
+
+def test_images_in_no_order_are_judged_as_well() -> None:
+    """Neither order nor wrong poses propose pairs that show the same; the images do."""
+    points = Points(noise=0.4, outliers=0.1)
+    poses = [view.T_ref_camera for view in ring(points, 40)]
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(1)).tolist()
+    views = [points.view(poses[i], seed=i) for i in order]
+    found = posed_keypoints(views, points)
+    assert pose_contradiction(found) is None
+    mixed = [replace(image, T_ref_camera=found[(7 * i) % 40].T_ref_camera) for i, image in enumerate(found)]
+    contradiction = pose_contradiction(mixed)
+    assert contradiction is not None
+    assert contradiction.agreeing_as_given < 0.5 * contradiction.pairs
+
+
+def test_every_reading_has_words_and_moves_with_the_world() -> None:
+    T = SE3.stack(irregular_poses())
+    for reading in readings(14):
+        assert reading.clause
+        assert reading.remedy
+        assert reading.understand(T).rotation.shape == (14, 3, 3)
+    assert len(signed_permutations(1)) == len(set(signed_permutations(1))) == 24
+    assert AS_GIVEN in signed_permutations(1)
+    assert AS_GIVEN not in signed_permutations(-1)
+
+
+def test_training_refuses_contradicting_poses_unless_they_are_trusted() -> None:
+    points = Points(noise=0.4)
+    views = ring(points, 14)
+    register("features", "points", points)
+    wrong = [replace(view, T_ref_camera=view.T_ref_camera.inverse()) for view in views]
+    with pytest.raises(InputError, match=r"contradict the photos.*inverses.*--trust-poses"):
+        prepared(wrong, features="points")
+    assert prepared(wrong, "never", features="points", trust_poses=True).cameras

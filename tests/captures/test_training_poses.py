@@ -1,0 +1,204 @@
+"""Refinement of training poses: known errors are taken back, right poses stay, and a wrong one is found and put right."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core import SE3, View
+from bidnerf_core.captures import (
+    PoseRefinement,
+    as_given,
+    at_stored_poses,
+    moved_cameras,
+    pose_sentences,
+    stored_cameras,
+)
+from bidnerf_core.captures.cameras import moved_from
+from bidnerf_core.captures.pose_refinement import adjusted_poses
+from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.mapping import LandmarkConfig, Sift, tracked_views
+from landmark_scene import Points, looking_in, ring
+
+VIEWS, WRONG = 16, 7
+METRES, RADIANS = 0.01, 0.004  # together about two pixels
+
+
+def errors(scale: float = 1.0) -> Tensor:
+    size = scale * torch.tensor([METRES] * 3 + [RADIANS] * 3, dtype=torch.float64)
+    return size * torch.randn(VIEWS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+
+
+def capture(noise: float, updates: Tensor) -> tuple[Points, list[View], SE3]:
+    """Views whose given poses are off by right updates, and the true poses."""
+    points = Points(noise=noise)
+    true = ring(points, VIEWS)
+    poses = SE3.stack([view.T_ref_camera for view in true])
+    given = poses.retract(updates)
+    named = [
+        replace(v, frame=replace(v.frame, name=f"{i}"), T_ref_camera=given[i]) for i, v in enumerate(true)
+    ]
+    return points, named, poses
+
+
+def refined(noise: float, updates: Tensor, least: float = 0.25) -> tuple[TrainingPoses, list[View], SE3]:
+    points, views, poses = capture(noise, updates)
+    return training_poses(tracked_views(views, points), views, least), views, poses
+
+
+@functools.cache
+def inaccurate() -> tuple[TrainingPoses, list[View], SE3]:
+    return refined(0.4, errors())
+
+
+def off(found: SE3, true: SE3) -> Tensor:
+    """The rotation (radians) of each pose relative to the one before, which no common motion changes."""
+    steps = [T[:-1].inverse() @ T[1:] for T in (found, true)]
+    return (steps[1].inverse() @ steps[0]).log()[:, 3:].norm(dim=-1)
+
+
+def test_exact_poses_do_not_move_at_all() -> None:
+    found, views, _ = refined(0.0, torch.zeros(VIEWS, 6, dtype=torch.float64), least=0.0)
+    moved = torch.cat(
+        [(found.tracked.T_world_camera[i].inverse() @ v.T_ref_camera).log() for i, v in enumerate(views)]
+    )
+    assert float(moved.abs().max()) < 1e-5  # the keypoints are float32
+    assert found.consistency is not None
+    assert found.consistency.inconsistency == pytest.approx(0, abs=1e-3)
+
+
+def test_poses_that_fit_are_kept() -> None:
+    found, views, _ = refined(0.4, torch.zeros(VIEWS, 6, dtype=torch.float64))
+    assert not found.refined
+    assert found.replaced == []
+    for i, view in enumerate(views):
+        assert torch.equal(found.tracked.T_world_camera[i].matrix(), view.T_ref_camera.matrix())
+    assert found.consistency is not None
+    assert found.consistency.inconsistency < 0.15
+
+
+def test_known_errors_are_taken_back() -> None:
+    found, views, true = inaccurate()
+    given = SE3.stack([view.T_ref_camera for view in views])
+    assert found.refined
+    assert found.consistency is not None
+    assert found.consistency.inconsistency > 0.5
+    assert found.consistency.noise_after == pytest.approx(0.4, rel=0.2)
+    assert float(off(found.tracked.T_world_camera, true).median()) < 0.4 * float(off(given, true).median())
+    assert 0.5 < float(found.pixels.median()) < 4
+    motion = found.tracked.T_world_camera.translation - given.translation
+    assert float(motion.mean(0).norm()) < 0.2 * float(motion.norm(dim=-1).median())
+
+
+def test_half_of_the_error_is_half_of_the_motion() -> None:
+    whole, half = (refined(0.0, errors(scale), least=0.0)[0].pixels.median() for scale in (0.5, 0.25))
+    assert float(half) == pytest.approx(0.5 * float(whole), rel=0.2)
+
+
+@pytest.mark.parametrize("turn", [0.2, torch.pi])
+def test_a_wrong_pose_is_put_right_and_the_others_are_kept(turn: float) -> None:
+    updates = torch.zeros(VIEWS, 6, dtype=torch.float64)
+    updates[WRONG] = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.0, turn], dtype=torch.float64)
+    found, _, true = refined(0.4, updates)
+    assert found.replaced == [WRONG]
+    assert not found.refined
+    again = found.tracked.matched_anew(LandmarkConfig())  # as a resumed training matches them
+    assert torch.equal(found.tracked.observations.point, again.observations.point)
+    poses = found.tracked.T_world_camera
+    translation, rotation = (true[WRONG].inverse() @ poses[WRONG]).log().split(3)
+    assert float(translation.norm()) < 0.02
+    assert float(rotation.norm()) < 0.005
+    assert float(found.pixels[WRONG]) > 20
+    kept = [i for i in range(VIEWS) if i != WRONG]
+    assert torch.equal(poses[kept].matrix(), true[kept].matrix())
+    assert float(found.pixels[kept].max()) == 0
+
+
+def test_a_wrong_pose_among_inaccurate_ones() -> None:
+    updates = errors(0.5)
+    updates[WRONG] = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.2, 0.0], dtype=torch.float64)
+    found, _, true = refined(0.4, updates)
+    assert found.replaced == [WRONG]
+    assert found.refined
+    assert float((true[WRONG].inverse() @ found.tracked.T_world_camera[WRONG]).log()[:3].norm()) < 0.04
+
+
+def test_too_few_images_are_left_alone() -> None:
+    points = Points()
+    views = ring(points, 3)
+    tracked = tracked_views(views, points)
+    assert adjusted_poses(tracked, LandmarkConfig()) is None
+    found = training_poses(tracked, views)
+    assert (found.refined, found.consistency, found.replaced) == (False, None, [])
+
+
+def test_nothing_in_common_leaves_the_poses_alone() -> None:
+    points = Points()
+    views = [points.view(looking_in(0.1 * i)) for i in range(12)]
+    blank = [
+        replace(view, frame=replace(view.frame, rgb=torch.full_like(view.frame.rgb, 12.0))) for view in views
+    ]
+    points.seen.append(points.seen[0][torch.zeros(0, dtype=torch.long)])
+    found = training_poses(tracked_views(blank, points), blank)
+    assert (found.refined, found.consistency, found.replaced) == (False, None, [])
+
+
+def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
+    found, views, _ = inaccurate()
+    poses = found.tracked.T_world_camera
+    moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
+    cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())
+    assert as_given(cameras) == stored_cameras(views)
+    again = at_stored_poses(views, cameras)
+    assert all(
+        torch.equal(a.T_ref_camera.matrix(), b.T_ref_camera.matrix())
+        for a, b in zip(again, moved, strict=True)
+    )
+    others = at_stored_poses(moved, cameras)  # other poses than the dataset's are those of another dataset
+    assert all(a.T_ref_camera is b.T_ref_camera for a, b in zip(others, moved, strict=True))
+    update = (views[3].T_ref_camera.inverse() @ poses[3]).log()
+    camera = moved_cameras(cameras)[3]
+    assert camera.name == views[3].frame.name
+    assert camera.translation == pytest.approx(float(update[:3].norm()))
+    assert camera.rotation_deg == pytest.approx(float(update[3:].norm().rad2deg()))
+    assert found.consistency is not None
+    found_noise = found.consistency.noise_before, found.consistency.noise_after
+    (line,) = pose_sentences(cameras, PoseRefinement(*found_noise, True))
+    worst = max(range(VIEWS), key=lambda i: float(found.pixels[i]))
+    assert f"{views[worst].frame.name} most" in line
+
+
+def test_cameras_that_did_not_move_have_one_pose() -> None:
+    views = ring(Points(), 4)
+    cameras = moved_from(views, stored_cameras(views), [0.0] * 4)
+    assert cameras == stored_cameras(views)
+    assert moved_cameras(cameras) == []
+    (line,) = pose_sentences(cameras, PoseRefinement(0.3, 0.3, True))
+    assert line.endswith("the poses are kept")
+
+
+# Recorded scenes
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "refined"), [("room_living", False), ("tum_fr1_xyz", True)])
+def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
+    data_dir: Path, scene: str, refined: bool
+) -> None:
+    views = open_dataset(data_dir / scene).views("train")[:24]
+    features = Sift(count=500)
+    found = training_poses(tracked_views(views, features), views)
+    assert found.refined == refined
+    assert found.consistency is not None
+    if refined:
+        assert found.consistency.noise_after < 0.7 * found.consistency.noise_before
+        assert 0.3 < float(found.pixels.median()) < 2
+    else:
+        assert found.consistency.inconsistency < 0.1

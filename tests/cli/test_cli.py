@@ -1,0 +1,1143 @@
+"""The command line: what it prints, what it says of bad input, and that it leaves nothing half-made behind."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import json
+import math
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import tiny
+from bidnerf_core.backend import load_backend
+from bidnerf_core.cli import COMMANDS, main
+from bidnerf_core.cli.progress import Display
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets.transforms import TransformsDataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization import METHODS
+from bidnerf_core.maps import MapInfo, load_info, load_map
+from bidnerf_core.maps.checkpoints import Checkpoints
+from bidnerf_core.registry import list_plugins
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.training import TrainingStep
+from commands import CommandResult, Run
+
+LOCALIZE_KEYS = {
+    "frame", "T_world_camera", "converged", "outcome", "reason", "steps", "seconds", "covariance", "loss", "backend",
+    "method", "focal_factor", "intrinsics", "confidence", "error", "unit",
+}  # fmt: skip
+QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
+Edit = Callable[[Path], None]
+
+
+@pytest.fixture
+def interrupted(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A map whose training was stopped half-way."""
+    with monkeypatch.context() as patch:
+        stop_at(patch, tiny.STEPS // 2)
+        assert main(["train", str(shared / "data"), "--out", str(tmp_path / "half"), *tiny.options()]) == 130
+    return tmp_path / "half"
+
+
+def stop_at(patch: pytest.MonkeyPatch, number: int) -> None:
+    """Ctrl-C during that step of the next training."""
+    told = Checkpoints.step
+
+    def step(self: Checkpoints, now: Any) -> None:
+        if now.step == number:
+            signal.raise_signal(signal.SIGINT)
+        told(self, now)
+
+    patch.setattr(Checkpoints, "step", step)
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    files = sorted(folder.rglob("*"))
+    return {str(f.relative_to(folder)): f.read_bytes() if f.is_file() else None for f in files}
+
+
+def assert_refused(outcome: CommandResult, status: int, *fragments: str) -> None:
+    """One line, which names what is at fault."""
+    assert outcome.status == status, outcome
+    assert outcome.out == ""
+    assert outcome.err.count("\n") == 1, outcome.err
+    assert outcome.err.startswith("bidnerf ")
+    for fragment in fragments:
+        assert fragment in outcome.err
+
+
+@pytest.mark.parametrize(("samples", "shown"), [(math.nan, ""), (31.5, "  31.5 samples per ray")])
+def test_a_line_of_progress_leaves_out_what_the_recipe_does_not_tell(
+    samples: float, shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = MapInfo("fog", {}, demo_object().bounds, 0, complete=False)
+    with Display() as display:
+        Checkpoints(info, progress=display).step(TrainingStep(5, 5, 0.25, 6.0, samples))
+    line = f"training: 5/5 steps, loss 0.25000  PSNR 6.00 dB{shown}, 0 s left\n"
+    assert capsys.readouterr().err == line
+
+
+# Datasets that cannot be used.
+
+
+def of_json(change: Callable[[dict[str, Any]], None]) -> Edit:
+    def edit(folder: Path) -> None:
+        path = folder / "transforms.json"
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return edit
+
+
+def of_matrix(change: Callable[[list[list[float]]], None]) -> Edit:
+    return of_json(lambda content: change(content["frames"][1]["transform_matrix"]))
+
+
+def set_entry(row: int, column: int, value: float) -> Edit:
+    return of_matrix(lambda matrix: matrix[row].__setitem__(column, value))
+
+
+def mirror(matrix: list[list[float]]) -> None:
+    matrix[0] = [-x for x in matrix[0]]
+
+
+def empty(folder: Path) -> None:
+    for file in folder.rglob("*.*"):
+        file.unlink()
+
+
+def resize(name: str, shape: tuple[int, ...]) -> Edit:
+    kind = np.uint8 if len(shape) == 3 else np.uint16
+    return lambda folder: iio.imwrite(folder / name, np.zeros(shape, kind))
+
+
+def cut(name: str) -> Edit:
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:60])
+
+
+IMAGE, DEPTH = "images/r_0001.png", "depth/r_0001.png"
+BAD_DATA: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "no folder": (shutil.rmtree, ("no such folder",)),
+    "empty folder": (
+        empty,
+        ("contains no photos and is no dataset", "docs/datasets.md: transforms, tum,"),
+    ),
+    "a file": (
+        lambda folder: (folder.rename(f"{folder}.away"), folder.touch())[1],
+        ("is a file", "expected"),
+    ),
+    "broken JSON": (
+        lambda folder: (folder / "transforms.json").write_text('{"frames": [') and None,
+        (
+            "transforms.json: not JSON",
+            "at line 1",
+        ),
+    ),
+    "a list": (
+        lambda folder: (folder / "transforms.json").write_text("[]") and None,
+        ("transforms.json: holds []", "expected a JSON object"),
+    ),
+    "no frames": (of_json(lambda content: content.update(frames=[])), ("frames is empty", "expected a list")),
+    "no images": (lambda folder: shutil.rmtree(folder / "images"), ("images/r_", "expected that file")),
+    "truncated image": (cut(IMAGE), (IMAGE, "expected a complete image file")),
+    "image of another size": (resize(IMAGE, (8, 9, 3)), ("r_0001.png is 9x8, expected 24x24",)),
+    "truncated depth": (cut(DEPTH), (DEPTH, "expected a complete image file")),
+    "depth of another shape": (resize(DEPTH, (8, 9)), (DEPTH, "is 9x8, but its image is 24x24")),
+    "depth in colours": (resize(DEPTH, (24, 24, 3)), (DEPTH, "expected one channel")),
+    "mirrored pose": (of_matrix(mirror), ("frame 1", "mirror image", "expected a rigid transform")),
+    "bad last row": (set_entry(3, 3, -2.0), ("frame 1", "last row", "expected [0, 0, 0, 1]")),
+    "focal length zero": (
+        of_json(lambda content: content.update(fl_x=0)),
+        ("fl_x is 0, expected a positive number of pixels",),
+    ),
+    "no such split": (
+        of_json(lambda content: content.pop("train_filenames")),
+        ("no split 'train'", "expected one of"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_DATA)
+def test_a_dataset_that_cannot_be_used_is_told_in_a_line(
+    case: str, bidnerf: Run, data: Path, tmp_path: Path
+) -> None:
+    edit, fragments = BAD_DATA[case]
+    edit(data)
+    before = contents(tmp_path)
+    outcome = bidnerf("train", data, "--out", tmp_path / "new" / "map", *tiny.options())
+    assert_refused(outcome, 1, "bidnerf train: ", str(data), *fragments)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("case", ["truncated image", "truncated depth", "depth of another shape"])
+@pytest.mark.parametrize("command", ["localize", "render"])
+def test_the_frames_that_are_asked_for_are_judged_and_no_others(
+    case: str, command: str, bidnerf: Run, shared: Path, data: Path, tmp_path: Path
+) -> None:
+    edit, fragments = BAD_DATA[case]
+    edit(data)
+    where = ["--out", tmp_path / "out"] if command == "render" else QUICK
+    arguments = [command, shared / "map", data, "--split", "train", *where, "--frame"]
+    assert_refused(bidnerf(*arguments, "r_0000", "r_0001"), 1, *fragments)
+    assert not (tmp_path / "out").exists()
+    assert bidnerf(*arguments, "r_0000").status == 0
+
+
+def test_without_depth_colour_alone_is_used_and_that_is_said(bidnerf: Run, tmp_path: Path) -> None:
+    data = tiny.write_dataset(tmp_path / "data", depth=False)
+    trained = bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2))
+    assert trained.status == 0
+    assert [line for line in trained.err.splitlines() if "colour only" in line] == [
+        f"{data}: no measured depth in split 'train'; training on colour only"
+    ]
+    found = bidnerf("localize", tmp_path / "map", data, *QUICK, "--frame", "t_0000", "t_0001")
+    assert found.status == 0
+    assert found.err == "t_0000, t_0001: no measured depth; colour only\n"
+
+
+def test_values_that_are_no_depth_are_mentioned_once(
+    bidnerf: Run, shared: Path, data: Path, tmp_path: Path
+) -> None:
+    for file in sorted((data / "depth").glob("t_*.png")):
+        depth = iio.imread(file)
+        depth[0, :3] = 65535
+        iio.imwrite(file, depth)
+    outcome = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
+    assert outcome.status == 0
+    assert outcome.err == (
+        f"bidnerf render: {data}/depth/t_0000.png: depth: treated as not measured: 3 x 65535, here and in the images that"
+        " follow\n"
+    )
+
+
+# Names that do not exist.
+
+
+def test_names_that_do_not_exist_are_told_with_those_that_do(
+    bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    data, place = shared / "data", shared / "map"
+    train = ["train", data, "--out", tmp_path / "out"]
+    known = ", ".join(sorted(info.name for info in list_plugins("backends")))
+    assert_refused(
+        bidnerf(*train, "--backend", "hashgird"), 1, "'hashgird'", "mean 'hashgrid'", f"installed: {known}"
+    )
+    assert_refused(bidnerf("demo", "--backend", "x", "--out", tmp_path / "out"), 1, "'x'", known)
+    assert_refused(bidnerf(*train, "--split", "trian"), 1, str(data), "no split 'trian'", "train, test")
+    assert_refused(bidnerf(*train, "--background", "pink"), 2, "'pink'", 'expected "white"')
+    localize = ["localize", place, data, *QUICK]
+    assert_refused(bidnerf(*localize, "--frame", "t_001"), 1, str(data), "'t_001'", "mean 't_0001'")
+    assert_refused(
+        bidnerf("localize", place, data, "--frame", "t_0001", "--no-start", "--method", "x"), 2, "'x'"
+    )
+    render = ["render", place, data, "--out", tmp_path / "out"]
+    assert_refused(bidnerf(*render, "--frame", "r_0000"), 1, str(data), "split 'test'", "'r_0000'")
+    assert_refused(bidnerf(*render, "--level", "2"), 1, str(place), "no level 2, expected 0 to 1")
+    assert_refused(bidnerf(*render, "--level", "-1"), 1, str(place), "no level -1, expected 0 to 1")
+    assert list(tmp_path.iterdir()) == []
+
+
+# Maps that cannot be used.
+
+
+def of_description(change: Callable[[dict[str, Any]], Any]) -> Edit:
+    def edit(folder: Path) -> None:
+        content = json.loads((folder / "map.json").read_text())
+        change(content)
+        (folder / "map.json").write_text(json.dumps(content))
+
+    return edit
+
+
+def of_weights(change: Callable[[dict[str, torch.Tensor]], Any]) -> Edit:
+    def edit(folder: Path) -> None:
+        path = folder / load_info(folder).weights
+        tensors = load_file(path)
+        change(tensors)
+        save_file(tensors, path)
+
+    return edit
+
+
+def cut_weights(folder: Path) -> None:
+    path = folder / load_info(folder).weights
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def add_setting(name: str, value: object) -> Edit:
+    return of_description(lambda content: content["config"].update({name: value}))
+
+
+def into_a_file(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.write_text("x")
+
+
+BIAS = "geometry.0.bias"
+BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "no folder": (shutil.rmtree, ("no such folder", "expected a map")),
+    "empty folder": (
+        empty,
+        ("no map.json found", "expected a map as written by 'bidnerf train'"),
+    ),
+    "another version": (
+        of_description(lambda content: content.update(version=99)),
+        ("map.json", "version 99, expected 1", "by a newer bidnerf; upgrade bidnerf"),
+    ),
+    "an older version": (
+        of_description(lambda content: content.update(version=0)),
+        ("map.json", "version 0, expected 1", "retrain the map"),
+    ),
+    "a file": (
+        into_a_file,
+        ("is a file, expected a map: a folder",),
+    ),
+    "another format": (
+        of_description(lambda content: content.update(format="x")),
+        ("map.json", 'expected "format": "bidnerf map"'),
+    ),
+    "broken JSON": (
+        lambda folder: (folder / "map.json").write_text("{") and None,
+        ("map.json", "not JSON", "expected the description of a map"),
+    ),
+    "deep JSON": (
+        lambda folder: (folder / "map.json").write_text("[" * 100_000) and None,
+        ("map.json", "not JSON"),
+    ),
+    "missing field": (
+        of_description(lambda content: content.pop("bounds")),
+        ("map.json", "'bounds' missing", "expected all fields of MapInfo"),
+    ),
+    "unknown setting": (add_setting("widht", 3), ("map.json: config", "no field 'widht'", "mean 'width'")),
+    "setting of another type": (add_setting("width", "big"), ("config: width", "'big'", "expected int")),
+    "setting out of range": (add_setting("width", 0), ("map.json: config", "width is 0, expected 1 to")),
+    "setting that cannot be built": (
+        of_description(lambda content: content["config"]["encoding"].update(log2_table_size=99)),
+        ("map.json", "log2_table_size is 99, expected 1 to 30"),
+    ),
+    "bounds inside out": (
+        of_description(lambda content: content["bounds"].update(lower=[9, 9, 9])),
+        ("map.json: bounds", "is not below upper corner"),
+    ),
+    "bounds that are no numbers": (
+        of_description(lambda content: content["bounds"].update(far=math.nan)),
+        ("map.json: bounds: far", "nan", "expected float"),
+    ),
+    "unknown backend": (
+        of_description(lambda content: content.update(backend="hashgird")),
+        ("'hashgird'", "installed: ", "hashgrid"),
+    ),
+    "missing weights": (
+        lambda folder: (folder / load_info(folder).weights).unlink(),
+        ("weights-", "no such file, expected a safetensors file, without which the map is incomplete"),
+    ),
+    "weights elsewhere": (
+        of_description(lambda content: content.update(weights="../x.safetensors")),
+        ("'../x.safetensors'", "expected the name of a file next to it"),
+    ),
+    "corrupt weights": (cut_weights, ("weights-", "expected a safetensors file")),
+    "weight of another shape": (
+        of_weights(lambda tensors: tensors.update({BIAS: torch.zeros(3)})),
+        ("weights-", f"'{BIAS}' has shape [3], expected [16]"),
+    ),
+    "weight missing": (
+        of_weights(lambda tensors: tensors.pop(BIAS)),
+        ("weights-", f"no tensor '{BIAS}', expected one of shape [16]"),
+    ),
+    "weight too many": (
+        of_weights(lambda tensors: tensors.update(more=torch.zeros(3))),
+        ("weights-", "'more' is not part of the field"),
+    ),
+    "NaN in a weight": (
+        of_weights(lambda tensors: tensors.update({BIAS: torch.full((16,), math.nan)})),
+        ("weights-", f"'{BIAS}' holds NaN", "expected trained weights"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_MAPS)
+def test_a_map_that_cannot_be_used_is_told_in_a_line(
+    case: str, bidnerf: Run, shared: Path, map_folder: Path, tmp_path: Path
+) -> None:
+    edit, fragments = BAD_MAPS[case]
+    edit(map_folder)
+    before = contents(tmp_path)
+    named = (str(map_folder), *fragments)
+    assert_refused(bidnerf("info", map_folder), 1, "bidnerf info: ", *named)
+    render = bidnerf("render", map_folder, shared / "data", "--out", tmp_path / "out")
+    assert_refused(render, 1, "bidnerf render: ", *named)
+    localize = bidnerf("localize", map_folder, shared / "data", "--frame", "t_0000", *QUICK)
+    assert_refused(localize, 1, "bidnerf localize: ", *named)
+    assert contents(tmp_path) == before
+
+
+def test_what_cannot_be_resumed_is_told_in_a_line(
+    bidnerf: Run, shared: Path, interrupted: Path, tmp_path: Path
+) -> None:
+    data = shared / "data"
+    before = contents(interrupted)
+    resume = ["train", data, "--resume", "--out"]
+    nowhere = bidnerf(*resume, tmp_path / "nowhere")
+    assert_refused(nowhere, 1, str(tmp_path / "nowhere"), "nothing to resume, train without --resume")
+    complete = bidnerf(*resume, shared / "map", "--no-bake")
+    assert_refused(complete, 1, "training is complete (12 steps), nothing to resume")
+    other = tiny.write_dataset(tmp_path / "other", train=5)
+    assert_refused(
+        bidnerf("train", other, "--resume", "--out", interrupted), 1, str(other), "expected those of"
+    )
+    assert_refused(bidnerf(*resume, interrupted, "--split", "test"), 1, "'test'", "expected those of 'data'")
+    assert_refused(bidnerf(*resume, interrupted, "--steps", "99"), 2, "started with steps 12, got 99")
+    assert_refused(bidnerf(*resume, interrupted, "--overwrite"), 2, "expected only one of them")
+    assert_refused(
+        bidnerf(*resume, interrupted, "--background", "black"),
+        2,
+        "started with background",
+        "got (0.0, 0.0, 0.0)",
+    )
+    assert contents(interrupted) == before
+    (interrupted / str(load_info(interrupted).training)).write_bytes(b"junk")
+    assert_refused(bidnerf(*resume, interrupted), 1, "training-", "expected a safetensors file")
+    of_description(lambda content: content.update(backend="hashgird"))(interrupted)
+    assert_refused(bidnerf(*resume, interrupted), 1, str(interrupted), "'hashgird'", "installed: ")
+
+
+def test_settings_are_compared_one_by_one_with_those_of_the_interrupted_training(
+    bidnerf: Run, shared: Path, interrupted: Path
+) -> None:
+    """An option for one setting of the encoding says nothing about the others, whose defaults may have changed since."""
+    resume = ["train", shared / "data", "--resume", "--no-bake", "--out", interrupted]
+    assert_refused(bidnerf(*resume, "--base-resolution", "8"), 2, "started with base_resolution 4.0, got 8.0")
+    assert bidnerf(*resume, "--base-resolution", "4").status == 0
+
+
+# Places that cannot be written.
+
+
+@pytest.mark.parametrize("command", ["train", "render", "demo"])
+def test_what_exists_is_not_overwritten_unasked(
+    command: str, bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "precious").write_text("x")
+    arguments = {
+        "train": ["train", shared / "data", *tiny.options(1)],
+        "render": ["render", shared / "map", shared / "data", "--frame", "t_0000"],
+        "demo": ["demo"],
+    }[command]
+    before = contents(tmp_path)
+    assert_refused(bidnerf(*arguments, "--out", out), 1, str(out), "exists already", "--overwrite")
+    assert_refused(bidnerf(*arguments, "--out", out / "precious", "--overwrite"), 1, "is a file, expected")
+    assert contents(tmp_path) == before
+    if command != "demo":
+        assert bidnerf(*arguments, "--out", out, "--overwrite").status == 0
+        assert (out / "precious").read_text() == "x"
+        assert len(list(out.iterdir())) > 1
+
+
+@pytest.mark.parametrize("place", ["/dev/null/x", "/proc/x", "{file}/x/y", "/dev/null"])
+def test_a_place_that_cannot_be_written_is_told_before_any_work(
+    place: str, bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    out = place.format(file=tmp_path / "file")
+    for arguments in (
+        ["train", shared / "data"],
+        ["render", shared / "map", shared / "data"],
+        ["demo", "--overwrite"],
+    ):
+        assert_refused(bidnerf(*arguments, "--out", out), 1, out, "expected")
+    assert contents(tmp_path) == {"file": b""}
+
+
+def no_space(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_gpu_without_memory_left_is_said_in_a_line(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_memory(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nSee the notes")
+
+    monkeypatch.setattr("bidnerf_core.maps.training.build_field", no_memory)
+    trained = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options(2))
+    assert trained.status == 1
+    assert trained.err.splitlines()[-1].startswith(
+        "bidnerf train: the GPU's memory is full, try --device cpu"
+    )
+
+
+def test_a_full_disk_leaves_nothing_behind(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", no_space)
+    out = tmp_path / "some" / "where"
+    trained = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
+    assert trained.status == 1
+    assert "No space left on device" in trained.err.splitlines()[-1]
+    assert f"{out}/weights-" in trained.err.splitlines()[-1]
+    rendered = bidnerf("render", shared / "map", shared / "data", "--out", out)
+    assert_refused(rendered, 1, f"{out}/t_0000.png: No space left on device")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 KiB, where that may be made."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("mounting is not permitted here")
+    yield place
+    subprocess.run(["umount", str(place)], check=True, capture_output=True)
+
+
+def test_a_disk_that_fills_up_keeps_the_last_whole_map(bidnerf: Run, shared: Path, small_disk: Path) -> None:
+    """The finished map fits once (40 KiB), not twice, nor with its optimizer's state."""
+    train = ["train", shared / "data", "--out", small_disk / "map", *tiny.options(2)]
+    full = bidnerf(*train, "--checkpoint-every", "0")
+    assert full.status == 1
+    assert full.err.splitlines()[-1].endswith("No space left on device")
+    assert list(small_disk.iterdir()) == []
+    assert bidnerf(*train).status == 0
+    before = contents(small_disk)
+    assert bidnerf(*train, "--overwrite").status == 1
+    assert contents(small_disk) == before
+    assert load_map(small_disk / "map").info.complete
+
+
+# Wrong usage.
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["frobnicate"],
+        ["train"],
+        ["train", "{data}"],
+        ["train", "{data}", "--out"],
+        ["train", "{data}", "--out", "{out}", "--steps", "many"],
+        ["train", "{data}", "--out", "{out}", "--steps", "0"],
+        ["train", "{data}", "--out", "{out}", "--learning-rate", "nan"],
+        ["train", "{data}", "--out", "{out}", "--checkpoint-every", "-1"],
+        ["train", "{data}", "--out", "{out}", "--frobnicate"],
+        ["info"],
+        ["info", "{map}", "{map}"],
+        ["render", "{map}", "--out", "{out}"],
+        ["render", "{map}", "{data}", "--out", "{out}", "--level", "1.5"],
+        ["localize", "{map}"],
+        ["localize", "{map}", "{data}", "--focal", "30"],
+        ["localize", "{map}", "{data}", "{data}"],
+        ["localize", "{map}", "x.png", "--focal", "30", "--hfov", "60"],
+        ["localize", "{map}", "x.png", "--focal", "30", "--window", "2"],
+        ["localize", "{map}", "x.png", "--focal", "30", "--perturb", "1", "2"],
+        ["localize", "{map}", "x.png", "--focal", "30", "--depth", "a.png", "b.png"],
+        ["localize", "{map}", "x.png", "--focal", "30", "--out", "poses.csv"],
+        ["localize", "{map}", "{data}", "--no-start", "--frame"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--no-start", "--perturb", "1", "2"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--no-start", "--start", "p.json"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--start", "p.json", "--perturb", "1", "2"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--perturb", "1"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--perturb", "1", "2", "--seed", "-1"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--perturb", "1", "2", "--seed", "9" * 30],
+        ["demo", "--frames", "0", "--out", "{out}"],
+        ["demo", "--steps", "0", "--out", "{out}"],
+        ["demo", "extra", "--out", "{out}"],
+        ["backends", "--jsn"],
+        ["train", "{data}", "--out", "{out}", "--backend", "adanerf", "--threshold", "inf"],
+        ["train", "{data}", "--out", "{out}", "--depth-weight", "inf"],
+        ["train", "{data}", "--out", "{out}", "--points-error", "inf"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--no-start", "--method", "guess"],
+        [
+            "localize",
+            "{map}",
+            "{data}",
+            "--frame",
+            "t_0000",
+            "--perturb",
+            "1",
+            "2",
+            "--method",
+            "bid",
+            "--wide",
+            "nan",
+        ],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--method", "guess"],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--protocol", "guess"],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--size", "-1"],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--protocol", "none", "--size", "1"],
+        ["compare", "{map}", "{data}", "--method", "guess"],
+        ["compare", "{map}", "{data}", "--size", "0.5:10"],
+        ["report", "--out", "{out}"],
+        ["compare", "{map}", "{data}", "--protocol", "guess"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_has_status_2_and_no_output(
+    arguments: list[str], bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    places = {"data": shared / "data", "map": shared / "map", "out": tmp_path / "out"}
+    outcome = bidnerf(*[word.format(**places) for word in arguments])
+    assert (outcome.status, outcome.out) == (2, "")
+    assert outcome.err
+    assert "Traceback" not in outcome.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_command_the_commands_are_listed(bidnerf: Run) -> None:
+    nothing, asked, near = bidnerf(), bidnerf("--help"), bidnerf("rendr")
+    assert (nothing.status, nothing.out, nothing.err) == (2, "", asked.out)
+    assert asked.status == 0
+    assert all(f"  {name} " in asked.out for name in COMMANDS)
+    assert near.err.startswith("bidnerf: no command 'rendr', did you mean 'render'?\n")
+    assert bidnerf("--version").out.startswith("bidnerf ")
+
+
+POSES = {
+    "missing": (None, "no such file"),
+    "not JSON": ("{", "not JSON"),
+    "no pose": ("{}", "no matrix of numbers"),
+    "text": ('"x"', "no matrix of numbers"),
+    "ragged": ("[[1, 2], [3]]", "no matrix of numbers"),
+    "two of --out": ('[{"frame": "a"}, {"frame": "b"}]', "holds no pose"),
+    "two of --json": ('{"frame": "a"}\n{"frame": "b"}\n', "holds no pose"),
+    "none": ("[]", "holds no pose"),
+    "3x3": ("[[1, 0, 0], [0, 1, 0], [0, 0, 1]]", "has shape (3, 3)"),
+    "by columns": ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]", "column-major"),
+    "last row": ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 1, 1, 1]]", "has the last row"),
+    "huge": (
+        "[[1" + "0" * 400 + ", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+        "no matrix of numbers",
+    ),
+    "NaN": ("[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "not a rigid transform"),
+    "scaled": ("[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]", "not a rigid transform"),
+}
+
+
+@pytest.mark.parametrize("case", POSES)
+def test_a_start_that_is_no_pose_is_told_in_a_line(
+    case: str, bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    text, finding = POSES[case]
+    path = tmp_path / "pose.json"
+    if text is not None:
+        path.write_text(text)
+    found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0000", "--start", path)
+    assert_refused(found, 1, str(path), finding, "expected")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("command", ["localize", "evaluate", "compare"])
+def test_each_method_has_its_settings_beside_those_of_the_command(
+    command: str, method: str, bidnerf: Run
+) -> None:
+    found = bidnerf(command, "--method", method, "--help")
+    assert (found.status, found.err) == (0, "")
+    assert "--" in found.out
+
+
+def test_a_perturbation_is_judged(bidnerf: Run, shared: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", "--frame", "t_0000", "--perturb"]
+    for wrong in (("-1", "5"), ("nan", "5"), ("inf", "5")):
+        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: T is", "expected metres from 0 to 1e+06")
+    for wrong in (("1", "inf"), ("0.5", "1e9"), ("0.5", "180.1"), ("0.5", "-1")):
+        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: R is", "expected degrees from 0 to 180")
+
+
+# What is printed.
+
+
+def strict(text: str) -> Any:
+    """Exactly one line, which is JSON without NaN."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    assert text.count("\n") == 1
+    assert text.endswith("\n")
+    return json.loads(text, parse_constant=refuse)
+
+
+@pytest.mark.parametrize("frames", [["t_0000"], ["t_0000", "t_0001", "t_0002"]], ids=["one", "rig"])
+def test_localize_prints_the_object_that_was_agreed_on(
+    frames: list[str], bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    quick = ["--method", "bid", "--max-steps", "3", "--rays", "64"]
+    localize = ["localize", shared / "map", shared / "data", "--json", *quick]
+    outcome = bidnerf(*localize, "--perturb", "0.1", "5", "--frame", *frames)
+    assert outcome.status == 0, outcome.err
+    found = strict(outcome.out)
+    assert set(found) == LOCALIZE_KEYS
+    assert torch.tensor(found["T_world_camera"]).shape == (4, 4)
+    assert found["covariance"] is None or torch.tensor(found["covariance"]).shape == (6, 6)
+    assert set(found["error"]) == {"translation", "rotation_deg"}
+    assert found["frame"] == frames[-1]
+    kinds = {
+        "converged": bool,
+        "outcome": str,
+        "reason": str,
+        "steps": int,
+        "seconds": float,
+        "loss": float,
+        "backend": str,
+        "method": str,
+        "focal_factor": float,
+    }
+    assert {key: type(found[key]) for key in kinds} == kinds
+    assert found["backend"] == "hashgrid"
+    # What it prints is a start that it takes, and frames may be named one by one.
+    (tmp_path / "pose.json").write_text(outcome.out)
+    again = bidnerf(
+        *localize, "--start", tmp_path / "pose.json", *[w for f in frames for w in ("--frame", f)]
+    )
+    assert again.status == 0
+    rigid = torch.tensor(strict(again.out)["T_world_camera"])
+    assert torch.allclose(rigid[:3, :3] @ rigid[:3, :3].T, torch.eye(3), atol=1e-5)
+
+
+def test_every_frame_that_is_named_counts(
+    bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[str]] = []
+
+    def note(dataset: TransformsDataset, split: str, names: Any) -> Any:
+        seen.append(list(names))
+        raise InputError("enough")
+
+    monkeypatch.setattr(TransformsDataset, "views", note)
+    bidnerf("localize", shared / "map", shared / "data", "--no-start", "--frame", "a", "b", "--frame", "c")
+    assert seen == [["a", "b", "c"]]
+
+
+def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Run, shared: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK]
+    for twice in (["t_0001", "t_0001"], ["t_0000", "t_0001", "--frame", "t_0001"]):
+        assert_refused(bidnerf(*place, "--frame", *twice), 2, "--frame names t_0001 more than once")
+    bench = [
+        "evaluate",
+        "demo:blobs",
+        "demo:blobs",
+        "--out",
+        shared / "never.jsonl",
+        "--frame",
+        "0001",
+        "0001",
+    ]
+    assert_refused(bidnerf(*bench), 2, "frames names 0001 more than once")
+
+
+def test_a_window_is_the_frame_and_those_before_it(
+    bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+    real = TransformsDataset.views
+
+    def note(dataset: TransformsDataset, split: str, names: Any) -> Any:
+        asked.append(list(names))
+        return real(dataset, split, names)
+
+    monkeypatch.setattr(TransformsDataset, "views", note)
+    place = ["localize", shared / "map", shared / "data", *QUICK]
+    for frame, size in (("t_0002", 2), ("t_0001", 3), ("t_0001", 1)):
+        found = bidnerf(*place, "--frame", frame, "--window", size)
+        assert found.status == 0
+        cut = "--window 3: t_0001 has only 1 before it in split 'test'; a rig of 2" in found.err
+        assert cut == (size == 3)
+    assert asked == [["t_0001", "t_0002"], ["t_0000", "t_0001"], ["t_0001"]]
+    assert_refused(
+        bidnerf(*place, "--frame", "t_0000", "t_0001", "--window", 2), 2, "--window 2 with 2 frames"
+    )
+    assert_refused(bidnerf(*place, "--frame", "t_0000", "--window", 0), 2, "--window is 0")
+    assert_refused(bidnerf(*place, "--frame", "t_0000", "--window", 4), 2, "--window is 4, expected 1 to 3")
+    assert_refused(bidnerf(*place, "--frame", "t_9", "--window", 2), 1, "'t_9'")
+
+
+def test_points_of_a_sensor_are_used(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK, "--frame", "t_0001", "--json"]
+    points = tmp_path / "points.txt"
+    points.write_text("0 0 2.5\n0.1 0.1 2.6\n")
+    without, with_points = bidnerf(*place), bidnerf(*place, "--depth-points", points)
+    assert json.loads(without.out)["loss"] != json.loads(with_points.out)["loss"]
+    for_all = bidnerf("localize", shared / "map", shared / "data", "--depth-points", points)
+    assert_refused(for_all, 2, str(points), "points of a single camera, but 3 frames")
+    points.write_text("far away")
+    assert_refused(bidnerf(*place, "--depth-points", points), 1, str(points), "rows of x, y, z")
+
+
+def test_inerf_takes_one_image(bidnerf: Run, shared: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK, "--method", "inerf"]
+    assert bidnerf(*place, "--frame", "t_0000", "--pixels", "interest-points", "--no-renew").status == 0
+    assert_refused(bidnerf(*place, "--frame", "t_0000", "t_0001"), 1, "method inerf takes one image, got 2")
+
+
+def test_localize_without_json_prints_to_stdout_too(bidnerf: Run, shared: Path) -> None:
+    found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK)
+    assert (found.status, found.err) == (0, "")
+    assert found.out.startswith("t_0001: ")
+    assert "0.1000 m, 5.000 deg" in found.out
+
+
+def test_an_answer_that_is_not_finite_is_no_answer(
+    bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dataclasses import replace
+
+    from bidnerf_core.geometry import SE3
+    from bidnerf_core.localization import Localizer
+
+    real, nowhere = (
+        Localizer.__call__,
+        SE3(torch.eye(3).double(), torch.full((3,), math.nan).double()),
+    )
+    monkeypatch.setattr(Localizer, "__call__", lambda *given: replace(real(*given), T_world_camera=nowhere))
+    found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK, "--json")
+    assert_refused(found, 1, "t_0001", "not finite")
+
+
+def test_no_start_is_refused_by_methods_that_need_one(bidnerf: Run, shared: Path) -> None:
+    found = bidnerf(
+        "localize", shared / "map", shared / "data", "--frame", "t_0000", "--no-start", "--method", "bid"
+    )
+    assert_refused(found, 1, "'bid' needs a start", "give one by --start, or use method 'auto'")
+
+
+def test_a_backend_whose_module_has_no_docstring_is_listed_with_its_own_summary(
+    bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bare = [replace(info, summary="") for info in list_plugins("backends") if info.name == "hashgrid"]
+    monkeypatch.setattr("bidnerf_core.cli.backends.list_plugins", lambda group: bare)
+    (row,) = strict(bidnerf("backends", "--json").out)
+    assert row["summary"] == load_backend("hashgrid").summary
+
+
+def test_backends_are_listed(bidnerf: Run) -> None:
+    listed = strict(bidnerf("backends", "--json").out)
+    assert "hashgrid" in [entry["name"] for entry in listed]
+    assert {"name", "summary", "distribution", "version", "value", "fault"} == set(listed[0])
+    shown = bidnerf("backends")
+    assert (shown.status, shown.err) == (0, "")
+    assert all(entry["name"] in shown.out for entry in listed)
+
+
+def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
+    facts = strict(bidnerf("info", shared / "map", "--json").out)
+    assert facts["backend"] == "hashgrid"
+    assert (facts["cameras"], facts["step"], facts["complete"], facts["levels"]) == (6, tiny.STEPS, True, 2)
+    assert facts["data"] == "data"
+    assert facts["config"]["encoding"]["levels"] == 3
+    shown = bidnerf("info", shared / "map").out
+    assert f"{facts['step']} steps of backend hashgrid" in shown
+    assert "data, 6 images" in shown
+    assert "surface:     none; 'bidnerf bake MAP' builds it" in shown
+    assert "landmarks:   none; 'bidnerf bake MAP --data DATA' builds them" in shown
+    assert "levels 3" in shown
+    assert "nothing beyond it" in shown
+
+
+def test_render_refuses_names_whose_files_would_collide(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    data = Path(shutil.copytree(shared / "data", tmp_path / "data"))
+    path = data / "transforms.json"
+    described = json.loads(path.read_text())
+    first, second = described["test_filenames"][:2]
+    other = str(Path(first).with_name(f"{Path(first).stem}.depth.png"))
+    (data / second).rename(data / other)
+    path.write_text(path.read_text().replace(second, other))
+    refused = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
+    assert_refused(refused, 1, "would overwrite the depth of", "--frame")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_argument_with_a_nul_is_wrong_usage(bidnerf: Run) -> None:
+    assert_refused(bidnerf("info", "a\0b"), 2, "NUL")
+
+
+def test_render_writes_the_images_that_were_agreed_on(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    render = ["render", shared / "map", shared / "data"]
+    outcome = bidnerf(*render, "--out", tmp_path / "all")
+    assert (outcome.status, outcome.err) == (0, "")
+    names = {f"t_000{i}{end}" for i in range(3) for end in (".png", ".depth.png")}
+    assert {file.name for file in (tmp_path / "all").iterdir()} == names
+    image, depth = iio.imread(tmp_path / "all/t_0000.png"), iio.imread(tmp_path / "all/t_0000.depth.png")
+    assert (image.shape, image.dtype) == ((24, 24, 3), np.uint8)
+    assert (depth.shape, depth.dtype) == ((24, 24), np.uint16)
+    assert outcome.out.count("PSNR") == 4
+    assert bidnerf(*render, "--out", tmp_path / "one", "--frame", "t_0001", "--level", "0").status == 0
+    assert {f.name for f in (tmp_path / "one").iterdir()} == {"t_0001.png", "t_0001.depth.png"}
+    fine = (tmp_path / "all/t_0001.png").read_bytes()
+    assert (tmp_path / "one/t_0001.png").read_bytes() != fine
+    assert (
+        bidnerf(*render, "--out", tmp_path / "one", "--frame", "t_0001", "--level", "1", "--overwrite").status
+        == 0
+    )
+    assert (tmp_path / "one/t_0001.png").read_bytes() == fine
+
+
+def test_progress_goes_to_stderr(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    trained = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options(2))
+    assert (trained.status, trained.out) == (0, "")
+    assert "training: 2/2 steps, loss " in trained.err
+
+
+# Help.
+
+
+@pytest.fixture(params=[80, 120])
+def columns(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setenv("COLUMNS", str(request.param))
+    return int(request.param)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_the_terminal_and_explains_every_option(command: str, columns: int, bidnerf: Run) -> None:
+    outcome = bidnerf(command, "--help")
+    assert (outcome.status, outcome.err) == (0, "")
+    lines = outcome.out.splitlines()
+    assert max(map(len, lines)) <= columns
+    assert lines[0].startswith(f"usage: bidnerf {command} ")
+    assert "PATH" not in outcome.out
+    own = outcome.out.partition(" config options ")[0]
+    assert unexplained(own) == []
+
+
+def unexplained(page: str) -> list[str]:
+    """Options after whose name and metavar comes nothing but their default."""
+    rows = [line.strip("│ \n") for line in page.splitlines() if line.startswith("│")]
+    starts = [i for i, row in enumerate(rows) if row.startswith("-")] + [len(rows)]
+    texts = [" ".join(rows[i:j]) for i, j in itertools.pairwise(starts)]
+    return [text for text in texts if len(text.partition("(default")[0].split()) < 3]
+
+
+def test_the_options_of_a_backend_are_shown_and_explained(bidnerf: Run) -> None:
+    page = bidnerf("train", "--backend", "hashgrid", "--help").out
+    assert "--log2-table-size" in page
+    assert "--carve, --no-carve" in page
+    assert unexplained(page) == []
+
+
+def test_positional_arguments_are_named_as_in_the_manual(bidnerf: Run) -> None:
+    assert " DATA" in bidnerf("train", "--help").out.splitlines()[0]
+    assert " MAP" in bidnerf("info", "--help").out.splitlines()[0]
+    assert " MAP DATA" in bidnerf("render", "--help").out.splitlines()[0]
+    assert " MAP " in bidnerf("localize", "--help").out.splitlines()[0]
+    assert "QUERY..." in bidnerf("localize", "--help").out
+
+
+# Training that is interrupted.
+
+
+def assert_same_map(one: Path, other: Path) -> None:
+    """Weights and occupancy, bit by bit."""
+    a, b = load_file(one / load_info(one).weights), load_file(other / load_info(other).weights)
+    assert a.keys() == b.keys()
+    assert any("occupied" in name for name in a)
+    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+
+
+def test_a_stopped_training_goes_on_as_if_nothing_had_happened(
+    bidnerf: Run, shared: Path, interrupted: Path
+) -> None:
+    info = load_info(interrupted)
+    assert (info.step, info.complete) == (tiny.STEPS // 2, False)
+    assert bidnerf("info", interrupted).status == 0
+    resumed = bidnerf("train", shared / "data", "--out", interrupted, "--resume", "--no-bake")
+    assert (resumed.status, resumed.out) == (0, "")
+    assert f"resuming from step {tiny.STEPS // 2}" in resumed.err
+    assert load_info(interrupted).complete
+    assert sorted(f.suffix for f in interrupted.iterdir()) == [".json", ".safetensors"]
+    assert_same_map(interrupted, shared / "map")
+
+
+def test_a_training_resumes_over_the_background_that_it_began_with(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train = ["train", shared / "data", "--background", "black", *tiny.options()]
+    assert bidnerf(*train, "--out", tmp_path / "whole").status == 0
+    with monkeypatch.context() as patch:
+        stop_at(patch, 5)
+        assert bidnerf(*train, "--out", tmp_path / "half").status == 130
+    resume = ["train", shared / "data", "--resume", "--no-bake"]
+    assert bidnerf(*resume, "--out", tmp_path / "half").status == 0
+    assert_same_map(tmp_path / "half", tmp_path / "whole")
+
+
+def test_ctrl_c_before_anything_is_made_leaves_nothing(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bidnerf_core.maps.training.read_views", interrupt)
+    outcome = bidnerf("train", shared / "data", "--out", tmp_path / "map")
+    assert (outcome.status, outcome.err) == (130, "bidnerf train: interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_diverging_training_is_told_and_leaves_nothing(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def overflow(optimizer: torch.optim.Optimizer) -> None:
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.data.fill_(torch.nan)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", overflow)
+    outcome = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options())
+    assert_refused(outcome, 1, "training diverged", "smaller learning rate")
+    assert list(tmp_path.iterdir()) == []
+
+
+# Processes of their own.
+
+PROGRAM = [sys.executable, "-c", "import sys; from bidnerf_core.cli import main; sys.exit(main())"]
+ALONE = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_reader_that_goes_away_and_an_output_that_is_full() -> None:
+    shell = f"{sys.executable} -c '{PROGRAM[2]}' backends"
+    endings = {"gone": f"{shell} | head -0; exit ${{PIPESTATUS[0]}}", "full": f"exec {shell} > /dev/full"}
+    ran = {
+        name: subprocess.Popen(["bash", "-c", line], stderr=subprocess.PIPE, text=True, env=ALONE)
+        for name, line in endings.items()
+    }
+    said = {name: (process.communicate(timeout=120)[1], process.returncode) for name, process in ran.items()}
+    assert said == {"gone": ("", 141), "full": ("bidnerf backends: No space left on device\n", 1)}
+
+
+def test_closed_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python has None where the shell closed a stream."""
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert main(["backends", "--json"]) == 0
+    assert main(["backends"]) == 0
+    assert main(["frobnicate"]) == 2
+    assert main(["info", "/nowhere"]) == 1
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    end = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < end
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+
+
+LONG = 100  # steps
+
+
+@pytest.fixture(scope="module")
+def whole(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a training of so many steps comes to if it is left alone."""
+    out = tmp_path_factory.mktemp("whole") / "map"
+    assert main(["train", str(shared / "data"), "--out", str(out), *tiny.options(LONG)]) == 0
+    return out
+
+
+@pytest.mark.slow
+def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(bidnerf: Run, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert bidnerf("demo", "--steps", 20, "--frames", 1, "--out", out).status == 0
+    data = open_dataset(out / "data")
+    assert len(data.views("train")) == len(load_map(out / "map").info.cameras)
+    [view] = data.views("test")
+    found = json.loads(bidnerf("localize", out / "map", out / "data", "--split", "test", "--json").out)
+    assert found["frame"] == view.frame.name
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_and_resuming_loses_nothing(
+    bidnerf: Run, shared: Path, whole: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "map"
+    train = ["train", str(shared / "data"), "--out", str(out)]
+    command = [*PROGRAM, *train, *tiny.options(LONG), "--checkpoint-every", "0"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ALONE
+    ) as process:
+        wait_for((out / "map.json").exists, process)
+        process.send_signal(signal.SIGINT)
+        said, complaints = process.communicate(timeout=120)
+    info = load_info(out)
+    assert (process.returncode, said) == (130, "")
+    assert complaints.splitlines()[-2:] == [
+        f"{out}: saved after step {info.step}; --resume continues from there",
+        "bidnerf train: interrupted",
+    ]
+    assert 0 < info.step < LONG
+    assert bidnerf(*train, "--resume", "--no-bake").status == 0
+    assert_same_map(out, whole)
+
+
+# Trains in children, to import torch once only; a line on stdin starts one, and its process id is printed.
+FORKING = """
+import os, sys
+import bidnerf_core.cli.train as _
+from bidnerf_core.cli import main
+for line in sys.stdin:
+    child = os.fork()
+    if child == 0:
+        os._exit(main(line.split()))
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_training_that_is_killed_again_and_again_still_comes_to_its_end(
+    shared: Path, whole: Path, tmp_path: Path
+) -> None:
+    out, steps = tmp_path / "map", []
+    train = f"train {shared / 'data'} --out {out} --checkpoint-every 0 "
+    chance = random.Random(0)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([sys.executable, "-c", FORKING], text=True, env=ALONE, **pipes) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+
+        def tell(line: str) -> None:
+            process.stdin.write(line + "\n")
+            process.stdin.flush()
+
+        for _ in range(3):
+            before = (out / "map.json").read_bytes() if out.exists() else None
+            tell(train + ("--resume --no-bake" if before else " ".join(tiny.options(LONG))))
+            child = int(process.stdout.readline())
+            wait_for(
+                lambda before=before: (
+                    (out / "map.json").exists() and (out / "map.json").read_bytes() != before
+                ),
+                process,
+            )
+            time.sleep(chance.uniform(0, 0.1))
+            os.kill(child, signal.SIGKILL)
+            assert int(process.stdout.readline()) == -signal.SIGKILL
+            stored = load_map(out)
+            assert not stored.info.complete, "raise LONG: it came to its end before it was killed"
+            steps.append(stored.info.step)
+        tell(train + "--resume --no-bake")
+        process.stdout.readline()
+        assert int(process.stdout.readline()) == 0
+        process.stdin.close()
+    assert steps == sorted(set(steps))
+    assert_same_map(out, whole)
+    assert sorted(file.suffix for file in out.iterdir()) == [".json", ".safetensors"]

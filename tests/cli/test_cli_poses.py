@@ -1,0 +1,210 @@
+"""``bidnerf train --refine-poses``: what a map keeps of given and refined poses, and who takes which."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core import SE3, View
+from bidnerf_core.captures import as_given, stored_cameras, training_views
+from bidnerf_core.captures.cameras import PoseConsistency
+from bidnerf_core.captures.training_poses import TrainingPoses
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.mapping import TrackedViews, tracked_views
+from bidnerf_core.maps import cameras_of, load_info, read_views
+from bidnerf_core.maps.files import load_capture
+from commands import Run
+from landmark_scene import Points, ring
+from test_cli import assert_same_map, stop_at
+
+UPDATE = torch.tensor([0.01, -0.02, 0.0, 0.0, 0.03, 0.0], dtype=torch.float64)
+
+
+@pytest.fixture
+def refining(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refinement that turns every camera by the same right update: images of a few pixels have no keypoints for any."""
+
+    def moved(tracked: TrackedViews, views: Sequence[View], *_: Any, **__: Any) -> TrainingPoses:
+        pixels = torch.full((len(views),), 0.9, dtype=torch.float64)
+        pixels[2] = 1.4
+        there = tracked.at(tracked.T_world_camera.retract(UPDATE))
+        return TrainingPoses(there, pixels, [1], True, PoseConsistency(0.7, 0.36))
+
+    monkeypatch.setattr(training_views, "training_poses", moved)
+
+
+def views_of(data: Path) -> list[View]:
+    return open_dataset(data, tiny.BACKGROUND).views("train")
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return tiny.write_dataset(tmp_path / "data")
+
+
+@pytest.mark.usefixtures("refining")
+def test_a_map_holds_refined_and_given_poses(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    outcome = bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2))
+    assert outcome.status == 0
+    views, info = views_of(data), load_info(tmp_path / "map")
+    assert as_given(info.cameras) == stored_cameras(views)
+    for view, (_, T) in zip(views, cameras_of(info), strict=True):
+        torch.testing.assert_close((view.T_ref_camera.inverse() @ T).log(), UPDATE, rtol=0, atol=1e-9)
+    line = f"0.60 px to the 0.36 px of keypoints; the poses are refined by {UPDATE[:3].norm():.3g} and"
+    assert line in outcome.err
+    name = views[2].frame.name
+    assert f"{name} most" in outcome.err
+    shown = bidnerf("info", tmp_path / "map").out
+    assert line in shown
+    assert f"by the landmarks of the other images: {views[1].frame.name} by" in shown
+    facts = json.loads(bidnerf("info", tmp_path / "map", "--json").out)
+    assert [moved["name"] for moved in facts["moved"]] == [view.frame.name for view in views]
+    assert facts["moved"][2]["pixels"] == 1.4
+    assert facts["poses"]["replaced"] == [views[1].frame.name]
+
+
+def test_never_and_images_without_keypoints_keep_the_given_poses(
+    bidnerf: Run, data: Path, tmp_path: Path
+) -> None:
+    for when in ("never", "auto", "always"):
+        words = ["train", data, "--out", tmp_path / when, "--refine-poses", when, *tiny.options(2)]
+        found = bidnerf(*words)
+        assert found.status == 0
+        assert ("the poses are kept: refining them takes at least 8 images" in found.err) == (
+            when == "always"
+        )
+        info = load_info(tmp_path / when)
+        assert info.cameras == stored_cameras(views_of(data))
+        assert info.pose_refinement is None
+        assert json.loads(bidnerf("info", tmp_path / when, "--json").out)["moved"] == []
+    assert bidnerf("train", data, "--out", tmp_path / "x", "--refine-poses", "maybe").status == 2
+
+
+@pytest.mark.usefixtures("refining")
+def test_a_resumed_training_takes_the_refined_poses_again(
+    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train = ["train", data, *tiny.options()]
+    assert bidnerf(*train, "--out", tmp_path / "whole").status == 0
+    with monkeypatch.context() as patch:
+        stop_at(patch, 5)
+        assert bidnerf(*train, "--out", tmp_path / "half").status == 130
+    monkeypatch.setattr(training_views, "training_poses", None)  # it is not called again
+    other = bidnerf("train", data, "--resume", "--refine-poses", "never", "--out", tmp_path / "half")
+    assert (other.status, "was started with refined poses" in other.err) == (2, True)
+    assert bidnerf("train", data, "--resume", "--no-bake", "--out", tmp_path / "half").status == 0
+    assert_same_map(tmp_path / "half", tmp_path / "whole")
+    assert load_info(tmp_path / "half").cameras == load_info(tmp_path / "whole").cameras
+
+
+@pytest.mark.usefixtures("refining")
+def test_photos_that_are_baked_later_have_the_refined_poses(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    assert bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2)).status == 0
+    assert bidnerf("bake", tmp_path / "map", "--data", data, "--measured", "5000").status == 0
+    info = load_info(tmp_path / "map")
+    photos = load_capture(tmp_path / "map" / str(info.capture)).photos
+    for photo, (_, T) in zip(photos, cameras_of(info), strict=True):
+        torch.testing.assert_close(torch.tensor(photo.position).double(), T.translation, rtol=0, atol=1e-6)
+
+
+@pytest.mark.usefixtures("refining")
+def test_a_damaged_given_pose_is_named(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    assert bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2)).status == 0
+    file = tmp_path / "map" / "map.json"
+    described = json.loads(file.read_text())
+    described["cameras"][1]["given_T_world_camera"][0] = [0, 0, 0, 0]
+    file.write_text(json.dumps(described))
+    status, _, err = bidnerf("info", tmp_path / "map")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "not a rigid transform" in err
+
+
+def measured(ratio: float) -> TrackedViews:
+    """Images whose measured depth is ``ratio`` times the true one."""
+    points = Points(noise=0.3)
+    return tracked_views(ring(points, 8, depth=ratio), points)
+
+
+def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prepare views of points for training, as the command does."""
+    monkeypatch.setattr(
+        training_views,
+        "tracked_views",
+        lambda given, features, progress: tracked_views(given, points, progress=progress),
+    )
+    training_views.prepared(views)
+
+
+@pytest.mark.slow
+def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = Points(noise=0.3)
+    views = ring(points, 14, depth=1.0)
+    prepared(views, points, monkeypatch)
+    reversed_axes = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    flipped = [
+        replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation @ reversed_axes, v.T_ref_camera.translation))
+        for v in views
+    ]
+    with pytest.raises(InputError, match="the poses contradict the photos"):
+        prepared(flipped, points, monkeypatch)
+    millimetres = ring(points, 14, depth=1000.0)
+    with pytest.raises(InputError, match="depth_unit_scale_factor"):
+        prepared(millimetres, points, monkeypatch)
+
+
+@pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])
+def test_depth_in_another_unit_is_refused(ratio: float) -> None:
+    with pytest.raises(InputError, match=r"times the depth that the poses .*depth_unit_scale_factor"):
+        training_views.check_depth_unit(measured(ratio))
+
+
+def test_another_unit_of_depth_is_named_where_it_can_be_given() -> None:
+    with pytest.raises(
+        InputError, match=r"0.2 times .* 0.001 m and not 0.0002 m \(--depth-unit 0.001, .*by 0.2$"
+    ):
+        training_views.check_depth_unit(measured(0.2), 1 / 5000)
+    with pytest.raises(InputError, match=r"--depth-unit 0.00328, "):
+        training_views.check_depth_unit(measured(0.3048), 0.001)
+
+
+def test_datasets_tell_the_unit_of_their_depth(tmp_path: Path) -> None:
+    folder = tiny.write_dataset(tmp_path / "data")
+    assert read_views(folder).depth_unit == 0.001
+    centimetres = open_dataset(folder, depth_unit=0.01)
+    assert read_views(centimetres, "all").depth_unit == 0.01
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(1.08, True), (0.94, True), (1.02, False)])
+def test_a_scale_of_depth_that_is_a_few_percent_off_is_told(
+    ratio: float, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "bidnerf")
+    training_views.check_depth_unit(measured(ratio))
+    assert ("times the depth that the poses and photos imply; training takes both" in caplog.text) == said
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_training_refuses_axes_of_other_software(bidnerf: Run, data_dir: Path, tmp_path: Path) -> None:
+    source = data_dir / "room_living"
+    described = json.loads((source / "transforms_train.json").read_text())
+    described["frames"] = described["frames"][:30]
+    for frame in described["frames"]:
+        frame["transform_matrix"] = [[a, -b, -c, d] for a, b, c, d in frame["transform_matrix"]]
+        for key in ("file_path", "depth_file_path"):
+            frame[key] = str(source / frame[key])
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/transforms_train.json").write_text(json.dumps(described))
+    status, _, err = bidnerf("train", tmp_path / "data", "--out", tmp_path / "map", *tiny.options(2))
+    assert status == 1
+    assert "the poses contradict the photos" in err
+    assert "diag(1, -1, -1, 1)" in err
+    assert not (tmp_path / "map/map.json").exists()

@@ -1,0 +1,371 @@
+"""COLMAP models: what is read of them, in which unit, and what localization and training make of it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import sparse_model
+import tiny
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.datasets import SparseChoice, SparsePoints
+from bidnerf_core.datasets.colmap_files import read_model
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields import Observations, SceneBounds, render, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import rig
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import GaussianBlobs, demo_object, orbit
+from bidnerf_core.training import RayBank, Silent, ray_termination
+from bidnerf_hashgrid import backend as hashgrid
+from problems import FieldMap, localize
+from sparse_model import Known
+
+CHOICE = SparseChoice()
+Edit = Callable[[Path], object]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Known:
+    views = tiny.views(6)
+    return sparse_model.known(views, [f"train/{view.frame.name}.png" for view in views])
+
+
+@pytest.fixture
+def model(scene: Known, tmp_path: Path) -> Path:
+    return sparse_model.write(tmp_path / "sparse", scene)
+
+
+def places(what: Known) -> list[tuple[str, SE3]]:
+    return [(view.frame.name, view.T_ref_camera) for view in what.views]
+
+
+def opened(model: Path, what: Known, choice: SparseChoice = CHOICE) -> SparsePoints:
+    return SparsePoints(model, places(what), choice)
+
+
+def bare(view: View) -> View:
+    return replace(view, frame=replace(view.frame, depth=None))
+
+
+# Reading.
+
+
+def test_text_binary_and_pycolmap_say_the_same(model: Path, tmp_path: Path, scene: Known) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Reconstruction(str(model))
+    binary = tmp_path / "binary"
+    binary.mkdir()
+    theirs.write_binary(str(binary))  # with rigs.bin and frames.bin, as versions from 3.12 on write
+    assert (binary / "frames.bin").is_file()
+    (binary / "project.ini").write_text("whatever else is there")
+    for folder in (model, binary):
+        images, points = read_model(folder)
+        assert [image.name for image in images] == [theirs.images[i].name for i in sorted(theirs.images)]
+        for image in images:
+            other = theirs.find_image_with_name(image.name)
+            expected = torch.from_numpy(np.array(other.cam_from_world().matrix()))
+            torch.testing.assert_close(image.T_camera_model.matrix()[:3], expected)
+            assert set(image.points.tolist()) == {p.point3D_id for p in other.points2D if p.has_point3D()}
+        assert points.ids.tolist() == sorted(theirs.points3D)
+        for i, number in enumerate(points.ids.tolist()):
+            other = theirs.points3D[number]
+            np.testing.assert_allclose(points.positions[i].numpy(), other.xyz)
+            assert (float(points.errors[i]), int(points.tracks[i])) == (other.error, other.track.length())
+    assert len(points.ids) == len(scene.points)
+
+
+def test_an_image_that_observes_nothing_and_names_with_blanks(tmp_path: Path) -> None:
+    (tmp_path / "images.txt").write_text(
+        "# a comment\n\n7 1 0 0 0 1 2 3 1 a folder/an image.jpg\n\n8 1 0 0 0 0 0 0 1 b.jpg\n"
+    )
+    (tmp_path / "points3D.txt").write_text("")
+    images, points = read_model(tmp_path)
+    assert [(image.name, len(image.points)) for image in images] == [
+        ("a folder/an image.jpg", 0),
+        ("b.jpg", 0),
+    ]
+    assert images[0].T_camera_model.translation.tolist() == [1, 2, 3]
+    assert len(points.ids) == 0
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_a_file_that_is_cut_or_changed_never_ends_otherwise_than_in_a_line(
+    binary: bool, model: Path, tmp_path: Path, scene: Known
+) -> None:
+    if binary:
+        pycolmap = pytest.importorskip("pycolmap")
+        theirs = pycolmap.Reconstruction(str(model))
+        shutil.rmtree(model)
+        model.mkdir()
+        theirs.write_binary(str(model))
+    chance = np.random.default_rng(0)
+    refused = 0
+    for name in ("images", "points3D"):
+        file = model / f"{name}{'.bin' if binary else '.txt'}"
+        whole = file.read_bytes()
+        for number in range(60):
+            broken = bytearray(whole)
+            if number % 2:
+                broken = broken[: chance.integers(len(whole))]
+            else:
+                for place in chance.integers(len(whole), size=3):
+                    broken[place] = chance.integers(256)
+            file.write_bytes(broken)
+            try:
+                opened(model, scene).onto(bare(scene.views[0]), "train")
+            except InputError as error:
+                refused += str(model) in str(error) and "\n" not in str(error)
+            if binary and number % 2:
+                with pytest.raises(InputError, match=r"ends too early|declares"):
+                    read_model(model)
+        file.write_bytes(whole)
+    assert refused > 60
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "said"),
+    [
+        ("images.txt", "1 1 0 0 0 0 0 0 1\n\n", "line 1 has 9 entries"),
+        ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", "line 1: could not convert"),
+        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n", "invalid pose"),
+        ("images.txt", "1 nan 0 0 0 0 0 0 1 a.png\n\n", "is not finite"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "line 2 has 2 entries"),
+        ("images.txt", f"1 1 0 0 0 0 0 0 1 a.png\n1 2 {10**30}\n", "has more than 64 bits"),
+        ("points3D.txt", "1 0 0 0 1 2 3 0.5 1\n", "line 1 has 9 entries"),
+        ("points3D.txt", "1 0 0 0 1 2 3 0.5\n1 0 0 0 1 2 3 0.5\n", "the same id"),
+        ("points3D.txt", "", "none of its 0 points"),
+        ("images.txt", "", "has 0 of the 6 training cameras"),
+    ],
+)
+def test_files_that_are_wrong_are_told(model: Path, scene: Known, file: str, text: str, said: str) -> None:
+    (model / file).write_text(text)
+    with pytest.raises(InputError, match=said) as caught:
+        opened(model, scene)
+    assert str(model) in str(caught.value)
+
+
+def test_a_folder_without_a_model_is_told(tmp_path: Path, scene: Known) -> None:
+    with pytest.raises(InputError, match=r"expected images\.bin and points3D\.bin"):
+        opened(tmp_path, scene)
+    sparse_model.write(tmp_path / "sparse/0", scene)
+    with pytest.raises(InputError, match=r"did you mean .*sparse/0\?"):
+        opened(tmp_path, scene)
+
+
+# Points in metres.
+
+
+def test_the_points_that_a_frame_observes_come_back_in_metres(model: Path, scene: Known) -> None:
+    sparse = opened(model, scene)
+    assert sparse.unit.metres == pytest.approx(sparse_model.UNIT, rel=1e-9)
+    assert sparse.unit.misfit < 1e-9
+    for place, view in enumerate(scene.views):
+        found, truth = sparse.seen(view.frame.name, "train"), scene.truth(place)
+        assert len(found) == len(truth) > 5
+        torch.testing.assert_close(found, truth)
+
+
+def test_what_is_left_out_is_a_setting(model: Path, scene: Known) -> None:
+    def count(choice: SparseChoice) -> int:
+        return len(opened(model, scene, choice).seen(scene.views[0].frame.name, "train"))
+
+    usual = count(CHOICE)
+    all_of_them = count(SparseChoice(points_error=100, points_views=1))
+    assert all_of_them > usual > count(SparseChoice(points_views=3)) > 0
+    with pytest.raises(InputError, match=r"none of its .* reprojection error of 0.1 pixels or less"):
+        opened(model, scene, SparseChoice(points_error=0.1))
+    for wrong in ({"points_error": 0.0}, {"points_error": float("nan")}, {"points_views": 0}):
+        with pytest.raises(InputError, match="expected"):
+            SparseChoice(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_moved_world_leaves_the_points_as_they_are(model: Path, scene: Known) -> None:
+    """They are in the camera's frame, and only the shape that the training cameras make is looked at."""
+    motion = SE3.exp(torch.tensor([5.0, 1.0, -2.0, 0.3, 1.0, -0.6], dtype=torch.float64))
+    moved = SparsePoints(model, [(name, motion @ T) for name, T in places(scene)], CHOICE)
+    name = scene.views[2].frame.name
+    torch.testing.assert_close(moved.seen(name, "train"), opened(model, scene).seen(name, "train"))
+
+
+def test_no_pose_of_another_split_is_looked_at(model: Path, scene: Known) -> None:
+    """The frame that is sought is not among the places, and its points are right all the same."""
+    sparse = SparsePoints(model, places(scene)[1:], CHOICE)
+    assert sparse.unit.cameras == 5
+    torch.testing.assert_close(sparse.seen(scene.views[0].frame.name, "train"), scene.truth(0))
+
+
+def test_a_few_misplaced_cameras_do_not_change_the_unit(model: Path, scene: Known) -> None:
+    wrong = [(name, T @ SE3.exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64)) if i == 3 else T)
+             for i, (name, T) in enumerate(places(scene))]  # fmt: skip
+    sparse = SparsePoints(model, wrong, CHOICE)
+    assert sparse.unit.cameras < len(wrong)
+    assert sparse.unit.metres == pytest.approx(sparse_model.UNIT, rel=0.02)
+
+
+def test_cameras_that_tell_no_unit_are_refused(model: Path, scene: Known) -> None:
+    one = places(scene)[:1]
+    here = [(name, one[0][1]) for name, _ in places(scene)]
+    other = list(zip([n for n, _ in places(scene)], orbit(3.5, 6, seed=9, elevation=(-60, 10)), strict=True))
+    shuffled = [other[i] for i in (3, 0, 5, 1, 4, 2)]
+    for wrong, said in (
+        (one, "1 of the 1 training cameras, expected at least 2"),
+        ([], "0 of the 0 training cameras"),
+        ([("x", T) for _, T in places(scene)], "0 of the 6 training cameras.* 6 images .train/"),
+        (here, "distinct ones"),
+        (
+            [(a, T) for (a, _), (_, T) in zip(other, shuffled, strict=True)],
+            "is it a model of these images|no similarity",
+        ),
+    ):
+        with pytest.raises(InputError, match=said):
+            SparsePoints(model, wrong, CHOICE)
+    two = SparsePoints(model, places(scene)[:2], CHOICE)
+    assert two.unit.metres == pytest.approx(sparse_model.UNIT)
+    assert "unchecked" in two.summary
+
+
+def test_names_are_matched_by_stem_and_by_folders(scene: Known, tmp_path: Path) -> None:
+    def found(*names: str) -> SparsePoints:
+        return opened(sparse_model.write(tmp_path, replace(scene, names=names)), scene)
+
+    stems = [view.frame.name for view in scene.views]
+    assert len(found(*(f"{stem}.JPG" for stem in stems)).seen(stems[0], "test")) > 0
+    sided = [(f"{side}_{stem}", f"{side}/{stem}.png") for stem in stems[:3] for side in ("left", "right")]
+    both = replace(scene, names=[file for _, file in sided])
+    seen = [(name, T) for (name, _), (_, T) in zip(sided, places(scene), strict=True)]
+    rig = SparsePoints(sparse_model.write(tmp_path, both), seen, CHOICE)
+    assert len(rig.seen(f"right_{stems[0]}", "train")) == len(scene.truth(1))
+    with pytest.raises(InputError, match=f"frame '{stems[1]}' may be any of"):
+        found(*(f"{side}/{stem}.png" for side in ("left", "right") for stem in stems[1:4]))
+
+
+def test_splits_in_folders_of_their_own_are_not_mistaken_for_each_other(scene: Known, tmp_path: Path) -> None:
+    """Names repeat between splits as in NeRF-Synthetic: train/r_0.png and test/r_0.png."""
+    stems = [view.frame.name for view in scene.views]
+    names = [f"test/{stems[0]}.png", *(f"train/{stem}.png" for stem in stems[:5])]
+    model = sparse_model.write(tmp_path, replace(scene, names=names))
+    seen = [(stem, view.T_ref_camera) for stem, view in zip(stems, scene.views[1:], strict=False)]
+    sparse = SparsePoints(model, seen, CHOICE)
+    torch.testing.assert_close(sparse.seen(stems[0], "test"), scene.truth(0))
+    torch.testing.assert_close(sparse.seen(stems[0], "train"), scene.truth(1))
+    assert len(sparse.seen(stems[3], "test")) == 0
+
+
+# Depth from it.
+
+
+def test_a_rig_has_the_points_of_all_its_views_in_the_frame_of_the_last(model: Path, scene: Known) -> None:
+    views = list(scene.views[:3])
+    rays = opened(model, scene).rays(views, "train")
+    world = views[-1].T_ref_camera.apply(rays.points)
+    expected = [scene.views[i].T_ref_camera.apply(scene.truth(i)) for i in range(3)]
+    torch.testing.assert_close(world, torch.cat(expected))
+    centres = views[-1].T_ref_camera.apply(rays.origins)
+    torch.testing.assert_close(centres[0], views[0].T_ref_camera.translation)
+
+
+def test_a_frame_that_the_model_does_not_have_is_told_unless_others_help(model: Path, scene: Known) -> None:
+    sparse = opened(model, scene)
+    stranger = replace(scene.views[0], frame=replace(scene.views[0].frame, name="stranger"))
+    with pytest.raises(InputError, match=r"has no points observed by stranger; it has 6 images"):
+        sparse.rays([stranger], "train")
+    assert len(sparse.rays([stranger, scene.views[1]], "train")) == len(scene.truth(1))
+    assert sparse.onto(bare(stranger), "train").frame.depth is None
+
+
+def test_a_depth_image_of_the_points(model: Path, scene: Known) -> None:
+    """Points lie on pixel centres of one view; seen from others they are a pixel's width off at most."""
+    sparse = opened(model, scene)
+    for place, view in enumerate(scene.views):
+        depth = sparse.onto(bare(view), "train").frame.depth
+        assert depth is not None
+        assert view.frame.depth is not None
+        assert 0 < int((depth > 0).sum()) <= len(scene.truth(place))
+        both = (depth > 0) & (view.frame.depth > 0)
+        assert int(both.sum()) == int((depth > 0).sum())
+        torch.testing.assert_close(depth[both], view.frame.depth[both], rtol=0.02, atol=0)
+    assert sparse.onto(scene.views[0], "train") is scene.views[0]  # has depth of its own
+
+
+def test_of_points_at_one_pixel_the_nearest_is_seen(model: Path, scene: Known) -> None:
+    small = Intrinsics(1.0, 1.0, 0.5, 0.5, 1, 1)
+    frame = Frame(scene.views[0].frame.name, torch.zeros(1, 1, 3), small)
+    depth = opened(model, scene).onto(View(frame, scene.views[0].T_ref_camera), "train").frame.depth
+    assert depth is not None
+    assert float(depth) == pytest.approx(float(scene.truth(0)[:, 2].min()))
+
+
+# What it is good for.
+
+FIELD = GaussianBlobs.random(density=400, samples=96)
+BOUNDS = SceneBounds((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5), 2.0, 6.5, (1.0, 1.0, 1.0))
+CAMERA = Intrinsics(32.0, 32.0, 15.0, 12.0, 30, 24)
+
+
+def photograph(number: int, T: SE3) -> View:
+    image = render_image(FIELD, CAMERA, T, BOUNDS)
+    depth = torch.where(image.opacity > 0.99, image.depth, 0)
+    return View(Frame(f"p{number}", image.rgb, CAMERA, depth), T)
+
+
+def test_a_pose_comes_closer_with_the_points_than_without(tmp_path: Path) -> None:
+    with torch.no_grad():
+        views = [photograph(i, T) for i, T in enumerate(orbit(4.0, 6, seed=1))]
+    what = sparse_model.known(views, [f"{v.frame.name}.jpg" for v in views], each=60, agree=0.004)
+    model = sparse_model.write(tmp_path, what)
+    sparse = SparsePoints(model, places(what)[3:], CHOICE)
+    config = {
+        "rays": 16, "depth_rays": 64, "max_steps": 25, "learning_rate": 0.03, "pivot": "camera", "level": None,
+    }  # fmt: skip
+
+    def error(view: View, rays: Observations | None, back: float) -> float:
+        start = view.T_ref_camera.retract(torch.tensor([0, 0, back, 0, 0, 0], dtype=torch.float64))
+        found = localize(rig(FieldMap(FIELD, BOUNDS), [view], start, rays), "bid", config)
+        return float(pose_error(found.T_world_camera, view.T_ref_camera).translation)
+
+    sought = [bare(view) for view in views[1:3]]
+    pairs = list(zip(sought, (-0.3, -0.3), strict=True))
+    with_points = [error(view, sparse.rays([view], "train"), back) for view, back in pairs]
+    without = [error(view, None, back) for view, back in pairs]
+    assert sum(with_points) < 0.6 * sum(without)
+
+
+def test_training_is_supervised_by_the_points(model: Path, scene: Known) -> None:
+    """Matter of pixels that no point tells of comes nearer to where it is, too."""
+    dense = scene.views
+    views = [opened(model, scene).onto(bare(view), "train") for view in dense]
+    bounds = demo_object().bounds
+    assert not any(view.frame.has_dense_depth for view in views)
+
+    def misplaced(weight: float) -> float:
+        config = tiny.config(steps=40, depth_weight=weight, carve=False)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            field = hashgrid.build(config, bounds)
+            hashgrid.train(field, views, config, Silent())
+        batch = RayBank(dense, bounds).draw(3000, torch.Generator().manual_seed(1))
+        with torch.no_grad():
+            return float(ray_termination(render(field, batch.rays, batch.background), batch))
+
+    assert misplaced(1.0) < 0.9 * misplaced(0.0)
+
+
+def test_the_scene_is_bounded_by_points_where_there_is_nothing_better(model: Path, scene: Known) -> None:
+    """Silhouettes bound the scene where there are any; a box of points alone gets a wide margin."""
+    sparse = opened(model, scene)
+    outlined = [sparse.onto(bare(view), "train") for view in scene.views]
+    assert estimate_bounds(outlined) == estimate_bounds([bare(view) for view in scene.views])
+    plain = [replace(view, frame=replace(view.frame, alpha=None)) for view in outlined]
+    bounds = estimate_bounds(plain)
+    good = scene.points[: scene.good]
+    assert bool((good > torch.tensor(bounds.lower)).all() and (good < torch.tensor(bounds.upper)).all())
+    assert max(bounds.size) < 3

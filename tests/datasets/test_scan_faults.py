@@ -1,0 +1,376 @@
+"""Scans that are cut off, incomplete, too large or of many frames, and what is said of them."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as iio
+import lzfse
+import numpy as np
+import pytest
+import torch
+
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import open_dataset, open_sequence
+from bidnerf_core.datasets.phone_scans import thinned
+from bidnerf_core.datasets.posed_images import ImageFrame
+from bidnerf_core.datasets.video_frames import VideoFrames
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+from bidnerf_core.io import archives
+from bidnerf_core.testing import training_views
+from scan_layouts import (
+    metres,
+    record3d_files,
+    write_euroc,
+    write_kitti,
+    write_polycam,
+    write_reality_capture,
+    write_stray_scanner,
+    write_twelve_scenes,
+    write_video,
+)
+
+Files = dict[str, bytes]
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    return list(training_views())[:4]
+
+
+def remarks_of(path: Path) -> list[str]:
+    """Return the remarks that opening and reading a capture causes."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dataset = open_dataset(path)
+        for split in dataset.splits:
+            dataset.views(split)
+    return [str(warning.message) for warning in caught]
+
+
+def message(path: Path) -> str:
+    """Return the one line that is said of a capture that cannot be read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(InputError) as caught:
+            list(open_sequence(path))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def packed(folder: Path, files: Files, compression: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(folder / "scan.r3d", "w", compression) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return folder / "scan.r3d"
+
+
+def metadata(files: Files, **changes: object) -> Files:
+    return {**files, "metadata": json.dumps({**json.loads(files["metadata"]), **changes}).encode()}
+
+
+# Record3D
+
+
+def test_depth_of_low_confidence_far_away_and_not_finite_is_dropped(
+    views: list[View], tmp_path: Path
+) -> None:
+    """Depth has a quarter of the photo's resolution, each number repeated; four of its pixels hold none."""
+    size = metres(views[0]).shape
+    depth = np.full((size[0] // 4, size[1] // 4), 2.0, np.float32)
+    depth[0, :4] = np.nan, 0, 6, -1
+    sure = np.full(depth.shape, 2, np.uint8)
+    sure[1, :2] = 1, 0
+    files = metadata(record3d_files(views), dw=depth.shape[1], dh=depth.shape[0])
+    files |= {"rgbd/0.depth": lzfse.compress(depth.tobytes()), "rgbd/0.conf": lzfse.compress(sure.tobytes())}
+    found = open_dataset(packed(tmp_path, files)).views("test", ["0"])[0].frame.depth
+    expected = depth.copy()
+    expected[0, :4], expected[1, :2] = 0, 0
+    np.testing.assert_array_equal(found, expected.repeat(4, 0).repeat(4, 1))
+
+
+def test_intrinsics_of_the_first_frame_hold_for_all_where_there_are_no_others(
+    views: list[View], tmp_path: Path
+) -> None:
+    files = metadata(record3d_files(views), perFrameIntrinsicCoeffs=None)
+    frames = list(open_sequence(packed(tmp_path, files)))
+    for timed in frames:
+        torch.testing.assert_close(
+            timed.frame.intrinsics.matrix(), views[0].frame.intrinsics.matrix(), atol=1e-9, rtol=0
+        )
+
+
+def test_a_recording_that_lacks_frames(views: list[View], tmp_path: Path) -> None:
+    files = record3d_files(views)
+    poses = json.loads(files["metadata"])["poses"]
+    poses[3] = [float("nan")] * 7
+    files = metadata(files, poses=poses)
+    del files["rgbd/1.jpg"], files["rgbd/2.depth"]
+    said = remarks_of(packed(tmp_path, files))
+    assert any("1 of 4 images is missing and left out, first: rgbd/1.jpg" in text for text in said)
+    assert any("1 of 3 frames have no depth" in text for text in said)
+    assert any("1 of 3 frames have no pose and are left out" in text for text in said)
+    assert len(said) == 3
+
+
+def test_confidence_that_removes_all_depth_is_said_once_with_its_values(
+    views: list[View], tmp_path: Path
+) -> None:
+    scan = write_polycam(tmp_path / "polycam", views)
+    for file in (scan / "keyframes" / "confidence").iterdir():
+        iio.imwrite(file, np.full(metres(views[0]).shape, 254, np.uint8))
+    said = [text for text in remarks_of(scan) if "confidence" in text]
+    assert len(said) == 1
+    assert "has only the value 254, expected 255 where depth is sure" in said[0]
+    files = record3d_files(views)
+    low = np.zeros(metres(views[0]).shape, np.uint8)
+    low[0] = 1
+    assert remarks_of(packed(tmp_path, files)) == []
+    (said_of_one,) = remarks_of(packed(tmp_path, files | {"rgbd/1.conf": lzfse.compress(low.tobytes())}))
+    assert "rgbd/1.conf: has the values 0 and 1, expected 2 where depth is sure" in said_of_one
+
+
+def without_poses(files: Files) -> Files:
+    return metadata(files, poses=[])
+
+
+def without_photos(files: Files) -> Files:
+    return {name: content for name, content in files.items() if not name.endswith(".jpg")}
+
+
+def cut_depth(files: Files) -> Files:
+    return {**files, "rgbd/0.depth": files["rgbd/0.depth"][:50]}
+
+
+def long_depth(files: Files) -> Files:
+    return {**files, "rgbd/0.depth": lzfse.compress(bytes(10**7))}
+
+
+def random_depth(files: Files) -> Files:
+    return {**files, "rgbd/0.depth": bytes(range(256)) * 1000}
+
+
+RECORDINGS: dict[str, tuple[Callable[[Files], Files], str]] = {
+    "no poses": (without_poses, "scan.r3d/metadata: no poses, expected a list of qx qy qz qw tx ty tz"),
+    "pose of 6": (lambda f: metadata(f, poses=[[0] * 6] * 4), "pose 0: is not 7 numbers"),
+    "quaternion": (lambda f: metadata(f, poses=[[1, 1, 0, 0, 0, 0, 0]] * 4), "pose 0: the quaternion has length 1.41"),
+    "no photos": (without_photos, "rgbd/0.jpg: no such photo"),
+    "no metadata": (lambda f: {"icon": b""}, "scan.r3d/metadata: not found in the archive, which holds 1 file"),
+    "no size": (lambda f: metadata(f, w=None), "no w and h"),
+    "no K": (lambda f: metadata(f, K=None, perFrameIntrinsicCoeffs=None), "no K with 9 numbers"),
+    "metadata": (lambda f: {**f, "metadata": b"{"}, "scan.r3d/metadata: not JSON"),
+    "cut depth": (cut_depth, "rgbd/0.depth: "),
+    "long depth": (long_depth, "rgbd/0.depth: "),
+    "random depth": (random_depth, "rgbd/0.depth: has 256000 bytes, expected at most"),
+    "cut photo": (lambda f: {**f, "rgbd/0.jpg": f["rgbd/0.jpg"][:900]}, "rgbd/0.jpg: not readable as an image"),
+    "empty photo": (lambda f: {**f, "rgbd/0.jpg": b""}, "(the file is empty)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", RECORDINGS)
+def test_bad_recordings(case: str, views: list[View], tmp_path: Path) -> None:
+    change, expected = RECORDINGS[case]
+    assert expected in message(packed(tmp_path, change(record3d_files(views))))
+
+
+def test_an_archive_cut_in_half_and_one_that_is_none(views: list[View], tmp_path: Path) -> None:
+    file = packed(tmp_path, record3d_files(views))
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2])
+    assert "scan.r3d: ends too early, probably an incomplete copy" in message(file)
+    file.write_bytes(b"no zip at all")
+    assert "scan.r3d: is not a zip archive" in message(file)
+
+
+def test_members_that_unpack_to_too_much(
+    views: list[View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The size that the archive states is checked first, and what comes out of it as well."""
+    file = packed(tmp_path, {**record3d_files(views), "metadata": bytes(10**6)}, zipfile.ZIP_DEFLATED)
+    monkeypatch.setattr(archives, "LARGEST_MEMBER", 10**5)
+    assert "scan.r3d/metadata: unpacks to 1 MiB, expected at most 0 MiB" in message(file)
+    content = file.read_bytes().replace((10**6).to_bytes(4, "little"), (10**4).to_bytes(4, "little"))
+    file.write_bytes(content)
+    assert "metadata: cannot be unpacked" in message(file) or "metadata: unpacks to" in message(file)
+
+
+def test_the_missing_package_is_named(
+    views: list[View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("lzfse", "liblzfse"):
+        monkeypatch.setitem(sys.modules, name, None)
+    files = record3d_files(views)
+    text = message(packed(tmp_path, files))
+    assert "reading Record3D depth needs the package lzfse: pip install 'bidnerf[record3d]'" in text
+    colour = {name: content for name, content in files.items() if not name.endswith((".depth", ".conf"))}
+    assert all(timed.frame.depth is None for timed in open_sequence(packed(tmp_path, colour)))
+
+
+# Polycam
+
+
+def test_undistorted_photos_hide_their_border(views: list[View], tmp_path: Path) -> None:
+    for corrected in (True, False):
+        folder = write_polycam(tmp_path / str(corrected), views, corrected)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            hidden = next(iter(open_sequence(folder))).frame.hidden
+        assert (hidden is not None) == corrected
+        if hidden is not None:
+            assert not bool(hidden[15:-15, 15:-15].any())
+            assert int((~hidden).sum()) == (hidden.shape[0] - 30) * (hidden.shape[1] - 30)
+
+
+def test_cameras_without_a_size_and_photos_without_a_camera(views: list[View], tmp_path: Path) -> None:
+    folder = write_polycam(tmp_path, views)
+    cameras = sorted((folder / "keyframes/corrected_cameras").iterdir())
+    for file in cameras:
+        content = json.loads(file.read_text())
+        del content["width"], content["height"]
+        file.write_text(json.dumps(content))
+    assert open_dataset(folder).views("test")[0].frame.intrinsics == views[0].frame.intrinsics
+    cameras[1].unlink()
+    (folder / "keyframes/depth" / f"{cameras[2].stem}.png").unlink()
+    (folder / "keyframes/corrected_images" / f"{cameras[3].stem}.jpg").unlink()
+    said = remarks_of(folder)
+    assert any("1 of 3 photos is missing and left out" in text for text in said)
+    assert any("1 of 3 photos have no camera in corrected_cameras" in text for text in said)
+    assert any("1 of 2 photos have no depth" in text for text in said)
+    assert len(said) == 3
+
+
+def test_poses_that_drift_are_said_to(views: list[View], tmp_path: Path) -> None:
+    (said,) = remarks_of(write_polycam(tmp_path, views, corrected=False))
+    assert "has no corrected_cameras, so the poses are ARKit's, which drift" in said
+
+
+# Stray Scanner
+
+
+def test_a_video_of_another_length_and_missing_depth(views: list[View], tmp_path: Path) -> None:
+    folder = write_stray_scanner(tmp_path, views)
+    write_video(folder / "rgb.mp4", [np.full((96, 128, 3), 50, np.uint8)] * 3)
+    (folder / "depth/000001.png").unlink()
+    said = remarks_of(folder)
+    assert any("1 of 4 frames is missing and left out, first: frame 3" in text for text in said)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert [timed.frame.depth is not None for timed in open_sequence(folder)] == [True, False, True]
+    with (folder / "odometry.csv").open("a") as file:
+        file.write("1000.7")
+    assert any("the last row is truncated and was left out" in text for text in remarks_of(folder))
+
+
+def test_intrinsics_of_each_frame(views: list[View], tmp_path: Path) -> None:
+    folder = write_stray_scanner(tmp_path, views)
+    rows = (folder / "odometry.csv").read_text().splitlines()
+    rows = [
+        f"{rows[0]}, fx, fy, cx, cy",
+        *(f"{row}, {100 + n}, 101, 63.5, 47.5" for n, row in enumerate(rows[1:])),
+    ]
+    (folder / "odometry.csv").write_text("\n".join(rows))
+    found = [timed.frame.intrinsics for timed in open_sequence(folder)]
+    assert [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in found] == [
+        (100 + n, 101, 64, 48) for n in range(4)
+    ]
+
+
+def test_frames_of_a_video_in_any_order(tmp_path: Path) -> None:
+    """Each frame is of one grey, which tells its number."""
+    write_video(tmp_path / "v.mp4", [np.full((32, 48, 3), 8 * number, np.uint8) for number in range(30)])
+    video = VideoFrames(tmp_path / "v.mp4")
+    assert len(video) == 30
+    assert video.size == (48, 32)
+    for number in (0, 1, 2, 9, 8, 29, 13, 14, 0):
+        assert float(video.read(number).float().mean()) == pytest.approx(8 * number, abs=2)
+    with pytest.raises(InputError, match="has 30 frames"):
+        video.read(30)
+    content = (tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "v.mp4").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match=r"v\.mp4: "):
+        VideoFrames(tmp_path / "v.mp4").read(0)
+
+
+def test_five_frames_a_second_are_kept() -> None:
+    camera = CameraSource()
+    for rate, kept in ((60, 12), (30, 6), (10, 2), (5, 1), (2, 1)):
+        frames = [ImageFrame(Path(f"{n}.png"), camera, None, 10 + n / rate) for n in range(120)]
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            found, others = thinned(Path("scan"), frames)
+        assert [int(frame.stem) for frame in found] == list(range(0, 120, kept))
+        assert len(found) + len(others) == 120
+        assert len(said) == (kept > 1)
+
+
+# Data sets
+
+
+def test_frames_of_twelve_scenes_whose_tracking_failed(views: list[View], tmp_path: Path) -> None:
+    folder = write_twelve_scenes(tmp_path, views)
+    (folder / "data/frame-000002.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
+    assert any("1 of 4 images have no pose and are left out" in text for text in remarks_of(folder))
+    assert open_dataset(folder).frame_names("test") == ["frame-000000", "frame-000001"]
+    assert [timed.truth is None for timed in open_sequence(folder)] == [False, False, True, False]
+    assert len(open_sequence(folder / "data")) == 4
+
+
+def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path) -> None:
+    """The depth camera sees twice as much: what it sees in the middle is what the photo shows."""
+    folder = write_twelve_scenes(tmp_path, views)
+    info = (folder / "info.txt").read_text()
+    line = next(line for line in info.splitlines() if line.startswith("m_calibrationDepthIntrinsic"))
+    (folder / "info.txt").write_text(info.replace(line, line.replace("130.0", "65.0")))
+    iio.imwrite(folder / "data/frame-000000.depth.png", np.full((96, 128), 1500, np.uint16))
+    depth = open_dataset(folder).views("test", ["frame-000000"])[0].frame.depth
+    assert depth is not None
+    assert depth.unique().tolist() == pytest.approx([1.5])
+
+
+def test_lists_of_photos_that_are_not_there(views: list[View], tmp_path: Path) -> None:
+    folder = write_reality_capture(tmp_path, views)
+    (folder / "2.png").unlink()
+    (said,) = remarks_of(folder)
+    assert "cameras.csv: 1 of 4 photos is missing and left out, first: 2.png" in said
+    text = (folder / "cameras.csv").read_text()
+    (folder / "cameras.csv").write_text(text.replace(",0,0,0,0,0,0\n", ",0,0,0,0.1,0,0\n").replace("\r", ""))
+    text = (folder / "cameras.csv").read_text()
+    (folder / "cameras.csv").write_text(text.replace(",f,", ",focal,"))
+    assert "has no column f, expected the export 'Internal/External camera parameters'" in message(folder)
+
+
+def test_sequences_without_poses_and_with_missing_images(views: list[View], tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path / "kitti", views)
+    (folder / "image_2/000001.png").unlink()
+    assert any("1 of 4 images are missing, first: number 1" in text for text in remarks_of(folder))
+    (tmp_path / "kitti/poses/07.txt").unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert [timed.truth for timed in open_sequence(folder)] == [None] * 3
+        with pytest.raises(
+            InputError, match=r"has no poses, expected poses\.txt in it, or \.\./\.\./poses/07\.txt"
+        ):
+            open_dataset(folder)
+    folder = write_euroc(tmp_path / "euroc", views)
+    next(iter(sorted((folder / "mav0/cam0/data").iterdir()))).unlink()
+    assert any("1 of 4 images is missing and left out" in text for text in remarks_of(folder))
+    sensor = folder / "mav0/cam0/sensor.yaml"
+    sensor.write_text(
+        sensor.read_text()
+        .replace("radial-tangential", "equidistant")
+        .replace("[0.0, 0.0, 0.0, 0.0]", "[0.1, 0.0, 0.0, 0.0]")
+    )
+    assert "distortion_model is equidistant, expected radial-tangential" in message(folder)
+
+
+def test_archives_are_to_be_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "scan.zip").write_bytes(b"PK")
+    assert "is a file, expected the folder of a dataset; unpack the archive first" in message(
+        tmp_path / "scan.zip"
+    )

@@ -1,0 +1,232 @@
+"""Sequences: the order of time, every frame once, lazily, whatever the dataset."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+import tiny
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import (
+    Dataset,
+    FileSequence,
+    FrameSequence,
+    Reader,
+    ReadingProgress,
+    ReadOptions,
+    open_dataset,
+    open_sequence,
+    write_transforms,
+)
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+
+NAMES = ("b_10", "b_2", "a_3", "b_1")
+
+
+def write_file(folder: Path, extra: Sequence[dict[str, Any]], **lists: list[str]) -> Path:
+    """Write ``transforms.json`` of four images, with further entries for each frame."""
+    frames = []
+    for number, (name, more) in enumerate(zip(NAMES, extra, strict=True)):
+        pose = np.eye(4)
+        pose[0, 3] = number
+        frames.append({"file_path": f"{name}.png", "transform_matrix": pose.tolist(), **more})
+        iio.imwrite(folder / f"{name}.png", np.full((6, 8, 3), number, np.uint8))
+    content = {"fl_x": 8.0, "w": 8, "h": 6, "frames": frames, **lists}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def names(sequence: FrameSequence) -> list[str]:
+    return [timed.frame.name for timed in sequence]
+
+
+@pytest.mark.parametrize("key", ["time", "timestamp"])
+def test_frames_are_in_the_order_of_their_times(key: str, tmp_path: Path) -> None:
+    sequence = open_sequence(write_file(tmp_path, [{key: time} for time in (3.5, -1, 2.0, 0)]))
+    assert isinstance(sequence, FrameSequence)
+    assert names(sequence) == ["b_2", "b_1", "a_3", "b_10"]
+    assert [timed.time for timed in sequence] == [-1, 0, 2, 3.5]
+    for timed in sequence:  # pose and image belong together
+        assert timed.truth is not None
+        assert float(timed.truth.translation[0]) == round(float(timed.frame.rgb[0, 0, 0]) * 255)
+
+
+def test_the_source_of_a_frame_may_be_its_time(tmp_path: Path) -> None:
+    stamps = ("1305031103.25", "1305031102.175304", "1305031102.311267", "1305031102.1")
+    sequence = open_sequence(write_file(tmp_path, [{"source": f"rgb/{stamp}.png"} for stamp in stamps]))
+    assert names(sequence) == ["b_1", "b_2", "a_3", "b_10"]
+    assert [timed.time for timed in sequence] == sorted(map(float, stamps))
+
+
+@pytest.mark.parametrize(
+    "extra", [[{}] * 4, [{"time": 1}, {}, {"time": 0}, {"time": 2}], [{"source": "IMG_12.png"}] * 4]
+)
+def test_without_times_the_order_is_that_of_names(extra: list[dict[str, Any]], tmp_path: Path) -> None:
+    sequence = open_sequence(write_file(tmp_path, extra))
+    assert names(sequence) == ["a_3", "b_1", "b_2", "b_10"]
+    assert [timed.time for timed in sequence] == [None] * 4
+
+
+@pytest.mark.parametrize("time", ["noon", True, [1], 1e400, 10**400])
+def test_a_time_that_is_none_is_refused(time: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"transforms\.json: frame 0: time is .*, expected a finite number"):
+        open_sequence(write_file(tmp_path, [{"time": time}, {}, {}, {}]))
+
+
+def test_every_frame_occurs_once_though_splits_share_it(tmp_path: Path) -> None:
+    """Exports of nerfstudio list the same images as val and as test."""
+    lists = {
+        "train_filenames": ["b_10.png"],
+        "val_filenames": ["b_2.png"],
+        "test_filenames": ["b_2.png", "./a_3.png"],
+    }
+    sequence = open_sequence(write_file(tmp_path, [{}] * 4, **lists))
+    assert [(timed.frame.name, timed.split) for timed in sequence] == [
+        ("a_3", "test"),
+        ("b_2", "val"),
+        ("b_10", "train"),
+    ]
+
+
+def test_names_that_splits_share_are_told_apart(tmp_path: Path) -> None:
+    write_transforms(tmp_path, {"train": tiny.views(2), "test": tiny.views(1)})
+    found = names(open_sequence(tmp_path))
+    assert len(set(found)) == 3
+    assert open_dataset(tmp_path).frame_names("test")[0] in {name.removeprefix("test_") for name in found}
+
+
+def test_sequences_are_indexed_and_reversed_without_reading(tmp_path: Path) -> None:
+    sequence = open_sequence(write_file(tmp_path, [{"time": n} for n in range(4)]))
+    assert isinstance(sequence, FileSequence)
+    (tmp_path / "b_2.png").unlink()
+    assert sequence.names == list(NAMES)
+    assert sequence.times == [0, 1, 2, 3]
+    assert names(sequence[::2]) == ["b_10", "a_3"]
+    assert names(sequence[::-1][:2]) == ["b_1", "a_3"]
+    assert sequence[-1].frame.name == "b_1"
+    with pytest.raises(InputError, match=r"b_2\.png: no such file"):
+        sequence[1]
+    with pytest.raises(IndexError):
+        sequence[4]
+
+
+def test_datasets_of_other_readers_have_sequences(tmp_path: Path) -> None:
+    class Others:
+        path, splits, background = tmp_path, ("train", "test"), (0.0, 0.0, 0.0)
+        seen = {view.frame.name: view for view in tiny.views(3)}  # noqa: RUF012
+
+        def frame_names(self, split: str) -> list[str]:
+            return list(self.seen)[:2] if split == "train" else list(self.seen)[2:]
+
+        def views(
+            self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+        ) -> list[View]:
+            return [self.seen[name] for name in names or self.frame_names(split)]
+
+    class Anything(Reader):
+        expected = "anything"
+
+        def recognises(self, path: Path) -> bool:
+            return True
+
+        def open(self, path: Path, options: ReadOptions) -> Dataset:
+            return Others()
+
+    sequence = open_sequence(tmp_path, readers=[Anything()])
+    assert names(sequence) == list(Others.seen)
+    assert [timed.split for timed in sequence] == ["train", "train", "test"]
+    with pytest.raises(InputError, match="with its own cameras"):
+        open_sequence(tmp_path, readers=[Anything()], focal=100.0)
+
+
+def test_a_folder_of_images(tmp_path: Path) -> None:
+    for stem, value in (("10", 1), ("9", 0)):
+        iio.imwrite(tmp_path / f"{stem}.png", np.full((6, 8, 3), value, np.uint8))
+    iio.imwrite(tmp_path / "9.depth.png", np.full((6, 8), 1500, np.uint16))
+    frames = list(open_sequence(tmp_path, hfov=90))
+    assert [timed.frame.name for timed in frames] == ["9", "10"]
+    assert [timed.time for timed in frames] == [None, None]
+    assert frames[0].frame.intrinsics == Intrinsics(4, 4, 4, 3, 8, 6).from_hfov(90, 8, 6)
+    assert frames[0].frame.depth is not None
+    assert float(frames[0].frame.depth.mean()) == pytest.approx(1.5)
+    assert frames[1].frame.depth is None
+    with pytest.raises(InputError, match="no focal length in EXIF, expected a camera"):
+        list(open_sequence(tmp_path))
+    assumed = next(iter(open_sequence(tmp_path, assumed=[Intrinsics.from_focal(20, 16, 12)]))).frame
+    assert assumed.intrinsics == Intrinsics.from_focal(10, 8, 6)
+    assert assumed.focal_is_approximate
+
+
+def test_image_names_may_be_times(tmp_path: Path) -> None:
+    for stem in ("12.9", "2.25", "2.125"):
+        iio.imwrite(tmp_path / f"{stem}.png", np.zeros((6, 8, 3), np.uint8))
+    assert [timed.time for timed in open_sequence(tmp_path, focal=8)] == [2.125, 2.25, 12.9]
+
+
+def test_places_without_a_sequence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file or folder"):
+        open_sequence(tmp_path / "gone")
+    with pytest.raises(InputError, match="no images in it"):
+        open_sequence(tmp_path)
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(
+        InputError, match=r"notes\.txt: is a file, expected the folder of a dataset, or a video \(\.mp4"
+    ):
+        open_sequence(tmp_path / "notes.txt")
+    write_transforms(tmp_path, {"train": tiny.views(1)})
+    with pytest.raises(InputError, match="is a dataset with its own cameras; leave out the camera"):
+        open_sequence(tmp_path, camera=tiny.CAMERA)
+
+
+@pytest.mark.data
+def test_a_nerfstudio_export_is_the_dataset_it_was_made_of(data_dir: Path, tmp_path: Path) -> None:
+    """One file, cameras in the frames, lists of names, and the keys that its converters add; the world is the file's."""
+    original = open_dataset(data_dir / "phone_doll")
+    frames: list[dict[str, Any]] = []
+    camera = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
+    for split in ("train", "test"):
+        content = json.loads((data_dir / "phone_doll" / f"transforms_{split}.json").read_text())
+        for number, frame in enumerate(content["frames"]):
+            frames.append(frame | {key: content[key] for key in camera} | {"colmap_im_id": number})
+    lists = {
+        f"{split}_filenames": [f"images/{name}.jpg" for name in original.frame_names(source)]
+        for split, source in (("train", "train"), ("val", "test"), ("test", "test"))
+    }
+    export = {
+        "camera_model": "OPENCV", "orientation_override": "none", "frames": frames, "ply_file_path": "sparse_pc.ply",
+        "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], **lists,
+    }  # fmt: skip
+    (tmp_path / "transforms.json").write_text(json.dumps(export))
+    (tmp_path / "images").symlink_to(data_dir / "phone_doll" / "images")
+    found = open_dataset(tmp_path)
+    assert found.splits == ("train", "val", "test")
+    for split in ("train", "test"):
+        names = original.frame_names(split)[:6]
+        for view, expected in zip(found.views(split, names), original.views(split, names), strict=True):
+            assert view.frame.intrinsics == expected.frame.intrinsics
+            assert torch.equal(view.frame.rgb, expected.frame.rgb)
+            torch.testing.assert_close(view.T_ref_camera.matrix(), expected.T_ref_camera.matrix())
+    assert len(open_sequence(tmp_path)) == 97
+
+
+@pytest.mark.data
+def test_a_recorded_sequence_is_one_video(data_dir: Path) -> None:
+    """Train and test together are every fourth frame of a video at 30 Hz, in which the camera does not jump."""
+    sequence = open_sequence(data_dir / "tum_fr1_xyz")
+    assert isinstance(sequence, FileSequence)
+    times = torch.tensor([time for time in sequence.times if time is not None], dtype=torch.float64)
+    assert len(times) == len(sequence) == 199
+    assert 0.1 < float(times.diff().min()) < float(times.diff().max()) < 0.3  # one frame is missing
+    truths = [timed.truth for timed in sequence[:40]]
+    steps = [float((b.translation - a.translation).norm()) for a, b in pairwise(truths) if a and b]
+    assert len(steps) == 39
+    assert max(steps) < 0.1

@@ -1,0 +1,121 @@
+"""Models of depth sensors: their numbers agree with their sources, and everything that uses them does."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Generator
+
+import baked
+from bidnerf_core import Intrinsics, Localizer
+from bidnerf_core.depth import (
+    DEPTH_SENSORS,
+    UNKNOWN,
+    DepthNoise,
+    DepthSensorModel,
+    find_depth_sensor,
+    noise_remark,
+)
+from bidnerf_core.depth.sensors import KINECT, REALSENSE, RENDERED
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization import AutoConfig, settings_of
+from commands import Run
+from problems import FieldMap
+
+
+def test_the_kinects_noise_is_that_of_half_a_pixel_of_disparity() -> None:
+    disparities_a_pixel, focal, baseline = 8, 580.0, 0.075  # of the infrared camera: pixels, metres
+    half_a_step = 0.5 / (disparities_a_pixel * focal * baseline)
+    assert KINECT.noise.deviation(1.0) == pytest.approx(half_a_step, rel=0.02)
+    assert KINECT.noise.deviation(5.0) == pytest.approx(0.04, rel=0.15)  # "about 4 cm at the maximum range"
+
+
+def test_the_realsenses_noise_is_about_that_of_intels_formula() -> None:
+    focal = 848 / 2 / math.tan(math.radians(90) / 2)
+    for z in (1.0, 2.0, 3.0):
+        assert REALSENSE.noise.deviation(z) == pytest.approx(0.08 * z**2 / (focal * 0.050), rel=0.6)
+
+
+def test_an_unknown_sensor_has_no_lengths_in_metres() -> None:
+    assert UNKNOWN.offset == UNKNOWN.noise.constant == UNKNOWN.noise.quadratic == 0
+
+
+@pytest.mark.parametrize("name", DEPTH_SENSORS)
+def test_noise_grows_with_the_distance_and_is_the_same_for_numbers_and_tensors(name: str) -> None:
+    noise, depth = DEPTH_SENSORS[name].noise, torch.linspace(0.3, 8.0, 20, dtype=torch.float64)
+    deviations = noise.deviation(depth)
+    assert bool((deviations > 0).all())
+    assert bool((deviations.diff() > 0).all())
+    assert deviations.tolist() == pytest.approx([noise.deviation(z) for z in depth.tolist()])
+
+
+def test_negative_deviations_are_refused() -> None:
+    with pytest.raises(InputError, match="expected finite coefficients of 0 or more"):
+        DepthNoise(linear=-0.01)
+    with pytest.raises(InputError, match="expected finite numbers of 0 or more"):
+        DepthSensorModel(0.01, DepthNoise(), offset=-1)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_deviations_that_are_not_finite_are_refused(value: float) -> None:
+    for part in ("constant", "linear", "quadratic"):
+        with pytest.raises(InputError, match="expected finite coefficients of 0 or more"):
+            DepthNoise(**{part: value})
+    for part in ("scale", "offset"):
+        with pytest.raises(InputError, match="expected finite numbers of 0 or more"):
+            replace(UNKNOWN, **{part: value})
+
+
+def test_another_name_is_an_error_that_lists_the_names() -> None:
+    with pytest.raises(InputError, match="unknown, kinect, realsense, lidar, rendered"):
+        find_depth_sensor("sonar")
+    with pytest.raises(InputError, match="unknown, kinect, realsense, lidar, rendered"):
+        AutoConfig(depth_sensor="sonar")
+    with pytest.raises(InputError, match="did you mean 'kinect'"):
+        find_depth_sensor("kinekt")
+
+
+def test_the_commands_take_a_sensor_by_name(bidnerf: Run) -> None:
+    for words in (("track", "MAP", "DATA", "--out", "t.txt"), ("localize", "MAP", "DATA")):
+        failed = bidnerf(*words, "--depth-sensor", "sonar")
+        assert failed.status != 0
+        assert "expected one of unknown, kinect," in " ".join(failed.err.replace("│", " ").split())
+
+
+def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -> None:
+    camera = Intrinsics.from_focal(100.0, 120, 90)
+    depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (
+        1 + 0.02 * torch.randn((90, 120), generator=generator)
+    )
+    remark = noise_remark(depth, camera, "kinect")
+    assert remark is not None
+    assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", remark)
+    assert noise_remark(torch.zeros_like(depth), camera, "kinect") is None
+
+
+def test_the_localizer_has_the_sensor_of_its_settings() -> None:
+    scene = FieldMap(baked.FIELD, baked.BOUNDS, baked.toy())
+    assert Localizer(scene, warm_up=False).depth_sensor == UNKNOWN
+    assert Localizer(scene, "bid", warm_up=False).depth_sensor == UNKNOWN
+    config = settings_of("auto", {"depth_sensor": "kinect"})
+    assert Localizer(scene, config=config, warm_up=False).depth_sensor == KINECT
+
+
+def test_the_covariance_of_a_pose_by_depth_grows_with_the_scale_of_the_sensor() -> None:
+    scene, view = FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), baked.unseen()[0]
+    by_sensor = {}
+    for name in ("rendered", "unknown", "kinect"):
+        config = settings_of("auto", {"depth_sensor": name, "hypotheses": 32, "rounds": 1, "refine_steps": 0})
+        by_sensor[name] = Localizer(scene, config=config, warm_up=False)(view.frame)
+    sizes = {}
+    for name, found in by_sensor.items():
+        assert found.covariance is not None
+        sizes[name] = float(found.covariance[:3, :3].trace())
+    # The pose is the same, so the covariances differ by the squared scales alone.
+    ratio = (sizes["kinect"] - sizes["rendered"]) / (sizes["unknown"] - sizes["rendered"])
+    assert ratio == pytest.approx((KINECT.scale / UNKNOWN.scale) ** 2, rel=1e-3)
+    assert RENDERED.scale == 0

@@ -1,0 +1,504 @@
+"""Benches: planned from a seed, resumed after any kill, the same whoever runs them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import random
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+import tiny
+from bidnerf_core.cli import main
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import (
+    Plan,
+    ResultsFile,
+    ResultTable,
+    Trial,
+    TrialResult,
+    planned,
+    read_results,
+    read_runs,
+    run_trial,
+    run_trials,
+)
+from bidnerf_core.evaluation.bench import shard_of
+from bidnerf_core.evaluation.json_lines import as_line
+from bidnerf_core.evaluation.workers import InThisProcess
+from bidnerf_core.geometry import arc, turned_about
+from bidnerf_core.geometry.arcs import mean_up, seen_middle
+from bidnerf_core.io import to_plain
+from bidnerf_core.localization import METHODS
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import closed_form_data, closed_form_map, look_at, orbit
+from bidnerf_core.settings import to_flat
+
+QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
+BLOBS = "demo:blobs"
+Evaluate = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def evaluate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Evaluate:
+    """Runs it on the blobs with few rays and steps; the file is ``tmp_path / "r.jsonl"`` unless named."""
+
+    def run(*more: object, out: Path = tmp_path / "r.jsonl") -> tuple[int, str]:
+        words = ["evaluate", BLOBS, "--out", str(out), *QUICK, *map(str, more)]
+        status = main(words)
+        return status, capsys.readouterr().err
+
+    return run
+
+
+def timeless(path: Path) -> list[dict[str, Any]]:
+    """The lines in order, without what two runs differ in."""
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k not in ("seconds", "peak_memory_bytes")} for line in lines]
+
+
+def blob_trial(seed: int = 0, steps: int = 2) -> Trial:
+    config = json.dumps({"rays": 16, "max_steps": steps})
+    return Trial(BLOBS, BLOBS, (f"{seed:04d}",), "bid", (0.3,), "bid", config, seed)
+
+
+# Plans.
+
+
+def test_a_plan_is_its_protocol_for_each_size() -> None:
+    trials = planned(Plan(BLOBS, BLOBS))
+    assert len(trials) == 72
+    assert [trials[i].size for i in (0, 24, 48)] == [(0.5,), (0.8,), (1.2,)]
+    assert [t.seed for t in trials[:24]] == [t.seed for t in trials[24:48]] == list(range(24))
+    assert len({t.frame for t in trials[:24]}) == 24
+    assert planned(Plan(BLOBS, BLOBS, seed=5))[0].seed == 5
+    few = planned(Plan(BLOBS, BLOBS, sizes=((0.9,),), trials=5, frames=("0003", "0007")))
+    assert sorted({t.frame for t in few}) == ["0003", "0007"]
+    (odd,) = planned(Plan(BLOBS, BLOBS, sizes=((0.1,),), trials=1, device="cpu:0", depth=False))
+    assert (odd.device, odd.depth) == ("cpu:0", False)
+    parallel = planned(Plan(BLOBS, BLOBS, "parallel"))
+    assert [t.seed for t in parallel] == list(range(1234, 1259))
+    assert len({t.frame for t in parallel[:5]}) == 1
+
+
+@pytest.mark.parametrize("shards", [1, 2, 3, 7, 100])
+def test_shards_share_all_trials_between_them(shards: int) -> None:
+    trials = planned(Plan(BLOBS, BLOBS))
+    parts = [shard_of(trials, number, shards) for number in range(shards)]
+    assert sorted(t.seed * 100 + t.size[0] for p in parts for t in p) == sorted(
+        t.seed * 100 + t.size[0] for t in trials
+    )
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    with pytest.raises(InputError, match="shard is"):
+        shard_of(trials, shards, shards)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"protocol": "inerf", "sizes": ((0.5,),)}, "has no sizes"),
+        ({"frames": ("nope",)}, "no frame 'nope'"),
+        ({"split": "train"}, "no split 'train'"),
+        ({"protocol": "parallel", "frames": ("0000",)}, "defines its own frames"),
+        ({"protocol": "parallel", "seed": 3}, "list is fixed"),
+        ({"map": "demo:object"}, "train one with 'bidnerf demo'"),
+        ({"map": "demo:blops"}, "expected demo:blobs"),
+        ({"data": "demo:rom"}, "expected demo:room"),
+        ({"device": "gpu"}, "device 'gpu' does not work"),
+        ({"device": "meta"}, "device 'meta' does not work"),
+        ({"device": "cuda:99"}, "device 'cuda:99' does not work"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(change: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        planned(Plan(**({"map": BLOBS, "data": BLOBS} | change)))
+
+
+# Sequences.
+
+
+def test_a_sequence_goes_round_the_object_in_equal_steps() -> None:
+    poses = [look_at((4 * c, 4 * s, 2.0), (0.0, 0.0, 0.0)) for c, s in _circle(24)]
+    places = arc(poses, 5, 4, 15.0)
+    assert places in ((2, 3, 4, 5), (8, 7, 6, 5))
+    assert arc(poses, 5, 3, 30.0) in ((1, 3, 5), (9, 7, 5))
+    assert arc(poses, 5, 4, 7.0) is None
+    assert arc(poses, 5, 24, 15.0) is not None
+    assert arc(poses, 5, 25, 15.0) is None
+    assert seen_middle(poses).abs().max() < 1e-6
+    assert mean_up(poses).tolist() == pytest.approx([0, 0, 1])
+
+
+def test_a_sequence_follows_a_moved_and_turned_world() -> None:
+    poses = orbit(3.0, 60, elevation=(10, 40), seed=2)
+    move = look_at((1.0, -2.0, 0.5), (3.0, 1.0, 4.0))
+    found = [arc(poses, last, 4, 15.0) for last in range(60)]
+    assert any(found)
+    assert found == [arc([move @ T for T in poses], last, 4, 15.0) for last in range(60)]
+
+
+def test_a_turned_camera_sees_its_middle_in_the_same_place() -> None:
+    pose = look_at((3.0, 1.0, 2.0), (0.2, 0.1, 0.0))
+    middle, up = (torch.tensor(x, dtype=torch.float64) for x in ([0.3, -0.2, 0.1], [0.0, 0.0, 2.0]))
+    turned = turned_about(pose, middle, up, 40.0)
+    assert torch.allclose(turned.inverse().apply(middle), pose.inverse().apply(middle))
+    assert float(pose_error(turned, pose).rotation_deg) == pytest.approx(40)
+    assert torch.allclose(turned_about(turned, middle, up, -40.0).matrix(), pose.matrix())
+
+
+@pytest.fixture
+def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidnerf_core.scenes.closed_form_data.DEMO_CAMERA", tiny.CAMERA)
+
+
+@pytest.mark.usefixtures("small_images")
+def test_closed_form_sequences_are_rendered_at_the_angle_asked_for() -> None:
+    data = closed_form_data("demo:object")
+    names = data.sequence("0002", 3, 15.0)
+    assert names == ("0002@30", "0002@15", "0002")
+    views = data.views("test", names)
+    for first, second in itertools.pairwise(views):
+        assert float(pose_error(first.T_ref_camera, second.T_ref_camera).rotation_deg) == pytest.approx(15)
+    assert all(view.frame.has_depth for view in views)
+    trials = planned(
+        Plan(BLOBS, BLOBS, sizes=((0.9,),), method="bid", config=blob_trial().config, trials=2, images=3)
+    )
+    assert len(run_trial(trials[0]).trial.frames) == 3
+    with pytest.raises(InputError, match="no frame '0024'"):
+        data.views("test", ["0024"])
+
+
+@pytest.mark.usefixtures("small_images")
+@pytest.mark.parametrize("name", ["demo:blobs", "demo:object", "demo:room"])
+def test_closed_form_data_are_a_dataset(name: str) -> None:
+    data = closed_form_data(name)
+    told: list[tuple[int, int]] = []
+    views = data.views("test", ["0000", "0001"], lambda *now: told.append(now))
+    assert told == [(1, 2), (2, 2)]
+    assert [view.frame.name for view in views] == ["0000", "0001"]
+    assert all(view.frame.has_depth for view in views)
+    assert len(data.frame_names("test")) == len(data.poses)
+
+
+def test_blobs_are_localized() -> None:
+    """The bench's own map is a real one: its poses are found, to a millimetre of the cube of 2."""
+    config = json.dumps({"rays": 256, "max_steps": 100})
+    result = run_trial(Trial(BLOBS, BLOBS, ("0002",), "bid", (0.3,), "bid", config, 2))
+    assert result.error is not None
+    assert result.error.translation < 0.01
+    assert closed_form_map(BLOBS).info.weights == "exact"
+
+
+# Resuming.
+
+
+@pytest.mark.slow
+def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(
+    tmp_path: Path, evaluate: Evaluate
+) -> None:
+    whole, killed = tmp_path / "whole.jsonl", tmp_path / "killed.jsonl"
+    more = ("--trials", 10, "--size", "0.3")
+    began = time.monotonic()
+    assert evaluate(*more, out=whole)[0] == 0
+    seconds = time.monotonic() - began
+    chance, kills, known = random.Random(0), 0, set[bytes]()
+    for _ in range(40):
+        child = os.fork()
+        if child == 0:
+            silent = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(silent, 1)
+            os.dup2(silent, 2)
+            os._exit(main(["evaluate", BLOBS, "--out", str(killed), *QUICK, *map(str, more)]))
+        time.sleep(chance.uniform(0.1, 0.6) * seconds)
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        lines = killed.read_bytes().split(b"\n")[:-1] if killed.exists() else []
+        assert known <= set(lines), "a finished trial was lost or run again"
+        known = set(lines)
+        kills += os.WIFSIGNALED(status)
+        if os.WIFEXITED(status):
+            break
+    assert kills >= 1
+    assert evaluate(*more, out=killed)[0] == 0
+    assert timeless(killed) == timeless(whole)
+
+
+def _written(path: Path, *seeds: int) -> list[TrialResult]:
+    results = [run_trial(blob_trial(seed)) for seed in seeds]
+    ResultTable(tuple(results)).save(path)
+    return results
+
+
+@pytest.mark.parametrize("kept", [0.01, 0.5, 0.999])
+def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, kept: float) -> None:
+    path = tmp_path / "r.jsonl"
+    first, second = _written(path, 0, 1)
+    whole = path.read_bytes()
+    half = as_line(to_plain(second))
+    path.write_bytes(as_line(to_plain(first)) + half[: max(1, int(kept * len(half)) - 1)])
+    assert read_results([path]) == [first]
+    with ResultsFile(path) as file:
+        assert list(file.results.values()) == [first]
+        assert path.read_bytes() == as_line(to_plain(first))
+        file.add(second)
+    assert path.read_bytes() == whole
+
+
+def test_a_last_line_that_lacks_only_its_end_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    results = _written(path, 0, 1)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    with ResultsFile(path) as file:
+        assert list(file.results.values()) == results
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"my notes", "line 1: not JSON"),
+        (b'{"a": 1}', "line 1: TrialResult has no field 'a'"),
+        (b'{"T_world_camera": \n{}\n', "line 1: not JSON"),
+        (b"\xff\xfe\n", "line 1: not JSON"),
+    ],
+)
+def test_a_file_of_something_else_is_left_alone(
+    tmp_path: Path, evaluate: Evaluate, content: bytes, said: str
+) -> None:
+    path = tmp_path / "r.jsonl"
+    path.write_bytes(content)
+    status, err = evaluate("--trials", 1)
+    assert (status, err.count("\n")) == (1, 1)
+    assert said in err
+    assert path.read_bytes() == content
+
+
+def test_a_file_is_written_by_one_at_a_time(tmp_path: Path, evaluate: Evaluate) -> None:
+    with ResultsFile(tmp_path / "r.jsonl"):
+        status, err = evaluate("--trials", 1)
+    assert status == 1
+    assert "another process is writing to it" in err
+
+
+def test_results_come_in_the_order_of_the_plan(tmp_path: Path) -> None:
+    trials = [blob_trial(seed) for seed in range(3)]
+    with ResultsFile(tmp_path / "r.jsonl") as file:
+        for trial in (blob_trial(9), *reversed(trials)):
+            file.add(run_trial(trial))
+        file.put_in_order(trials)
+        file.add(run_trial(blob_trial(4)))  # still the same file
+    assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [9, 0, 1, 2, 4]
+
+
+def test_more_trials_and_other_methods_go_into_the_same_file(tmp_path: Path, evaluate: Evaluate) -> None:
+    assert evaluate("--trials", 2, "--size", 0.3)[0] == 0
+    before = (tmp_path / "r.jsonl").read_bytes()
+    status, err = evaluate("--trials", 3, "--size", 0.3)
+    assert status == 0
+    assert "2 of 3 trials are already there" in err
+    assert (tmp_path / "r.jsonl").read_bytes().startswith(before)
+    assert evaluate("--trials", 2, "--method", "inerf", "--protocol", "inerf")[0] == 0
+    assert [r.method for r in read_results([tmp_path / "r.jsonl"])] == ["bid"] * 3 + ["inerf"] * 2
+    assert len(read_runs(tmp_path / "r.jsonl")) == 3
+    command = read_runs(tmp_path / "r.jsonl")[1].command
+    assert command.startswith("bidnerf evaluate demo:blobs --out")
+
+
+def test_another_training_of_the_map_is_not_mixed_in(tmp_path: Path, evaluate: Evaluate) -> None:
+    assert evaluate("--trials", 1, "--size", 0.3)[0] == 0
+    path = tmp_path / "r.jsonl"
+    content = path.read_text()
+    path.write_text(content.replace('"weights": "exact"', '"weights": "other"'))
+    status, err = evaluate("--trials", 1, "--size", 0.3)
+    assert status == 1
+    assert "another training run of map demo:blobs (other, expected exact)" in err
+    path.write_text(content.replace('"depth_weight": 1.0', '"depth_weight": 0.5'))
+    assert "was made with depth_weight 0.5, expected 1.0" in evaluate("--trials", 1, "--size", 0.3)[1]
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    return tiny.write_dataset(tmp_path / "photos")
+
+
+def test_results_of_other_images_are_refused(
+    tmp_path: Path, photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Folders are known by name, so the content decides: a moved copy is the same data, a changed one is not."""
+
+    def run(data: Path) -> tuple[int, str]:
+        words = ["evaluate", BLOBS, str(data), "--out", str(tmp_path / "r.jsonl"), *QUICK, "--size", "0.3"]
+        status = main([*words, "--trials", "3"])
+        return status, capsys.readouterr().err
+
+    assert run(photos)[0] == 0
+    before = (tmp_path / "r.jsonl").read_bytes()
+    status, err = run(Path(shutil.copytree(photos, tmp_path / "moved" / "photos")))
+    assert (status, "3 of 3 trials are already there" in err) == (0, True)
+    for what in ("images", "depth", "transforms.json"):
+        changed = Path(shutil.copytree(photos, tmp_path / what / "photos"))
+        if what == "transforms.json":
+            about = json.loads((changed / what).read_text())
+            for frame in about["frames"]:
+                frame["transform_matrix"][0][3] += 0.25
+            (changed / what).write_text(json.dumps(about))
+        else:
+            for image in (changed / what).glob("t_*.png"):
+                iio.imwrite(image, iio.imread(image)[::-1])
+        status, err = run(changed)
+        assert (status, err.count("\n")) == (1, 1), err
+        assert "made with other images, depth, masks or cameras" in err
+    assert (tmp_path / "r.jsonl").read_bytes() == before
+
+
+def test_results_of_an_earlier_version_are_resumed_and_reported(
+    tmp_path: Path, evaluate: Evaluate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "r.jsonl"
+    here = Path(__file__).parent
+    path.write_bytes((here / "earlier_results.jsonl").read_bytes())
+    (tmp_path / "r.meta.json").write_bytes((here / "earlier_results.meta.json").read_bytes())
+    assert [r.inputs for r in read_results([path])] == [None, None]
+    status, err = evaluate("--trials", 3, "--size", 0.3)
+    assert status == 0
+    assert "2 results of an earlier version do not record their images" in err
+    assert "2 of 3 trials are already there" in err
+    assert [r.inputs is None for r in read_results([path])] == [True, True, False]
+    assert main(["report", str(path), "--out", str(tmp_path / "report")]) == 0
+    assert "3 trials" in (tmp_path / "report" / "index.html").read_text()
+
+
+@pytest.mark.slow
+def test_repeated_frames_are_announced(evaluate: Evaluate) -> None:
+    assert "distinct" not in evaluate("--trials", 2, "--size", 0.3)[1]
+    err = evaluate("--frame", "0000", "0001", "--trials", 5, "--size", 0.3, 0.4)[1]
+    assert (
+        "2 distinct frames of split 'test', each tried 2 to 3 times of each size with different seeds" in err
+    )
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced: bool) -> None:
+    path = tmp_path / "r.jsonl"
+    results = [run_trial(blob_trial(seed)) for seed in range(2)]
+    with ResultsFile(path) as file:
+        file.add(results[0])
+        path.unlink()
+        if replaced:
+            path.write_text("")
+        with pytest.raises(InputError, match="was removed or replaced while it was being written"):
+            file.add(results[1])
+        with pytest.raises(InputError, match="was removed or replaced"):
+            file.put_in_order([blob_trial(0)])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"steps": 2', '"steps": 1' + "0" * 400, "steps: found 10000000"),
+        (
+            '"errors": {"translation": [',
+            '"errors": {"translation": [1.0, ',
+            "4 translation and 3 rotation errors",
+        ),
+        ('"reason": "', '"reason": "\\ud800', "line 1: not JSON"),
+    ],
+)
+def test_numbers_and_text_that_nothing_can_hold_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+) -> None:
+    line = as_line(to_plain(run_trial(blob_trial(0)))).decode()
+    assert old in line
+    path = tmp_path / "r.jsonl"
+    path.write_text(line.replace(old, new))
+    assert main(["report", str(path), "--out", str(tmp_path / "report")]) == 1
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_shards_joined_are_the_whole(tmp_path: Path, evaluate: Evaluate) -> None:
+    more = ("--trials", 5, "--size", "0.3")
+    assert evaluate(*more)[0] == 0
+    parts = [tmp_path / f"{number}.jsonl" for number in range(2)]
+    for number, path in enumerate(parts):
+        assert evaluate(*more, "--shards", 2, "--shard", number, out=path)[0] == 0
+    joined = {r.seed: r.T_world_camera for r in read_results(parts)}
+    assert joined == {r.seed: r.T_world_camera for r in read_results([tmp_path / "r.jsonl"])}
+    assert len(read_results([*parts, *parts])) == 5
+
+
+# Running.
+
+
+def test_a_trial_that_fails_ends_the_run_and_keeps_the_others(tmp_path: Path) -> None:
+    good, bad = blob_trial(0), Trial(BLOBS, BLOBS, ("0000",), "none", (), "bid")
+    with ResultsFile(tmp_path / "r.jsonl") as file, pytest.raises(InputError, match="needs a start"):
+        run_trials([good, bad, blob_trial(1)], file, InThisProcess(), at_once=1)
+    assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [0]
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_finished(
+    tmp_path: Path, evaluate: Evaluate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    added = ResultsFile.add
+
+    def add(self: ResultsFile, result: TrialResult) -> None:
+        added(self, result)
+        if len(self.results) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ResultsFile, "add", add)
+        status, err = evaluate("--trials", 5, "--size", 0.3)
+    assert status == 130
+    assert "3 trials are left in" in err
+    assert len(read_results([tmp_path / "r.jsonl"])) == 2
+    assert evaluate("--trials", 5, "--size", 0.3)[0] == 0
+    assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == list(range(5))
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["--size", "half"], 2, "--size is half, expected numbers"),
+        (["--size", "-1"], 2, "size is -1, expected e_t"),
+        (["--trials", "0"], 2, "trials is 0"),
+        (["--trials", "999999999"], 2, "trials is 999999999, expected a whole number, 1 to"),
+        (["--shards", "2", "--shard", "2"], 2, "--shard is 2"),
+        (["--protocol", "none"], 1, "needs a start"),
+        (["--protocol", "prallel"], 2, "did you mean 'parallel'"),
+        (["--dask", "tcp://x:1", "--workers", "2"], 2, "contradict"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(evaluate: Evaluate, words: list[str], status: int, said: str) -> None:
+    found, err = evaluate(*words)
+    assert (found, err.count("\n")) == (status, 1), err
+    assert said in err
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_its_settings_on_the_command_line(
+    method: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", "--method", method, "--help"]) == 0
+    page = capsys.readouterr().out
+    names = [f"--{name.replace('_', '-')}" for name in to_flat(METHODS[method].config_type())]
+    assert sum(f"{name} " in page for name in names) > 3
+
+
+def _circle(count: int) -> list[tuple[float, float]]:
+    angles = torch.arange(count, dtype=torch.float64) * (2 * torch.pi / count)
+    return list(zip(angles.cos().tolist(), angles.sin().tolist(), strict=True))

@@ -1,0 +1,268 @@
+"""Maps are compared from the same starts, each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+
+import tiny
+from bidnerf_core.cli import main
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import (
+    Comparison,
+    Plan,
+    Trial,
+    TrialResult,
+    comparison_figure,
+    run_comparison,
+    run_trial,
+    trials,
+)
+from bidnerf_core.evaluation.comparison import map_bytes, map_labels, map_row, plan_comparison
+from bidnerf_core.evaluation.summary import seconds_to_success, success_of
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
+from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
+from bidnerf_core.io import from_plain, to_plain
+
+pytestmark = pytest.mark.slow
+
+
+QUICK = json.dumps({"rays": 32, "max_steps": 3})
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny.write_dataset(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def maps(data: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two that differ in how long they were trained."""
+    folder = tmp_path_factory.mktemp("maps")
+    made = [folder / "short", folder / "long"]
+    for out, steps in zip(made, (4, 8), strict=True):
+        assert main(["train", str(data), "--out", str(out), *tiny.options(steps)]) == 0
+    return made
+
+
+@pytest.fixture(scope="module")
+def plan(data: Path) -> Plan:
+    return Plan("", str(data), "bid", ((0.5,),), "bid", QUICK, trials=2)
+
+
+@pytest.fixture(scope="module")
+def usual(maps: list[Path], data: Path) -> Trial:
+    return Trial(str(maps[0]), str(data), ("t_0000",), "bid", (0.5,), "bid", QUICK, 0)
+
+
+@pytest.fixture(scope="module")
+def compared(maps: list[Path], plan: Plan) -> Comparison:
+    return run_comparison(plan, maps)
+
+
+def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResult:
+    """One whose distance went as ``trace`` says; one step took ``seconds`` in all."""
+    distances = tuple(times * x for x in trace)
+    errors = Trace(distances, tuple(0.0 for _ in trace))
+    return TrialResult(
+        None, True, len(trace) - 1, seconds, None, 0.0, "fog", "bid", ScalarPoseError(distances[-1], 0.0), "r_0", 0,
+        ScalarPoseError(distances[0], 0.0), errors, "", 1000, {}, "w", Trial("m", "d", ("r_0",)),
+    )  # fmt: skip
+
+
+def test_every_map_is_tried_on_the_same_frames_from_the_same_starts(compared: Comparison) -> None:
+    first, second = compared.results
+    assert [(r.frame, r.seed, r.start_error) for r in first] == [
+        (r.frame, r.seed, r.start_error) for r in second
+    ]
+    assert [r.errors.translation[0] for r in first] == pytest.approx(
+        [0.5, 0.5], abs=0.02
+    )  # the chord of a screw
+    assert first[0].T_world_camera != second[0].T_world_camera
+
+
+def test_a_process_elsewhere_finds_what_this_one_finds(
+    compared: Comparison, maps: list[Path], plan: Plan, data: Path
+) -> None:
+    planned = plan_comparison(plan, [str(m) for m in maps], open_dataset(data))
+    for trial, found in ((planned[0][0], compared.results[0][0]), (planned[1][1], compared.results[1][1])):
+        again = run_trial(trial)
+        assert replace(again, seconds=0.0, peak_memory_bytes=0) == replace(
+            found, seconds=0.0, peak_memory_bytes=0
+        )
+
+
+def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(
+    tmp_path: Path, usual: Trial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
+    monkeypatch.chdir(tmp_path)
+    with TrialProcess() as process:
+        assert process.run(usual).result.steps == 3
+
+
+def test_a_process_keeps_one_map(usual: Trial) -> None:
+    """Its memory is measured as that of one."""
+    trials._opened.cache_clear()
+    measured(usual)
+    assert trials._opened.cache_info().currsize == 1
+
+
+def test_a_row_says_what_the_map_costs(compared: Comparison, maps: list[Path]) -> None:
+    assert [r.map for r in compared.rows] == ["short", "long"]
+    for found, folder in zip(compared.rows, maps, strict=True):
+        assert found.map_bytes == map_bytes(folder) == sum(f.stat().st_size for f in folder.iterdir())
+        assert found.peak_memory_bytes > 50 * 2**20  # a Python with torch in it
+        assert found.ms_per_step > 0
+        assert 0 < found.samples_per_ray < 1000
+        assert found.steps == 3
+
+
+def test_samples_are_those_of_the_level_that_the_method_uses(maps: list[Path], usual: Trial) -> None:
+    trial = replace(usual, map=str(maps[1]), frames=("t_0000",))
+    fine = replace(trial, config=json.dumps({"level": None}))
+    assert samples_per_ray(trial) == samples_per_ray(replace(trial, config=json.dumps({"level": 0})))
+    assert samples_per_ray(fine) > 0
+
+
+def test_speed_is_that_of_the_trials_that_succeeded() -> None:
+    quick, slow = result(1.0, [1.0, 0.05, 0.05], 0.2), result(1.0, [1.0, 0.5, 0.5, 0.05, 0.05], 2.0)
+    lost = result(1.0, [1.0, 0.05, 0.9], 50.0)  # met it on the way only
+    found = success_of([quick, slow, lost], "10%")
+    assert (found.rate.successes, found.rate.trials) == (2, 3)
+    assert found.steps == 2  # of 1 and 3
+    assert found.milliseconds == pytest.approx((100 + 1500) / 2)
+    assert seconds_to_success([slow, quick, lost], "10%") == pytest.approx([0.1, 1.5])
+    assert success_of([lost], "10%").milliseconds is None
+
+
+def test_a_median_error_counts_lost_poses_as_worst() -> None:
+    good, gone = result(0.1, [1.0, 0.1]), replace(result(0.1, [1.0, 0.1]), error=None)
+    assert map_row("a", 0, [Measured(good, 1.0)] * 2 + [Measured(gone, 1.0)]).translation == pytest.approx(
+        0.01
+    )
+    assert map_row("a", 0, [Measured(good, 1.0)] + [Measured(gone, 1.0)] * 2).translation is None
+
+
+def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
+    free = replace(result(1.0, [0.04, 0.01]), start_error=None)
+    row = map_row("short", 0, [Measured(free, 1.0)])
+    assert row.success["10%"] is None
+    absolute = row.success["5deg 0.05"]
+    assert absolute is not None
+    assert (absolute.rate.successes, absolute.steps) == (1, 0)
+    found = Comparison("d", "test", "none", (), "auto", {}, 0, 1, (row,), ((free,),))
+    comparison_figure([tmp_path / "a.svg"], found)
+    assert "<svg" in (tmp_path / "a.svg").read_text()
+    assert from_plain(Comparison, json.loads(json.dumps(to_plain(found))), "again") == found
+
+
+def test_maps_have_the_shortest_names_that_tell_them_apart() -> None:
+    assert map_labels(["/x/a", "/x/b"]) == ["a", "b"]
+    assert map_labels(["/x/a", "/y/a", "/y/b"]) == ["x/a", "y/a", "y/b"]
+
+
+def test_a_comparison_survives_json(compared: Comparison) -> None:
+    text = json.dumps(to_plain(compared), allow_nan=False)
+    assert from_plain(Comparison, json.loads(text), "compare.json") == compared
+
+
+def test_the_plan_is_the_protocols(plan: Plan, data: Path) -> None:
+    planned = plan_comparison(replace(plan, trials=4), ["a", "b"], open_dataset(data))
+    assert [len(trials) for trials in planned] == [2] * 4
+    assert all(a.map == "a" and b == replace(a, map="b") for a, b in planned)
+    assert {a.frames for a, _ in planned[:3]} == {("t_0000",), ("t_0001",), ("t_0002",)}
+    with pytest.raises(InputError, match="named twice"):
+        run_comparison(plan, ["a", "./a"])
+    with pytest.raises(InputError, match="no maps"):
+        run_comparison(plan, [])
+
+
+def test_a_trial_that_cannot_be_is_told_in_one_line(maps: list[Path], usual: Trial) -> None:
+    with TrialProcess() as process:
+        with pytest.raises(InputError, match="no frame"):
+            process.run(replace(usual, map=str(maps[0]), frames=("r_9999",)))
+        found = process.run(replace(usual, map=str(maps[0]), frames=("t_0000",)))  # it lives on
+        assert found.result.frame == "t_0000"
+        process._process.kill()
+        with pytest.raises(InputError, match="ended with status -9"):
+            process.run(replace(usual, map=str(maps[0]), frames=("t_0000",)))
+
+
+def test_the_picture_is_written(compared: Comparison, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    comparison_figure([tmp_path / "a.png", tmp_path / "a.svg"], compared)
+    image = iio.imread(tmp_path / "a.png")
+    assert image.shape[0] > 400
+    assert image[..., :3].std() > 5
+    assert "<svg" in (tmp_path / "a.svg").read_text()
+
+
+def test_the_command_prints_a_table_and_writes_what_it_says(
+    maps: list[Path], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [str(maps[0]), str(data)]
+    options = ["--trials", "1", "--rays", "32", "--max-steps", "2", "--out", str(tmp_path / "out")]
+    assert main(["compare", *folders, *options]) == 0
+    shown = capsys.readouterr()
+    assert "short" in shown.out
+    assert "ms a step" in shown.out
+    assert "1/1" in shown.err
+    assert shown.err.startswith("1 start in 1 map; a process for each begins\n")
+    kept = from_plain(Comparison, json.loads((tmp_path / "out" / "compare.json").read_text()), "compare.json")
+    assert [len(column) for column in kept.results] == [1]
+    assert main(["compare", *folders, *options]) == 1  # what is there is not overwritten
+    assert "not empty" in capsys.readouterr().err
+
+
+def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [
+        "--trials",
+        "1",
+        "--rays",
+        "32",
+        "--max-steps",
+        "2",
+        "--size",
+        "0.3",
+        "--frame",
+        "t_0001",
+        "--json",
+    ]
+    assert main(["compare", str(maps[0]), str(data), *words]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["size"] == [0.3]
+    assert found["rows"][0]["success"]["10%"]["rate"]["trials"] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "expected"),
+    [
+        (["{map}"], 2, "1 folder given, expected"),
+        (["{map}", "{data}", "--trials", "0"], 2, "trials is 0"),
+        (["{map}", "{data}", "--frame", "r_77"], 1, "r_77"),
+        (["{map}", "{data}", "--protocol", "bib"], 2, "did you mean 'bid'"),
+        (["{map}", "{data}", "--size", "1:2"], 2, "size is 1:2"),
+        (["{map}", "{data}", "--split", "none"], 1, "no split 'none'"),
+        (["{data}", "{data}"], 1, "expected a map"),
+        (["{map}", "{map}", "{data}"], 1, "named twice"),
+    ],
+)
+def test_mistakes_are_told_before_the_work_begins(
+    words: list[str],
+    status: int,
+    expected: str,
+    maps: list[Path],
+    data: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = [word.format(map=maps[0], data=data) for word in words]
+    assert main(["compare", *given]) == status
+    error = capsys.readouterr().err
+    assert expected in error
+    assert len(error.splitlines()) == 1

@@ -1,0 +1,339 @@
+"""Evaluation from Python: in memory, from any thread, cancelled and resumed, and the same as from the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core.cli import main
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.evaluation import ResultTable, TrialResult, read_results, trials
+from bidnerf_core.io import from_plain
+from bidnerf_core.localization import find_method
+from bidnerf_core.scenes import closed_form_data, closed_form_map
+
+QUICK: dict[str, Any] = {
+    "method": "bid",
+    "config": {"rays": 16, "max_steps": 2},
+    "protocol": "bid",
+    "sizes": [0.3],
+}
+COMPARED = {name: value for name, value in QUICK.items() if name != "sizes"}
+WORDS = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--size", "0.3", "--workers", "1"]
+BLOBS = "demo:blobs"
+
+
+def timeless(rows: Any) -> list[TrialResult]:
+    """The results without what two runs differ in."""
+    return [dataclasses.replace(row, seconds=0.0, peak_memory_bytes=0) for row in rows]
+
+
+def placeless(rows: Any) -> list[TrialResult]:
+    """The results without the names of their map and data too."""
+    return [
+        dataclasses.replace(row, trial=dataclasses.replace(row.trial, map="", data="")) for row in timeless(rows)
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("evaluate")
+    tiny.write_dataset(folder / "data")
+    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+    return folder
+
+
+def test_a_table_has_what_the_command_writes(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, data = folder / "map", folder / "data"
+    words = ["evaluate", str(scene), str(data), "--out", str(tmp_path / "command.jsonl"), "--trials", "3"]
+    assert main([*words, *WORDS, "--fault", "none", "blur:1"]) == 0
+    expected = timeless(read_results([tmp_path / "command.jsonl"]))
+    given = {"trials": 3, "faults": ["none", "blur:1"], **QUICK}
+    capsys.readouterr()
+    table = bn.evaluate(scene, data, out=tmp_path / "python.jsonl", **given)
+    assert capsys.readouterr() == ("", "")
+    assert timeless(table.rows) == expected == timeless(read_results([tmp_path / "python.jsonl"]))
+    loaded, dataset = bn.load_map(scene), open_dataset(data)
+    in_memory = bn.evaluate(loaded, dataset, **given)
+    assert placeless(in_memory.rows) == placeless(table.rows)
+    assert [row.trial.map for row in in_memory.rows] == [loaded.info.backend] * 6
+    assert placeless(bn.evaluate(loaded, dataset.views("test"), **given).rows) == placeless(table.rows)
+
+
+def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = bn.evaluate(BLOBS, BLOBS, trials=4, **QUICK)
+    (row,) = table.summary
+    found = row.statistics.criteria["5deg 0.05"]
+    assert found is not None
+    assert (row.start, row.label, found.rate.trials) == ("bid 0.3", "bid", 4)
+    assert 0 <= found.rate.low <= found.rate.rate <= found.rate.high <= 1
+    assert "5deg 0.05" in str(table)
+    assert "bid 0.3" in str(table)
+    table.save(tmp_path / "r.jsonl")
+    again = bn.ResultTable.load(tmp_path / "r.jsonl")
+    assert (again, str(again)) == (table, str(table))
+    assert main(["report", str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "report")]) == 0
+    assert str(table) in capsys.readouterr().out
+
+
+def test_the_folder_is_read_anew_at_each_call(folder: Path, tmp_path: Path) -> None:
+    """A map that was trained again under the same name is not mistaken for the one before."""
+    scene = tmp_path / "map"
+    for steps in (4, 8):
+        words = ["train", str(folder / "data"), "--out", str(scene), "--overwrite", *tiny.options(steps)]
+        assert main(words) == 0
+        (row,) = bn.evaluate(scene, folder / "data", trials=1, **QUICK).rows
+        assert row.weights == bn.load_map(scene).info.weights
+
+
+def test_results_of_another_map_in_memory_are_not_taken_for_its_own(tmp_path: Path) -> None:
+    """Maps in memory have no file of weights, so that their content tells them apart."""
+    first, second = (bn.train(tiny.views(), config=tiny.config(steps), bake=False) for steps in (2, 6))
+    given: dict[str, Any] = {"data": tiny.views(2), "trials": 1, "out": tmp_path / "r.jsonl", **QUICK}
+    (row,) = bn.evaluate(first, **given).rows
+    assert row.weights == first.training
+    assert timeless(bn.evaluate(first, **given).rows) == timeless([row])
+    with pytest.raises(bn.InputError, match="results of another training"):
+        bn.evaluate(second, **given)
+
+
+def test_a_process_reads_a_map_once_until_it_changes(folder: Path, tmp_path: Path) -> None:
+    """Processes of a cluster outlive an evaluation."""
+    scene = tmp_path / "map"
+    found = []
+    for steps in (4, 8):
+        words = ["train", str(folder / "data"), "--out", str(scene), "--overwrite", *tiny.options(steps)]
+        assert main(words) == 0
+        found += [trials.opened(str(scene), str(folder / "data"), *device)[0] for device in ((), ("cpu",))]
+    assert found[0] is found[1] is not found[2] is found[3]
+    assert found[3].training == bn.load_map(scene).training
+
+
+@pytest.mark.slow
+def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("bidnerf_core.registry.registered", {})
+    mine = dataclasses.replace(find_method("bid"), summary="mine")
+    bn.register("methods", "bid", mine, replace=True)
+    bn.register("methods", "unused", mine)
+    said = "method 'bid' was registered in one process but is unknown in another"
+    with pytest.raises(bn.InputError, match=said):
+        bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **QUICK)
+    with pytest.raises(bn.InputError, match=said):
+        bn.compare([BLOBS], BLOBS, trials=1, method="bid", config=QUICK["config"])
+    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=1, **QUICK).rows) == 2
+    other = {**QUICK, "method": "bid-lm", "config": {}, "sizes": [0.1]}
+    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **other).rows) == 2
+
+
+def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever ``device`` says, which is for maps in folders. No trial is run: a meta device computes nothing."""
+    scene = bn.train(tiny.views(2), config=tiny.config(1), bake=False)
+    assert isinstance(scene.field, torch.nn.Module)
+    elsewhere = dataclasses.replace(scene, field=scene.field.to("meta"))
+    seen: list[Any] = []
+    monkeypatch.setattr("bidnerf_core.evaluation.evaluate.run_plan", lambda plan, *_, **__: seen.append(plan))
+    monkeypatch.setattr(
+        "bidnerf_core.evaluation.evaluate.compare_maps", lambda starts, *_: seen.extend(starts[0])
+    )
+    bn.evaluate(elsewhere, tiny.views(2), trials=1, **QUICK)
+    bn.compare([elsewhere, BLOBS], tiny.views(2), trials=1, method="bid", protocol="bid")
+    assert [found.device for found in seen] == ["meta", "meta", "cpu"]
+
+
+def test_masks_hide_parts_of_the_images_in_every_trial(folder: Path, tmp_path: Path) -> None:
+    scene, data, masks = folder / "map", folder / "data", tmp_path / "masks"
+    masks.mkdir()
+    for name in open_dataset(data).frame_names("test"):
+        mask = np.full((tiny.SIZE, tiny.SIZE), 255, np.uint8)
+        mask[:, : tiny.SIZE // 2] = 0
+        iio.imwrite(masks / f"{name}.png", mask)
+    words = [str(scene), str(data), *WORDS, "--trials", "2", "--seed", "5"]
+    for number, more in enumerate(
+        ([], ["--masks", str(masks)], ["--masks", str(masks), "--mask-hides", "white"])
+    ):
+        assert main(["evaluate", *words, *more, "--out", str(tmp_path / f"{number}.jsonl")]) == 0
+    whole, black, white = (read_results([tmp_path / f"{number}.jsonl"]) for number in range(3))
+    assert len({result[0].loss for result in (whole, black, white)}) == 3
+    given = bn.load_map(scene), open_dataset(data, masks=masks)
+    in_memory = bn.evaluate(*given, **QUICK, trials=2, seed=5)
+    again = bn.evaluate(scene, data, **QUICK, trials=2, seed=5, masks=masks)
+    assert [r.T_world_camera for r in in_memory.rows] == [r.T_world_camera for r in black]
+    assert timeless(again.rows) == timeless(black)
+    assert black[0].trial.masks == "masks"
+    labels = {group.label for group in ResultTable((*whole, *black, *white)).groups}
+    assert labels == {"bid, nothing hidden", "bid, black of masks hidden", "bid, white of masks hidden"}
+    compared = bn.compare([scene], data, method="bid", config=QUICK["config"], protocol="bid", size=0.3, trials=2,
+                          seed=5, masks=masks)  # fmt: skip
+    assert timeless(compared.results[0]) == timeless(black)
+
+
+def test_frames_that_masks_hide_wholly_are_named_and_left_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, data, masks = folder / "map", folder / "data", tmp_path / "masks"
+    masks.mkdir()
+    names = open_dataset(data).frame_names("test")
+    for name in names:
+        shade = 0 if name == names[0] else 255
+        iio.imwrite(masks / f"{name}.png", np.full((tiny.SIZE, tiny.SIZE), shade, np.uint8))
+    words = [str(scene), str(data), *WORDS, "--masks", str(masks)]
+    assert main(["evaluate", *words, "--trials", "6", "--out", str(tmp_path / "r.jsonl")]) == 0
+    told = f"masks hide 1 whole frame of {len(names)}, not tried: {names[0]}\n"
+    assert capsys.readouterr().err.count(told) == 1
+    assert {row.frame for row in read_results([tmp_path / "r.jsonl"])} == set(names[1:])
+    with pytest.warns(bn.InputWarning, match="1 whole frame"):
+        found = bn.compare([bn.load_map(scene)], data, **COMPARED, trials=6, masks=masks)
+    assert {row.frame for row in found.results[0]} == set(names[1:])
+    with pytest.raises(bn.InputError, match=f"not tried: {names[0]}; .*inverted"):
+        bn.evaluate(scene, data, **QUICK, frames=names[:1], masks=masks)
+
+
+def test_all_splits_are_evaluated_together(folder: Path, tmp_path: Path) -> None:
+    data = open_dataset(folder / "data")
+    count = sum(len(data.frame_names(split)) for split in data.splits)
+    words = ["evaluate", str(folder / "map"), str(folder / "data"), *WORDS, "--split", "all"]
+    assert main([*words, "--trials", str(count), "--out", str(tmp_path / "r.jsonl")]) == 0
+    rows = read_results([tmp_path / "r.jsonl"])
+    assert {row.trial.split for row in rows} == {"all"}
+    assert len({row.frame for row in rows}) == count
+    for given in (folder / "data", data):
+        found = bn.evaluate(folder / "map", given, **QUICK, split="all", trials=count)
+        assert timeless(found.rows) == timeless(rows)
+    compared = bn.compare([bn.load_map(folder / "map")], data, **COMPARED, split="all", trials=2)
+    assert compared.split == "all"
+
+
+def test_folders_without_masks_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(folder / "map"), str(folder / "data"), "--masks", str(tmp_path)]
+    assert main(["evaluate", *words, "--out", str(tmp_path / "r.jsonl")]) == 1
+    assert "expected masks" in capsys.readouterr().err
+    assert main(["compare", str(folder / "map"), str(folder / "data"), "--mask-hides", "white"]) == 2
+
+
+def test_frames_of_one_name_are_refused() -> None:
+    views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
+    with pytest.raises(bn.InputError, match="2 frames named 'image'"):
+        bn.evaluate(BLOBS, views, trials=1, **QUICK)
+
+
+def test_a_file_of_results_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(bn.InputError, match=r"r\.jsonl: cannot be written"):
+        bn.evaluate(BLOBS, BLOBS, trials=1, out=tmp_path / "file" / "r.jsonl", **QUICK)
+
+
+def test_any_thread_evaluates_and_leaves_no_trace() -> None:
+    expected = timeless(bn.evaluate(BLOBS, BLOBS, trials=2, **QUICK).rows)
+    handler, threads = signal.getsignal(signal.SIGINT), torch.get_num_threads()
+    found: dict[int, Any] = {}
+
+    def work(number: int) -> None:
+        scene, data = closed_form_map(BLOBS), closed_form_data(BLOBS)
+        found[number] = placeless(bn.evaluate(scene, data, trials=2, **QUICK).rows)
+
+    others = [threading.Thread(target=work, args=(number,)) for number in range(2)]
+    for other in others:
+        other.start()
+    for other in others:
+        other.join()
+    assert found[0] == found[1] == placeless(expected)
+    assert (signal.getsignal(signal.SIGINT), torch.get_num_threads()) == (handler, threads)
+
+
+@pytest.mark.slow
+def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
+    out, stop = tmp_path / "r.jsonl", threading.Event()
+    seen: list[bn.Progress] = []
+
+    def stop_at_two(progress: bn.Progress) -> None:
+        seen.append(progress)
+        if progress.done == 2:
+            stop.set()
+
+    with pytest.raises(bn.Cancelled, match=r"3 trials are left in .*, the same command resumes"):
+        bn.evaluate(BLOBS, BLOBS, trials=5, out=out, progress=stop_at_two, cancel=stop.is_set, **QUICK)
+    assert [(p.stage, p.done, p.total, p.unit) for p in seen] == [("trials", n, 5, "trials") for n in (1, 2)]
+    before = out.read_bytes()
+    assert len(read_results([out])) == 2
+    table = bn.evaluate(BLOBS, BLOBS, trials=5, out=out, **QUICK)
+    assert out.read_bytes().startswith(before)
+    assert timeless(table.rows) == timeless(bn.evaluate(BLOBS, BLOBS, trials=5, **QUICK).rows)
+    with pytest.raises(bn.Cancelled, match="nothing is kept"):
+        bn.evaluate(BLOBS, BLOBS, trials=1, cancel=lambda: True, **QUICK)
+
+
+def test_an_error_of_the_callback_is_the_callers_and_its_trial_is_kept(tmp_path: Path) -> None:
+    def fail(progress: bn.Progress) -> None:
+        raise LookupError(str(progress))
+
+    with pytest.raises(LookupError, match=r"trials: 1/3 trials, \d within"):
+        bn.evaluate(BLOBS, BLOBS, trials=3, out=tmp_path / "r.jsonl", progress=fail, **QUICK)
+    assert len(read_results([tmp_path / "r.jsonl"])) == 1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_cannot_be_evaluated_is_refused() -> None:
+    for one in (BLOBS, Path("map"), closed_form_map(BLOBS)):
+        with pytest.raises(bn.InputError, match=r"scenes is the one map .*, expected a list of maps"):
+            bn.compare(one, BLOBS)  # type: ignore[arg-type]
+    scene = closed_form_map(BLOBS)
+    wrong: dict[str, dict[str, Any]] = {
+        "workers is 2, expected 1": {"workers": 2},
+        "trials is 0, expected a whole number, 1 to": {"trials": 0},
+        "trials is 2.5": {"trials": 2.5},
+        "workers is 0, expected 1 or more": {"scene": BLOBS, "workers": 0},
+        "workers is -1, expected 1 or more": {"scene": BLOBS, "workers": -1},
+        "seed is -1": {"seed": -1},
+        "size is 0.3:1, expected e_t": {"sizes": [(0.3, 1.0)]},
+        "did you mean 'rays'": {"config": {"ray": 3}},
+        "names 0001 more than once": {"frames": ["0001", "0001"]},
+        "no fault 'blurr'": {"faults": ["blurr:1"]},
+        r"faults is 'blur:1', expected a list, such as \['blur:1'\]": {"faults": "blur:1"},
+        "frames is '0001', expected a list": {"frames": "0001"},
+        "sizes is .*'far'.*, expected a list of numbers": {"sizes": ["far"]},
+        "data is a int": {"data": 3},
+        "data is a list": {"data": [1]},
+    }
+    for said, change in wrong.items():
+        given = {"scene": scene, "data": BLOBS, "trials": 1, **QUICK, **change}
+        with pytest.raises(bn.InputError, match=said):
+            bn.evaluate(**given)
+
+
+@pytest.mark.slow
+def test_maps_in_memory_and_in_folders_are_compared(folder: Path, tmp_path: Path) -> None:
+    given = {"trials": 2, "method": "bid", "config": QUICK["config"], "protocol": "bid", "size": 0.3}
+    scene, data = bn.load_map(folder / "map"), folder / "data"
+    seen: list[str] = []
+    found = bn.compare([scene, folder / "map", scene], data, progress=lambda p: seen.append(str(p)), **given)
+    assert [row.map for row in found.rows] == ["tiny", "map", "tiny 2"] or len(
+        {r.map for r in found.rows}
+    ) == 3
+    assert len(seen) == 6
+    first, other, third = map(placeless, found.results)
+    assert first == other == third
+    assert found.rows[0].map_bytes > 0
+    named = bn.compare({"mine": scene}, open_dataset(data), **given)
+    assert [row.map for row in named.rows] == ["mine"]
+    assert "mine" in str(named)
+    named.save(tmp_path / "c.json")
+    assert from_plain(bn.Comparison, json.loads((tmp_path / "c.json").read_text()), "c") == named
+    with pytest.raises(bn.Cancelled):
+        bn.compare([scene], data, cancel=lambda: True, **given)

@@ -1,0 +1,280 @@
+"""Faults in trials, results, reports and the benchmark: they are part of what a trial is, and counted by size."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from scipy.stats import chi2
+
+import tiny
+from bidnerf_core.cli import main
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import (
+    FAULTS,
+    NO_FAULT,
+    Plan,
+    ResultsFile,
+    ResultTable,
+    RowStore,
+    Trial,
+    TrialResult,
+    faulty,
+    grouped,
+    key_of,
+    left_to_do,
+    planned,
+)
+from bidnerf_core.evaluation.plots import draw_faults, fault_curves
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
+from bidnerf_core.evaluation.trials import trial_views
+from bidnerf_core.evaluation.workers import InThisProcess
+from bidnerf_core.registry import registered
+from bidnerf_core.scenes import closed_form_data
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+def trial(fault: str = NO_FAULT, seed: int = 0) -> Trial:
+    return Trial("demo:blobs", "demo:blobs", ("0003",), "none", (), "auto", "{}", seed, fault=fault)
+
+
+def test_a_plan_tries_each_fault_on_the_same_frames() -> None:
+    faults = ("none", "depth-scale:1.02", "exposure:0.7+blur:3")
+    trials = planned(Plan("demo:blobs", "demo:blobs", "none", trials=3, faults=faults))
+    assert [t.fault for t in trials] == [fault for fault in faults for _ in range(3)]
+    assert len({(t.frames, t.seed) for t in trials}) == 3
+    assert len({key_of(t) for t in trials}) == 9
+    with pytest.raises(InputError, match="which the method does not receive"):
+        planned(Plan("demo:blobs", "demo:blobs", "none", depth=False, faults=faults))
+    with pytest.raises(InputError, match="no fault 'blurr'"):
+        planned(Plan("demo:blobs", "demo:blobs", "none", faults=("blurr:1",)))
+
+
+def test_the_method_gets_the_faulty_views() -> None:
+    data = closed_form_data("demo:blobs")
+    (clean,), (bad,) = trial_views(trial(), data), trial_views(trial("depth-scale:1.02", 4), data)
+    assert clean.frame.depth is not None
+    assert bad.frame.depth is not None
+    assert torch.equal(bad.frame.depth, clean.frame.depth * 1.02)
+    (blind,) = trial_views(dataclasses.replace(trial("occluder:0.2"), depth=False), data)
+    assert blind.frame.depth is None
+    assert torch.equal(blind.frame.rgb, faulty(clean, "occluder:0.2", 0).frame.rgb)
+
+
+@pytest.mark.slow
+def test_evaluate_writes_the_fault_and_resumes_by_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r.jsonl"
+    words = [
+        "evaluate",
+        "demo:blobs",
+        "--out",
+        str(out),
+        "--method",
+        "bid",
+        "--rays",
+        "16",
+        "--max-steps",
+        "2",
+    ]
+    words += ["--workers", "1", "--size", "0.3", "--trials", "2"]
+    assert main([*words, "--fault", "depth-noise:0.01,0.02"]) == 0
+    assert main([*words, "--fault", "none", "--fault", "depth-noise:0.01", "exposure:0.7"]) == 0
+    assert "2 of 6 trials are already there" in capsys.readouterr().err
+    faults = [json.loads(line)["trial"]["fault"] for line in out.read_text().splitlines()]
+    noise = [f"depth-noise:{size}" for size in (0.02, 0.01)]
+    assert faults == [noise[0]] * 2 + ["none"] * 2 + [noise[1]] * 2 + ["exposure:0.7"] * 2
+    assert main([*words, "--fault", "exposur:0.7"]) == 2
+    assert main([*words, "--fault", "depth-scale:1.02", "--no-depth"]) == 1
+    assert "did you mean 'exposure'" in capsys.readouterr().err
+
+
+def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["evaluate", "demo:blobs", "--out", str(tmp_path / "r.jsonl"), "--method", "bid", "--rays", "16"]
+    words += [
+        "--max-steps",
+        "2",
+        "--workers",
+        "1",
+        "--size",
+        "0.3",
+        "--trials",
+        "1",
+        "--fault",
+        "exposure:0.7",
+    ]
+    assert main(words) == 0
+    plan = Plan("demo:blobs", "demo:blobs", sizes=((0.3,),), trials=1, method="bid", faults=("exposure:0.7",),
+                config='{"max_steps": 2, "rays": 16}')  # fmt: skip
+    with ResultsFile(tmp_path / "r.jsonl") as file:
+        assert left_to_do(planned(plan), file) == []
+        other = dataclasses.replace(FAULTS["exposure"], change=FAULTS["blur"].change)
+        monkeypatch.setitem(registered, ("faults", "exposure"), other)
+        with pytest.raises(InputError, match="made with other images"):
+            left_to_do(planned(plan), file)
+
+
+def result(fault: str, seed: int, right: bool, converged: bool) -> TrialResult:
+    """Return a result without a start that is right or wrong, and converged or not."""
+    error = 0.001 if right else 1.0
+    return TrialResult(
+        None, converged, 1, 2.0, None, 0.1, "fog", "auto", ScalarPoseError(error, error), "0003", seed, None,
+        Trace((error,), (error,)), "done", 2**30, {}, "weights-1", trial(fault, seed),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def results() -> list[TrialResult]:
+    """Ten trials a fault; the larger its size, the more are wrong, all of which converged."""
+    wrong = {"none": 0, "focal:0.95": 6, "focal:1.02": 3, "mirror:1": 10, "blur:3+focal:0.9": 5}
+    return [result(fault, seed, seed >= n, True) for fault, n in wrong.items() for seed in range(10)]
+
+
+def test_reports_group_by_fault_and_order_by_size(results: list[TrialResult]) -> None:
+    groups = grouped(results)
+    assert [g.situation.start for g in groups] == [
+        "no start", "no start, focal:0.95", "no start, focal:1.02", "no start, mirror:1", "no start, blur:3+focal:0.9",
+    ]  # fmt: skip
+    focal, mirror = fault_curves(groups)
+    assert [size for size, _ in focal.points] == [
+        0.95,
+        1.0,
+        1.02,
+    ]  # images without fault are at the neutral size
+    assert [size for size, _ in mirror.points] == [0.0, 1.0]
+    assert [len(group.results) for _, group in focal.points] == [10, 10, 10]
+    assert fault_curves(groups[:1]) == []
+
+
+@pytest.mark.slow
+def test_the_figure_shows_success_acceptance_and_silent_errors(
+    results: list[TrialResult], tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib")
+    drawn = draw_faults(grouped(results), tmp_path)
+    assert drawn is not None
+    assert drawn.with_suffix(".png").stat().st_size > 5000
+    assert draw_faults(grouped(results[:10]), tmp_path / "none") is None
+    lines = tmp_path / "r.jsonl"
+    ResultTable(tuple(results)).save(lines)
+    assert main(["report", str(lines), "--out", str(tmp_path / "report")]) == 0
+    assert "Trials by fault of the images" in (tmp_path / "report" / "index.html").read_text()
+
+
+# The benchmark.
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("faults")
+
+
+def row(right: bool, converged: bool, squared: float | None = None) -> dict[str, Any]:
+    error = 0.01 if right else 1.0
+    return {
+        "translation": error, "rotation_deg": error, "converged": converged, "normalized_error_squared": squared,
+        "cpu_seconds": 2.0,
+    }  # fmt: skip
+
+
+def test_a_cell_counts_silent_and_rejected_answers(script: ModuleType) -> None:
+    bound = float(chi2.ppf(0.95, 6))
+    rows = [
+        row(True, True, bound - 0.1),
+        row(True, True, bound + 0.1),
+        row(True, False, 1.0),
+        row(False, True),
+    ]
+    rows.append(row(False, False) | {"translation": None, "rotation_deg": None})  # of another scene
+    found = script.summary(rows)
+    assert {name: found[name] for name in ("n", "right", "strict", "converged", "silent", "right_but_rejected")} == {
+        "n": 5, "right": 3, "strict": 3, "converged": 3, "silent": 1, "right_but_rejected": 1,
+    }  # fmt: skip
+    assert found["inside_95_of_converged"] == [1, 2]
+    assert "silent    1" in script.line("cell", rows)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A map that was hardly trained and its dataset, as the script takes them."""
+    folder = tmp_path_factory.mktemp("faults")
+    tiny.write_dataset(folder / "data", test=12)
+    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+    return f"{folder / 'map'}:{folder / 'data'}"
+
+
+def given(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:
+    monkeypatch.setattr("sys.argv", ["faults.py", *words])
+    return script.arguments()
+
+
+def test_frames_for_tuning_and_for_reports_are_disjoint(
+    script: ModuleType, scene: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = ["--faults", "none", "--rgb"]
+    tuning = [q.frame for q in script.queries(given(script, monkeypatch, scene, *cell, "--tuning-frames"))]
+    report = [q.frame for q in script.queries(given(script, monkeypatch, scene, *cell))]
+    assert tuning == ["t_0001", "t_0006", "t_0011"]
+    assert sorted(tuning + report) == [f"t_{i:04d}" for i in range(12)]
+    few = [q.frame for q in script.queries(given(script, monkeypatch, scene, *cell, "--frames", "3"))]
+    assert few == [report[0], report[3], report[6]]
+
+
+def test_all_faults_are_tried_that_change_the_input(
+    script: ModuleType, scene: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = list(script.queries(given(script, monkeypatch, scene, "--frames", "1")))
+    by_mode = {mode: {q.cell[2] for q in found if q.cell[1] == mode} for mode in ("RGB", "RGB-D")}
+    everything = {NO_FAULT, *(f"{name}:{size:g}" for name, fault in FAULTS.items() for size in fault.sizes)}
+    assert by_mode["RGB-D"] == everything
+    blind = {NO_FAULT, *(f"{n}:{s:g}" for n, f in FAULTS.items() for s in f.sizes if not f.needs_depth)}
+    assert by_mode["RGB"] == blind
+    other = given(script, monkeypatch, scene, "--faults", "none", "--rgb", "--foreign", scene.split(":")[1])
+    assert not any(q.foreign for q in script.queries(other))  # its own dataset is not another scene
+
+
+def test_an_interrupted_run_goes_on_with_rows_of_the_same_content(
+    script: ModuleType, scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def answer(query: Any) -> dict[str, Any]:
+        asked.append(f"{query.cell[2]} {query.frame}")
+        return row(True, True, 1.0)
+
+    monkeypatch.setattr(script, "answer", answer)
+
+    def run(jobs: int, *faults: str) -> dict[str, Any]:
+        words = [scene, "--faults", *faults, "--rgbd", "--frames", "3", "--jobs", str(jobs)]
+        with RowStore(tmp_path / "rows.jsonl") as store:
+            found: dict[str, Any] = script.measured(
+                given(script, monkeypatch, *words), store, InThisProcess()
+            )
+            return found
+
+    assert run(1, "none")["all"]["n"] == 3
+    assert len(asked) == 3
+    both = run(2, "none", "mirror")
+    assert len(asked) == 6
+    assert list(both["cells"]["map"]["RGB-D"]) == ["none", "mirror:1"]
+    other = dataclasses.replace(FAULTS["mirror"], change=FAULTS["flip"].change)
+    monkeypatch.setitem(registered, ("faults", "mirror"), other)
+    run(1, "none", "mirror")
+    assert [words.split()[0] for words in asked[6:]] == ["mirror:1"] * 3  # those images are others now
+
+
+def test_answers_keep_all_their_numbers(script: ModuleType) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Answer:
+        confidence: float = 0.75
+
+    assert script.diagnostics_of(Answer()) == {"confidence": 0.75}

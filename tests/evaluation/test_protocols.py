@@ -1,0 +1,118 @@
+"""The protocols by name: which frames, which seeds, and where each trial begins."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import PROTOCOLS, find_protocol
+from bidnerf_core.evaluation.protocols import draw_starts, inerf_start
+from bidnerf_core.geometry import SE3
+from bidnerf_core.results import pose_error
+
+TRUE = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))
+by_name = pytest.mark.parametrize("name", PROTOCOLS)
+
+
+@by_name
+def test_a_protocol_follows_from_its_seed_alone(name: str) -> None:
+    protocol = PROTOCOLS[name]
+    cases = protocol.cases(9, protocol.trials, protocol.seed)
+    np.random.seed(5)
+    torch.manual_seed(5)
+    assert protocol.cases(9, protocol.trials, protocol.seed) == cases
+    assert protocol.cases(9, 7, protocol.seed) == cases[:7]
+    once = name == "none"  # without a start, trying a frame again tells nothing new
+    assert len({seed for _, seed in cases}) == (9 if once else protocol.trials)
+    assert not once or len({place for place, _ in cases}) == 9
+    assert all(0 <= place < 9 for place, _ in cases)
+    for _, seed in cases[:3]:
+        first, again = (protocol.start(TRUE, protocol.sizes[0], seed, 9) for _ in range(2))
+        assert (first is None) == (name == "none")
+        if first is not None and again is not None:
+            assert torch.equal(first.matrix(), again.matrix())
+            assert bool(first.is_rigid(1e-9))
+
+
+@by_name
+def test_a_size_has_to_be_of_the_protocols_kind(name: str) -> None:
+    protocol = PROTOCOLS[name]
+    for size in protocol.sizes:
+        protocol.check_size(size)
+    for wrong in ((*protocol.sizes[0], 1.0), (math.nan,) * len(protocol.units) or (1.0,)):
+        with pytest.raises(InputError, match="size is"):
+            protocol.check_size(wrong)
+    with pytest.raises(InputError, match="at least one frame"):
+        protocol.cases(0, 3, protocol.seed)
+
+
+def test_frames_take_turns() -> None:
+    places = [place for place, _ in PROTOCOLS["bid"].cases(5, 12, 0)]
+    assert sorted(places[:5]) == sorted(places[5:10]) == list(range(5))
+    assert places != [place for place, _ in PROTOCOLS["bid"].cases(5, 12, 1)]
+    places = [place for place, _ in PROTOCOLS["inerf"].cases(9, 25, 0)]
+    assert len(set(places)) == 5
+    assert places == sorted(places, key=places.index)
+
+
+def test_inerf_fills_its_ranges_evenly() -> None:
+    starts = [TRUE.inverse() @ inerf_start(TRUE, seed) for seed in range(600)]
+    moves = torch.stack([start.translation for start in starts])
+    angles = torch.stack([pose_error(start, SE3.identity()).rotation_deg for start in starts])
+    for axis in range(3):
+        assert kstest(moves[:, axis].numpy(), "uniform", (-0.2, 0.4)).pvalue > 0.01
+    assert kstest(angles.numpy(), "uniform", (0, 40)).pvalue > 0.01
+    axes = torch.stack([start.log()[3:] for start in starts])
+    assert axes.mean(0).abs().max() < 0.05  # rad
+
+
+@pytest.mark.parametrize("frames", [25, 50, 200])
+def test_parallel_draws_what_the_global_generator_of_numpy_does(frames: int) -> None:
+    np.random.seed(1234)
+    chosen = np.random.choice(frames, 5)
+    angles, moves = np.random.uniform(-15, 15, (5, 5, 3)), np.random.uniform(-0.25, 0.25, (5, 5, 3))
+    for ours, theirs in zip(draw_starts(frames), (chosen, angles, moves), strict=True):
+        assert np.array_equal(ours, theirs)
+    cases = PROTOCOLS["parallel"].cases(frames, 25, 1234)
+    assert cases == [(chosen[i // 5], 1234 + i) for i in range(25)]
+
+
+def test_parallel_turns_about_the_axes_of_the_world() -> None:
+    """The rotation is scipy's: extrinsic x, then y the other way round, then z, about the camera's own centre."""
+    _, angles, moves = draw_starts(50)
+    for i in range(25):
+        start = PROTOCOLS["parallel"].start(TRUE, (), 1234 + i, 50)
+        assert start is not None
+        phi, theta, psi = angles[i // 5, i % 5]
+        turn = Rotation.from_euler("xyz", [psi, -theta, phi], degrees=True).as_matrix()
+        np.testing.assert_allclose(start.rotation, turn @ TRUE.rotation.numpy(), atol=1e-12)
+        np.testing.assert_allclose(start.translation, TRUE.translation.numpy() + moves[i // 5, i % 5])
+
+
+def test_parallel_numbers_are_these() -> None:
+    """The frames are drawn from the 200 of a NeRF-Synthetic test split."""
+    chosen, angles, moves = draw_starts(200)
+    assert chosen.tolist() == [47, 38, 53, 116, 152]
+    assert angles[0, 0] == pytest.approx([8.140797565872, 10.820093141331, -10.480891031817], abs=1e-11)
+    assert moves[4, 4] == pytest.approx([-0.059440863625, -0.084531898589, -0.119538273259], abs=1e-11)
+
+
+@pytest.mark.parametrize(("trials", "seed"), [(26, 1234), (5, 0)])
+def test_parallel_is_a_fixed_list(trials: int, seed: int) -> None:
+    with pytest.raises(InputError, match="list is fixed"):
+        PROTOCOLS["parallel"].cases(50, trials, seed)
+    with pytest.raises(InputError, match="seed is 1259"):
+        PROTOCOLS["parallel"].start(TRUE, (), 1259, 50)
+
+
+def test_an_unknown_name_is_told_its_neighbour() -> None:
+    with pytest.raises(InputError, match="did you mean 'parallel'"):
+        find_protocol("paralel")
+    with pytest.raises(InputError, match="expected one of bid, bid-hard"):
+        find_protocol("xyz")

@@ -1,0 +1,447 @@
+"""Reports: how results are put side by side, what is said of them, and the page."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+import sys
+import warnings
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import pytest
+from scipy.stats import mannwhitneyu
+
+from bidnerf_core.cli import main
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import (
+    NEVER,
+    ResultTable,
+    Trial,
+    TrialResult,
+    grouped,
+    median,
+    note_run,
+    pairwise_tests,
+    provenance,
+    script_command,
+    steps_of,
+    summarize,
+)
+from bidnerf_core.evaluation.groups import situation_titles, situations
+from bidnerf_core.evaluation.plots import Figures
+from bidnerf_core.evaluation.report import page
+from bidnerf_core.evaluation.summary import compare_pair
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
+from bidnerf_core.io import to_plain
+from bidnerf_core.results import success_rate_by_frame
+
+STEPS = 10
+
+
+def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -> TrialResult:
+    """Return the result of a trial that meets every criterion from step ``reached`` on, if at all."""
+    far = STEPS + 1 if reached is None else reached
+    moved = (*(size for _ in range(far)), *(0.001 for _ in range(STEPS + 1 - far)))
+    turned = tuple(12.0 if x == size else 0.1 for x in moved)
+    protocol, images = settings.pop("protocol", "bid"), settings.pop("images", 1)
+    start = None if protocol == "none" else ScalarPoseError(moved[0], turned[0])
+    sizes, config = () if protocol == "none" else (size,), json.dumps(settings)
+    trial = Trial("house", "photos", ("a",) * images, protocol, sizes, "bid", config, seed)
+    return TrialResult(
+        None, reached is not None, STEPS, 2.0, None, 0.1, "fog", "bid", ScalarPoseError(moved[-1], turned[-1]), "a", seed,
+        start, Trace(moved, turned), "done", 2**30, {"rays": 64, "level": 0, **settings}, "weights-1", trial,
+    )  # fmt: skip
+
+
+def write(path: Path, *results: TrialResult) -> Path:
+    ResultTable(results).save(path)
+    return path
+
+
+@pytest.fixture
+def results() -> list[TrialResult]:
+    """Two conditions at two sizes; the second is slower and fails at the larger size."""
+    quick = [result(s, 2 + s % 3, size) for size in (1.2, 0.5) for s in range(6)]
+    slow = [
+        result(s, None if size > 1 else 6 + s % 4, size, level=None) for size in (0.5, 1.2) for s in range(6)
+    ]
+    return [*quick, *slow]
+
+
+def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
+    groups = grouped(results)
+    assert [g.situation.start for g in groups] == [
+        "bid 0.5", "bid 0.5", "bid 1.2", "bid 1.2", "bid, all sizes", "bid, all sizes",
+    ]  # fmt: skip
+    assert {g.label for g in groups} == {"bid, level 0", "bid, level none"}
+    assert [len(g.results) for g in groups] == [6, 6, 6, 6, 12, 12]
+    assert [g.label for g in grouped(results[:6])] == ["bid"]
+    rigs = grouped([result(0, 1), result(0, 1, images=8)])
+    assert [g.label for g in rigs] == ["bid, 1 image", "bid, 8 images"]
+    blind = result(0, 1)
+    blind = dataclasses.replace(blind, trial=dataclasses.replace(blind.trial, depth=False))
+    assert [g.label for g in grouped([result(0, 1), blind])] == ["bid, RGB-D", "bid, RGB"]
+    other = dataclasses.replace(result(0, 1), weights="weights-2")
+    assert len(situations(grouped([result(0, 1), other]))) == 2
+
+
+def test_a_summary_counts(results: list[TrialResult]) -> None:
+    by_name = {(g.situation.start, g.label): summarize(g.results) for g in grouped(results)}
+    slow = by_name["bid, all sizes", "bid, level none"]
+    judged = slow.criteria["10%"]
+    assert judged is not None
+    assert (judged.rate.successes, judged.rate.trials) == (6, 12)
+    assert judged.rate == success_rate_by_frame([True] * 6 + [False] * 6, [0] * 12)
+    assert judged.steps == 7
+    assert (slow.milliseconds_per_step, slow.seconds, slow.trials) == (200, 2, 12)
+    assert slow.translation == pytest.approx((0.001 + 1.2) / 2)
+    assert (slow.converged_but_wrong, slow.right_but_not_converged) == (0, 0)
+    lied = dataclasses.replace(result(0, None), converged=True)
+    assert summarize([lied]).converged_but_wrong == 1
+
+
+def test_without_a_start_there_is_no_share_of_its_error() -> None:
+    summary = summarize([result(s, 2, protocol="none") for s in range(3)])
+    assert summary.criteria["10%"] is None
+    assert summary.criteria["5deg 0.05"] is not None
+
+
+def test_comparisons_agree_with_scipy(results: list[TrialResult]) -> None:
+    near, far, both = pairwise_tests(grouped(results), "10%")
+    quick, slow = ([float(r.errors.translation.index(0.001)) for r in rows]
+                   for rows in (results[6:12], results[12:18]))  # fmt: skip
+    test = mannwhitneyu(quick, slow, alternative="two-sided")
+    assert (near.steps_u, near.steps_p) == (test.statistic, test.pvalue)
+    assert near.rates_p == 1
+    assert near.steps_p is not None
+    assert near.steps_p < 0.05
+    assert (far.steps_u, far.steps_p) == (None, None)
+    assert far.rates_p == pytest.approx(1 / 462)  # 2 of choose(12, 6)
+    assert (both.trials, both.successes) == ((12, 12), (12, 6))
+    assert both.all_p < 0.05
+
+
+def test_failures_are_slower_than_any_success_and_equal_among_themselves() -> None:
+    (a, b) = grouped([result(0, 3), result(1, None), result(0, None, level=1), result(1, None, level=1)])
+    assert steps_of(a.results, "10%") == [3, NEVER]
+    assert compare_pair(a, b, "10%").all_p == pytest.approx(compare_pair(b, a, "10%").all_p)
+    assert compare_pair(b, b, "10%").all_p == 1
+    assert compare_pair(a, a, "10%").all_p == pytest.approx(1)
+
+
+class Page(HTMLParser):
+    """Collects what a page would fetch, its pictures, and its text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.pictures: list[str] = []
+        self.text, self.open = "", 0
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.open += tag not in ("meta", "img", "br")
+        for name, value in attributes:
+            if name in ("src", "href"):
+                kind = (
+                    self.pictures if (value or "").startswith("data:image/svg+xml;base64,") else self.fetched
+                )
+                kind.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.open -= 1
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def read(folder: Path) -> Page:
+    page = Page()
+    page.feed((folder / "index.html").read_text())
+    return page
+
+
+@pytest.mark.slow
+def test_the_page_needs_nothing_beside_it(
+    tmp_path: Path, results: list[TrialResult], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write(tmp_path / "r.jsonl", *results)
+    note_run(file, provenance("bidnerf evaluate 'a <map>' photos", "2 local processes"))
+    assert main(["report", str(file), "--out", str(tmp_path / "out"), "--title", "Mine & yours"]) == 0
+    page = read(tmp_path / "out")
+    assert page.fetched == []
+    assert page.open == 0, "an element is not closed"
+    assert "url(" not in (tmp_path / "out" / "index.html").read_text()
+    assert len(page.pictures) == 5
+    for picture in page.pictures:
+        ET.fromstring(base64.b64decode(picture.partition(",")[2]))
+    for said in (
+        "Mine & yours", "24 trials", "bidnerf evaluate 'a <map>' photos", "2 local processes", "bid, level none",
+        "100.0 %6/6 on 1 frame, 21 to 100 %", "50.0 %6/12 on 1 frame, 5 to 95 %", "Fisher",
+    ):  # fmt: skip
+        assert said in page.text
+    for name in ("rates", "steps", "share", "translation", "rotation"):
+        assert iio.imread(tmp_path / "out" / f"{name}.png").std() > 1
+        assert (tmp_path / "out" / f"{name}.svg").stat().st_size > 2000
+    out = capsys.readouterr().out
+    assert re.search(r"bid, all sizes\n.*\n  bid, level none +12 +1 +50 % \(5-95\) +50 % \(5-95\) +50 %", out)
+
+
+def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:
+    lost = dataclasses.replace(
+        result(0, None, protocol="none"), error=None, errors=Trace((None, None), (None, None)), steps=0
+    )
+    file = write(tmp_path / "r.jsonl", lost)
+    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 0
+    assert "no record of how it was made" in read(tmp_path / "out").text
+
+
+def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
+    first, second = (Figures(grouped(results), tmp_path / name, "10%").steps() for name in ("a", "b"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(None, "no such file"), (b"", "no finished trial"), (b"hello\n", "line 1: not JSON")],
+)
+def test_a_file_without_results_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes | None, said: str
+) -> None:
+    file = tmp_path / "r.jsonl"
+    if content is not None:
+        file.write_bytes(content)
+    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert said in error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are files without content, since drawing them takes most of a report's time."""
+    monkeypatch.setattr(
+        "bidnerf_core.results.plot_style.write_figure",
+        lambda figure, path, **options: path.write_text("<svg/>"),
+    )
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_report_replaces_a_report_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]
+) -> None:
+    file, out = write(tmp_path / "r.jsonl", *results), tmp_path / "out"
+    out.mkdir()  # empty: nothing is lost
+    for title in ("first", "second"):
+        assert main(["report", str(file), "--out", str(out), "--title", title]) == 0
+        assert title in (out / "index.html").read_text()
+    for name in ("index.html", "thesis.tex"):
+        other = tmp_path / name.partition(".")[0]
+        other.mkdir()
+        (other / name).write_text("<html>mine</html>")
+        capsys.readouterr()
+        assert main(["report", str(file), "--out", str(other)]) == 1
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert f"{other}: holds something other than a bidnerf report" in error
+        assert [path.read_text() for path in other.iterdir()] == ["<html>mine</html>"]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_interrupted_report_is_written_again(
+    tmp_path: Path, results: list[TrialResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, out = write(tmp_path / "r.jsonl", *results), tmp_path / "out"
+
+    def interrupt(self: Figures) -> Path:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Figures, "steps", interrupt)
+        assert main(["report", str(file), "--out", str(out)]) == 130
+    assert (out / "rates.png").exists()
+    assert main(["report", str(file), "--out", str(out)]) == 0
+    assert read(out).fetched == []
+    written = (out / "index.html").read_bytes()
+    with monkeypatch.context() as patch:  # the page of before stays until the new one is whole
+        patch.setattr(Figures, "steps", interrupt)
+        assert main(["report", str(file), "--out", str(out)]) == 130
+    assert (out / "index.html").read_bytes() == written
+
+
+def test_datasets_and_maps_are_named_where_they_differ() -> None:
+    first = result(0, 2, protocol="none")
+    other = dataclasses.replace(first, trial=dataclasses.replace(first.trial, data="scans", split="val"))
+    retrained = dataclasses.replace(first, weights="weights-2.safetensors")
+    moved = dataclasses.replace(first, trial=dataclasses.replace(first.trial, map="garden"))
+
+    def titles(*found: TrialResult) -> list[str]:
+        return list(situation_titles(situations(grouped(found))).values())
+
+    assert titles(first) == ["no start"]
+    assert titles(first, other) == ["photos/test: no start", "scans/val: no start"]
+    assert titles(first, moved) == ["house: no start", "garden: no start"]
+    assert titles(first, retrained) == ["house (weights-1): no start", "house (weights-2): no start"]
+    assert titles(
+        first, dataclasses.replace(other, trial=dataclasses.replace(other.trial, map="garden"))
+    ) == [
+        "house on photos/test: no start",
+        "garden on scans/val: no start",
+    ]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_report_without_starts_uses_no_share_of_their_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    free = [result(seed, 2 + seed, protocol="none") for seed in range(3)]
+    file, out = write(tmp_path / "r.jsonl", *free), tmp_path / "out"
+    assert main(["report", str(file), "--out", str(out)]) == 0
+    assert "Steps to success (under 5° and 0.05 units)" in read(out).text
+    assert "(translation error at most 10 %" not in read(out).text
+    capsys.readouterr()
+    assert main(["report", str(file), "--out", str(out), "--criterion", "10%"]) == 2
+    err = capsys.readouterr().err
+    assert "no trial had a start" in err
+    assert err.count("\n") == 1
+    mixed = write(tmp_path / "m.jsonl", *free, result(0, 2), result(1, 3))
+    assert main(["report", str(mixed), "--out", str(out), "--criterion", "10%"]) == 0
+    assert "Trials without a start are not shown" in read(out).text
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"), [([1, 4], 2.5), ([3, 1, 2], 2), ([1, None], None), ([1, 2, None], 2), ([], None)]
+)
+def test_a_median_counts_what_is_unknown_as_infinite(
+    values: list[float | None], expected: float | None
+) -> None:
+    assert median(values) == expected
+
+
+def test_a_damaged_side_file_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]
+) -> None:
+    file = write(tmp_path / "r.jsonl", *results)
+    (tmp_path / "r.meta.json").write_text(json.dumps({"runs": 3}))
+    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
+    assert "runs is 3, expected a list" in capsys.readouterr().err
+
+
+def test_a_recorded_command_has_no_local_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = [
+        "/a/run.py",
+        "map:/data/lego",
+        "/b/map:/data/room",
+        "--out=/c/d",
+        "/e/f",
+        "g/h",
+        "--size",
+        "0.5:10",
+    ]
+    monkeypatch.setattr(sys, "argv", words)
+    assert script_command() == "python run.py map:lego map:room --out=d f g/h --size 0.5:10"
+
+
+HOSTILE = (
+    r"$\frac{$", "$x^{y$", r"$\badmacro{1}$", "$$", "\x1b[31mred", "nul\0", "\x07bell", "\u202eesrever", "\u2028line",
+    "<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "{{ 7 * 7 }}", "{% raw %}", "a\nb", "&amp;", "]]>", "x" * 5000,
+)  # fmt: skip
+
+
+def hostile_result(place: int) -> TrialResult:
+    """Return a result that holds every fourth hostile text wherever a file may hold any text."""
+    texts, usual = HOSTILE[place::4], result(place, 2 + place, protocol="none")
+    text, name = "".join(texts), "".join(texts).replace("\0", "")
+    trial = dataclasses.replace(usual.trial, map=name, data=name, split=text, device=text, depth_points=name)
+    return dataclasses.replace(
+        usual, settings={each: each for each in texts}, backend=text, weights=text, reason=text, trial=trial
+    )
+
+
+def harmless(text: str) -> bool:
+    """Return whether text, apart from line feeds, holds nothing that a terminal or a browser would obey."""
+    return all(character.isprintable() or character == "\n" for character in text)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error")
+def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    file = write(tmp_path / "r.jsonl", *map(hostile_result, range(4)))
+    run = provenance(HOSTILE[4], "\x1b]0;title\x07")
+    for text in HOSTILE:
+        note_run(file, dataclasses.replace(run, command=text, cpu=text, versions={text: text}))
+    title = "<b>\x1b[2J\udcff\u202e$\\frac{$"
+    assert main(["report", str(file), "--out", str(tmp_path / "out"), "--title", title]) == 0
+    said = capfd.readouterr()
+    assert harmless(said.out)
+    assert harmless(said.err)
+    content = (tmp_path / "out" / "index.html").read_text()
+    assert harmless(content)
+    for markup in ("<script", "<img src=x", "<b>"):
+        assert markup not in content
+    page = read(tmp_path / "out")
+    assert page.fetched == []
+    for shown in (
+        r"$\frac{$",
+        r"\x1b[31mred",
+        r"nul\x00",
+        r"\u202eesrever",
+        "{{ 7 * 7 }}",
+        r"<b>\x1b[2J\udcff",
+    ):
+        assert shown in page.text
+    drawings = list((tmp_path / "out").glob("*.svg"))
+    assert len(drawings) == len(page.pictures) == 5
+    for drawing in drawings:
+        ET.parse(drawing)
+
+
+def test_a_name_that_no_folder_can_have_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = json.dumps(to_plain(result(0, 2)))
+    for name in ("map", "data", "depth_points"):
+        plain = json.loads(line)
+        plain["trial"][name] = "a\0b"
+        (tmp_path / "r.jsonl").write_text(json.dumps(plain))
+        assert main(["report", str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "out")]) == 1
+        error = capsys.readouterr().err
+        assert f"{name} holds a NUL character" in error
+        assert error.count("\n") == 1
+
+
+def test_more_than_can_be_drawn_is_in_the_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidnerf_core.evaluation.plots.MOST_LINES", 3)
+    many = [result(seed, 2, protocol="none") for seed in range(8)]
+    many = [dataclasses.replace(r, trial=dataclasses.replace(r.trial, map=f"map {r.seed}")) for r in many]
+    table = ResultTable(tuple(many))
+    figures, whole = (Figures(groups, tmp_path, "5deg 0.05") for groups in (table.groups, table.groups[:3]))
+    assert "At most 3 of 8 groups" in figures.omitted
+    assert whole.omitted == ""
+    heights = [iio.imread(each.rates().with_suffix(".png")).shape[0] for each in (figures, whole)]
+    assert heights[0] == heights[1]
+    assert "map 7" in page("Many", table, [], [], "5deg 0.05")
+
+
+def test_warnings_of_other_libraries_cannot_control_the_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write(tmp_path / "r.jsonl", result(0, 2))
+
+    def warn(self: Figures) -> Path:
+        warnings.warn("Glyph \x1b[31m missing", UserWarning, stacklevel=1)
+        raise InputError("enough")
+
+    monkeypatch.setattr(Figures, "rates", warn)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *place: print(message, file=sys.stderr)  # type: ignore[assignment]
+        assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
+    said = capfd.readouterr().err
+    assert r"Glyph \x1b[31m missing" in said
+    assert harmless(said)

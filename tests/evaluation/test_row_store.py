@@ -1,0 +1,53 @@
+"""What scripts keep: rows by key, which survive a kill, and records with how they were made."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import RowStore, write_record
+
+
+def test_a_script_goes_on_where_it_was_killed(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    with RowStore(path) as store:
+        assert [store.get(["a", n], lambda n=n: {"value": n}) for n in (1, 2)] == [{"value": 1}, {"value": 2}]
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-5])  # a kill in the middle of the second row
+    made: list[int] = []
+
+    def make() -> dict[str, int]:
+        made.append(2)
+        return {"value": 2}
+
+    with RowStore(path) as store:
+        assert store.get(["a", 1], make) == {"value": 1}
+        assert made == []
+        assert store.get(["a", 2], make) == store.get(["a", 2], make) == {"value": 2}
+        with pytest.raises(InputError, match="another process"), RowStore(path):
+            pass
+    assert made == [2]
+    assert path.read_bytes() == whole
+
+
+def test_rows_of_something_else_are_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    for content in ("notes\n", '{"a": 1}\n', "[1]\n"):
+        path.write_text(content)
+        with pytest.raises(InputError, match="expected lines in the format of benchmark"), RowStore(path):
+            pass
+        assert path.read_text() == content
+
+
+def test_a_record_holds_its_results_and_how_they_were_made(tmp_path: Path) -> None:
+    path = write_record(tmp_path / "new" / "speed.json", {"rate": 0.5}, seed=3)
+    record = json.loads(path.read_text())
+    assert (record["benchmark"], record["seed"], record["results"]) == ("speed", 3, {"rate": 0.5})
+    assert record["command"].startswith("python ")
+    assert {"commit", "dirty", "cpu", "date", "versions", "workers"} <= record.keys()
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_record(path, {"rate": float("nan")}, seed=3)
+    assert json.loads(path.read_text()) == record

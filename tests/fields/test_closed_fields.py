@@ -1,0 +1,100 @@
+"""Fields in closed form: they keep the contract, and volume rendering finds what is known of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields import RadianceField, Rays, RaySampler, SceneBounds, Stratified, levels, render
+from bidnerf_core.geometry import SE3
+from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall, orbit
+
+BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)
+
+
+def rays_towards_the_middle(count: int, generator: torch.Generator) -> Rays:
+    """Float64; most of them meet a ball of radius 0.7."""
+    origins = torch.stack([T.translation for T in orbit(3.0, count, elevation=(-90, 90))])
+    aims = torch.rand((count, 3), generator=generator, dtype=torch.float64) * 1.6 - 0.8
+    return BOUNDS.rays(origins, torch.nn.functional.normalize(aims - origins, dim=-1))
+
+
+@pytest.mark.parametrize(
+    "field", [GaussianBlobs.random(), HomogeneousBall(0.7, 2.0)], ids=lambda f: type(f).__name__
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_contract(field: RadianceField, dtype: torch.dtype, generator: torch.Generator) -> None:
+    assert isinstance(field, RadianceField)
+    assert isinstance(field.sampler, RaySampler)
+    assert levels(field) == (field,)
+    positions = torch.rand((40, 5, 3), generator=generator, dtype=dtype) * 3 - 1.5
+    values = field.query(positions, torch.nn.functional.normalize(positions, dim=-1))
+    assert values.density.dtype == values.rgb.dtype == dtype
+    assert (values.density >= 0).all()
+    assert ((values.rgb >= 0) & (values.rgb <= 1)).all()
+    assert field.query(positions[:0], positions[:0]).density.shape == (0, 5)
+
+
+@pytest.mark.parametrize("density", [0.0, 0.3, 2.0, 40.0])
+def test_rendered_opacity_is_beer_lambert(density: float, generator: torch.Generator) -> None:
+    ball = HomogeneousBall(0.7, density, rgb=(0.2, 0.5, 0.9), centre=(0.1, -0.05, 0.2))
+    rays = rays_towards_the_middle(200, generator)
+    enter, leave = ball.chord(rays)
+    assert (leave - enter).max() > 1.2
+    assert (leave == enter).any()
+    # Limited to the chord the samples tile it exactly; limited to the box, borders are missed by an interval or less.
+    exact = render(ball, Rays(rays.origins, rays.directions, enter, leave), background=(1.0, 1.0, 1.0))
+    torch.testing.assert_close(exact.opacity, ball.opacity(rays), atol=1e-9, rtol=0)
+    expected = 1 + ball.opacity(rays)[:, None] * (exact.rgb.new_tensor(ball.rgb) - 1)
+    torch.testing.assert_close(exact.rgb, expected, atol=1e-9, rtol=0)
+    step = (rays.far - rays.near).max() / 256
+    rough = render(ball, rays)
+    torch.testing.assert_close(rough.opacity, ball.opacity(rays), atol=float(density * step) + 1e-9, rtol=0)
+
+
+def test_chord_of_rays_that_start_within_or_point_away() -> None:
+    ball = HomogeneousBall(0.5, 1.0)
+    origins = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [2.0, 0, 0], [0.0, 0.6, 0]], dtype=torch.float64)
+    directions = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0]], dtype=torch.float64)
+    enter, leave = ball.chord(
+        Rays(origins, directions, torch.zeros(4).double(), torch.full((4,), 5.0).double())
+    )
+    assert (leave - enter).tolist() == pytest.approx([0.5, 1.0, 0.0, 0.0])
+
+
+def test_blobs_are_differentiable_in_position(generator: torch.Generator) -> None:
+    field = GaussianBlobs.random(3, seed=1)
+    positions = (torch.rand((6, 3), generator=generator, dtype=torch.float64) - 0.5).requires_grad_()
+
+    def values(x: Tensor) -> tuple[Tensor, Tensor]:
+        found = field.query(x, x)
+        return found.density, found.rgb
+
+    assert torch.autograd.gradcheck(values, (positions,))
+    assert torch.autograd.gradgradcheck(values, (positions,))
+
+
+def test_moved_blobs_have_there_what_they_had_here(generator: torch.Generator) -> None:
+    field = GaussianBlobs.random(seed=2)
+    move = SE3.exp(torch.tensor([0.4, -2.0, 1.0, 0.3, 1.0, -0.7], dtype=torch.float64))
+    points = torch.rand((50, 3), generator=generator, dtype=torch.float64) * 2 - 1
+    here, there = field.query(points, points), field.moved(move).query(move.apply(points), points)
+    torch.testing.assert_close(there.density, here.density, atol=1e-10, rtol=0)
+    torch.testing.assert_close(there.rgb, here.rgb, atol=1e-10, rtol=0)
+    again = SE3.exp(torch.tensor([-1.0, 0.2, 0.5, -0.8, 0.1, 0.4], dtype=torch.float64))
+    twice = field.moved(move).moved(again).query((again @ move).apply(points), points)
+    torch.testing.assert_close(twice.density, here.density, atol=1e-10, rtol=0)
+
+
+def test_blobs_are_seen_from_everywhere_and_differ_by_seed(generator: torch.Generator) -> None:
+    rays = rays_towards_the_middle(200, generator)
+    one = render(GaussianBlobs.random(seed=0, samples=128), rays)
+    assert one.opacity.max() > 0.9
+    assert one.opacity.mean() > 0.3
+    assert one.rgb[one.opacity > 0.5].std(dim=0).min() > 0.03
+    assert (one.rgb - render(GaussianBlobs.random(seed=1), rays).rgb).abs().mean() > 0.05
+    assert GaussianBlobs.random(samples=7).sampler == Stratified(7)
+    with pytest.raises(InputError, match="at least 1"):
+        GaussianBlobs.random(0)

@@ -1,0 +1,152 @@
+"""Fields that find for whole rays what they meet: rendering, derivatives and the contract's check of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core.fields import (
+    FieldValues,
+    HitField,
+    HitsAroundDepth,
+    Observations,
+    RayHits,
+    Rays,
+    Stratified,
+    render,
+)
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.costs.linearization import linearize
+from bidnerf_core.testing import check_hits
+
+SOFT = 0.01  # metres: standard deviation of the density about a sheet
+HEIGHTS = (0.4, -0.3)  # metres
+ALPHA = 0.6
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """Two level sheets that stop the same share of any ray, with colours that vary smoothly over them."""
+
+    sampler: Stratified = Stratified(64)
+
+    def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
+        slope = directions[..., 2].abs()
+        density = torch.zeros_like(slope)
+        for height in HEIGHTS:
+            away = (positions[..., 2] - height) / SOFT
+            profile = torch.exp(-0.5 * away.square()) / (math.sqrt(2 * math.pi) * SOFT)
+            density = density - math.log(1 - ALPHA) * slope * profile
+        return FieldValues(density, self.colour(positions))
+
+    @staticmethod
+    def colour(positions: Tensor) -> Tensor:
+        return torch.sigmoid(3 * positions)
+
+    def hits(self, rays: Rays) -> RayHits:
+        slope = rays.directions[..., 2:]
+        heights = rays.origins.new_tensor(HEIGHTS)
+        distance = (heights - rays.origins[..., 2:]) / slope
+        distance, _ = distance.sort(dim=-1)
+        valid = (distance > rays.near[..., None]) & (distance < rays.far[..., None])
+        # those that count come first
+        distance, order = torch.where(valid, distance, torch.inf).sort(dim=-1)
+        valid = valid.gather(-1, order)
+        distance = torch.where(valid, distance, rays.near[..., None])
+        return RayHits(distance, ALPHA * valid.to(distance), self.colour(rays.at(distance)), valid)
+
+
+@dataclass(frozen=True)
+class Changed(Sheets):
+    """Sheets whose hits are changed afterwards."""
+
+    change: Callable[[RayHits], RayHits] = lambda hits: hits
+
+    def hits(self, rays: Rays) -> RayHits:
+        return self.change(super().hits(rays))
+
+
+def rays(count: int = 12) -> Rays:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.tensor([0.0, 0, 2]) + 0.3 * torch.randn((count, 3), generator=generator)
+    targets = 0.5 * torch.randn((count, 3), generator=generator)
+    directions = torch.nn.functional.normalize(targets * torch.tensor([1.0, 1, 0]) - origins, dim=-1)
+    return Rays(*(x.double() for x in (origins, directions, torch.zeros(count), torch.full((count,), 9.0))))
+
+
+def test_hits_are_composited_from_the_nearest_on() -> None:
+    field = Sheets()
+    assert isinstance(field, HitField)
+    hits = field.hits(rays())
+    found = render(field, rays(), (1.0, 1.0, 1.0))
+    first, second = hits.rgb.unbind(1)
+    expected = ALPHA * first + (1 - ALPHA) * ALPHA * second + (1 - ALPHA) ** 2
+    assert torch.allclose(found.rgb, expected)
+    assert torch.allclose(found.opacity, torch.tensor(1 - (1 - ALPHA) ** 2).double())
+    assert torch.allclose(found.distance, ALPHA * (hits.distance @ torch.tensor([1, 1 - ALPHA]).double()))
+
+
+def test_rays_that_meet_nothing_see_the_background() -> None:
+    away = replace(rays(), directions=-rays().directions)
+    found = render(Sheets(), away, (0.1, 0.2, 0.3))
+    assert torch.allclose(found.rgb, torch.tensor([0.1, 0.2, 0.3]).double().expand_as(found.rgb))
+
+
+def test_the_jacobian_of_hits_is_that_of_finite_differences() -> None:
+    start = SE3.exp(torch.tensor([0.1, 0, 0, 0, 0.1, 0], dtype=torch.float64))
+    local = rays()
+    count = len(local.near)
+    observed = Observations(
+        local.origins, local.directions, torch.full((count, 3), 0.5).double(),
+        torch.full((count,), 2.0).double(), torch.ones(count, dtype=torch.bool),
+    )  # fmt: skip
+
+    def moved(T: SE3) -> Rays:
+        return Rays(
+            *(x[None] for x in (T.apply(local.origins), T.rotate(local.directions), local.near, local.far))
+        )
+
+    def residual(rendering: object, seen: Observations) -> Tensor:
+        found = rendering
+        return torch.cat([found.rgb - seen.rgb, (found.distance - seen.distance)[..., None]], dim=-1)  # type: ignore[attr-defined]
+
+    pivot = SE3(start.rotation[None], start.translation[None])
+    exact = linearize(Sheets(), moved(start), observed, residual, pivot, (0.0, 0.0, 0.0))  # type: ignore[arg-type]
+    assert not exact.rgb.requires_grad
+    assert not exact.residuals.requires_grad
+    for axis in range(6):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[axis] = 1e-6
+        ahead, behind = (
+            linearize(Sheets(), moved(start.retract(s)), observed, residual, pivot, (0.0, 0.0, 0.0)).residuals  # type: ignore[arg-type]
+            for s in (step, -step)
+        )
+        assert torch.allclose(exact.jacobian[..., axis], (ahead - behind) / 2e-6, atol=1e-6)
+
+
+def test_hits_around_a_measured_depth() -> None:
+    field, along = Sheets(), rays()
+    whole = field.hits(along)
+    measured = whole.distance[:, 0].clone()
+    measured[0] = 0  # nothing was measured: the whole ray counts
+    near = HitsAroundDepth(field, measured, 0.1).hits(along)
+    assert near.valid.sum(-1).tolist() == [2, *[1] * (len(measured) - 1)]
+    assert torch.equal(near.distance[1:, 0], whole.distance[1:, 0])
+
+
+def test_the_contract_accepts_them_and_tells_what_is_wrong() -> None:
+    check_hits(Sheets())
+    changes: dict[str, Callable[[RayHits], RayHits]] = {
+        r"outside of \[0, 1\]": lambda hits: replace(hits, alpha=1.5 * hits.alpha / ALPHA),
+        "light of rays": lambda hits: replace(hits, alpha=0.5 * hits.alpha),
+        "where a hit is not valid": lambda hits: replace(hits, alpha=torch.full_like(hits.alpha, ALPHA)),
+        "outside .near, far.": lambda hits: replace(hits, distance=hits.distance + 100),
+    }
+    for message, change in changes.items():
+        with pytest.raises(AssertionError, match=message):
+            check_hits(Changed(change=change))

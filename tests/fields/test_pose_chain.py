@@ -1,0 +1,170 @@
+"""Derivatives by the pose, all the way from the tangent space to the loss, and what they are good for."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widened
+from bidnerf_core.frames import Frame, View, draw, uniform
+from bidnerf_core.geometry import SE3, Robust
+from bidnerf_core.localization import Problem, rig
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import GaussianBlobs, look_at, orbit
+from problems import FieldMap, localize, single
+
+BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
+CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
+HUBER = Robust("huber", 0.1)
+PAPERS = Objective((colour_term(HUBER), depth_term(HUBER, 1.0)))
+
+
+def photograph(field: GaussianBlobs, T_world_camera: SE3, name: str = "frame", depth: bool = True) -> Frame:
+    """Return what a perfect RGB-D camera sees of a field: the rendering's own colour and distance."""
+    ray = CAMERA.unproject(CAMERA.pixel_centres(torch.float64))
+    length = torch.linalg.vector_norm(ray, dim=-1)
+    directions = T_world_camera.rotate(ray / length[..., None])
+    rays = BOUNDS.rays(T_world_camera.translation.expand_as(directions), directions)
+    with torch.no_grad():
+        rendering = render(field, rays, BOUNDS.background)
+    measured = torch.where(rendering.opacity > 0.9, rendering.distance / length, 0)
+    return Frame(name, rendering.rgb, CAMERA, measured if depth else None)
+
+
+def loss(problem: Problem, T_world_last: SE3, wide: float = 1.0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(7)
+    pixels = draw(problem.views, 60, uniform, generator, torch.float64)
+    rays = widened(pixels.rays(T_world_last, problem.bounds), wide)
+    return PAPERS.loss(render(problem.field, rays, problem.bounds.background), pixels)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("wide", [1.0, 2.0])
+def test_gradient_by_the_pose_is_the_numerical_one(views: int, wide: float) -> None:
+    field = GaussianBlobs.random()
+    poses = orbit(4.0, views + 3, seed=1)[:views]
+    seen = [View(photograph(field, T, str(i)), T) for i, T in enumerate(poses)]
+    problem = rig(FieldMap(field, BOUNDS), seen, perturb(poses[-1], 0.3, 8.0, seed=0))
+
+    def by_tangent(xi: torch.Tensor) -> torch.Tensor:
+        # The interval on each ray says the part that is sampled, without a derivative: hold it, as autograd does.
+        pixels = draw(problem.views, 60, uniform, torch.Generator().manual_seed(7), torch.float64)
+        here = widened(pixels.rays(problem.start, problem.bounds), wide)
+        moved = pixels.rays(problem.start.retract(xi), problem.bounds)
+        rays = type(here)(moved.origins, moved.directions, here.near, here.far)
+        return PAPERS.loss(render(field, rays, BOUNDS.background), pixels)
+
+    zero = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    (found,) = torch.autograd.grad(loss(problem, problem.start.retract(zero), wide), zero)
+    numerical = []
+    for k in range(6):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[k] = 1e-5
+        numerical.append(float(by_tangent(step) - by_tangent(-step)) / 2e-5)
+    assert float(found.norm()) > 1e-3
+    torch.testing.assert_close(found, torch.tensor(numerical, dtype=torch.float64), atol=1e-8, rtol=1e-5)
+
+
+def test_zero_residual_at_the_truth() -> None:
+    field = GaussianBlobs.random()
+    truth = orbit(4.0, 3, seed=1)[0]
+    problem = single(field, BOUNDS, photograph(field, truth, depth=False), truth)
+    assert float(loss(problem, truth)) < 1e-12
+    assert float(loss(problem, perturb(truth, 0.2, 5.0, seed=0))) > 1e-4
+
+
+SETTINGS = {
+    "rays": 512, "max_steps": 200, "learning_rate": 0.08, "decay_steps": 80, "depth_weight": 1.0, "level": None,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_view_finds_its_place() -> None:
+    field = GaussianBlobs.random()
+    truth = orbit(4.0, 3, seed=1)[1]
+    start = perturb(truth, 0.3, 6.0, seed=3)
+    found = localize(single(field, BOUNDS, photograph(field, truth), start), "bid", SETTINGS, seed=0)
+    error = pose_error(found.T_world_camera, truth)
+    assert float(error.translation) < 0.03
+    assert float(error.rotation_deg) < 1.0
+    assert found.steps == 200
+    assert found.poses.translation.shape == (201, 3)
+    assert len(found.losses) == 200
+
+
+def test_a_moved_world_gives_a_moved_answer() -> None:
+    """Map, start and truth moved together: the same steps, moved. The scene's box cannot turn, so it is made larger."""
+    motion = SE3.exp(torch.tensor([0.2, -0.1, 0.3, 0.5, -0.7, 1.1], dtype=torch.float64))
+    roomy = SceneBounds((-30.0,) * 3, (30.0,) * 3, 2.0, 6.5, BOUNDS.background)
+    field = GaussianBlobs.random()
+    truth = orbit(4.0, 3, seed=1)[2]
+    start = perturb(truth, 0.25, 5.0, seed=3)
+    frame = photograph(field, truth)
+    few = {"rays": 256, "max_steps": 25, "level": None}
+    here = localize(single(field, roomy, frame, start), "bid", few, seed=0)
+    there = localize(single(field.moved(motion), roomy, frame, motion @ start), "bid", few, seed=0)
+    expected = motion @ here.T_world_camera
+    torch.testing.assert_close(there.T_world_camera.matrix(), expected.matrix(), atol=2e-4, rtol=0)
+    assert float(pose_error(here.T_world_camera, start).translation) > 0.05
+
+
+def test_the_seed_decides() -> None:
+    field = GaussianBlobs.random()
+    truth = orbit(4.0, 3, seed=1)[0]
+    problem = single(field, BOUNDS, photograph(field, truth), perturb(truth, 0.25, 5.0, seed=3))
+    few = {"rays": 128, "max_steps": 5, "level": None}
+    one, same, other = (localize(problem, "bid", few, seed) for seed in (0, 0, 1))
+    assert torch.equal(one.T_world_camera.matrix(), same.T_world_camera.matrix())
+    assert not torch.equal(one.T_world_camera.matrix(), other.T_world_camera.matrix())
+
+
+def test_rays_are_shared_out_equally_and_lie_in_the_last_cameras_frame() -> None:
+    field = GaussianBlobs.random()
+    poses = orbit(4.0, 6, seed=1)[:3]
+    problem = rig(
+        FieldMap(field, BOUNDS),
+        [View(photograph(field, T, str(i)), T) for i, T in enumerate(poses)],
+        poses[-1],
+    )
+    pixels: Observations = draw(problem.views, 99, uniform, torch.Generator().manual_seed(0))
+    assert pixels.rgb.shape == (3, 33, 3)
+    world = pixels.rays(poses[-1], BOUNDS)
+    for i, T in enumerate(poses):
+        torch.testing.assert_close(world.origins[i], T.translation.float().expand(33, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(world.directions.norm(dim=-1), torch.ones(3, 33), atol=1e-5, rtol=0)
+    assert bool(problem.views[-1].T_ref_camera.matrix().allclose(torch.eye(4, dtype=torch.float64)))
+
+
+def test_a_permuted_rig_gives_the_same_loss() -> None:
+    """The order of all but the last view does not matter."""
+    field = GaussianBlobs.random()
+    poses = orbit(4.0, 6, seed=1)[:3]
+    views = [View(photograph(field, T, str(i)), T) for i, T in enumerate(poses)]
+    start = perturb(poses[-1], 0.2, 4.0, seed=0)
+
+    def every(frame: Frame, count: int, generator: torch.Generator) -> torch.Tensor:
+        grid = torch.arange(0, 40, 5)
+        return torch.cartesian_prod(grid, grid)
+
+    losses = []
+    for order in ([0, 1, 2], [1, 0, 2]):
+        problem = rig(FieldMap(field, BOUNDS), [views[i] for i in order], start)
+        pixels = draw(problem.views, 3, every, torch.Generator(), torch.float64)
+        rendering = render(field, pixels.rays(start, BOUNDS), BOUNDS.background)
+        losses.append(PAPERS.loss(rendering, pixels))
+    torch.testing.assert_close(*losses)
+
+
+def test_a_start_that_looks_away_is_not_accepted() -> None:
+    field = GaussianBlobs.random()
+    truth = look_at((4.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    away = look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))
+    found = localize(
+        single(field, BOUNDS, photograph(field, truth), away),
+        "bid",
+        {"rays": 64, "max_steps": 20, "level": None},
+    )
+    assert not found.converged
+    assert bool(found.T_world_camera.is_rigid())

@@ -1,0 +1,125 @@
+"""Photos that say nothing of their camera, as messengers send them: ``auto`` begins with the camera of the map's images."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+import bidnerf_core.cli.localize as localize_module
+from bidnerf_core import Frame, Intrinsics, Localizer
+from bidnerf_core.evaluation import faulty
+from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.maps import Map, MapInfo
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen
+from commands import Run
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    path = tmp_path / "photo.png"
+    iio.imwrite(path, (255 * unseen().frame.rgb).round().to(torch.uint8).numpy())
+    return path
+
+
+def stored(monkeypatch: pytest.MonkeyPatch, landmarks: LandmarkMap | None) -> None:
+    """Let the command load the textured ground with these landmarks, whatever the folder."""
+    known, info = textured_map(surface=True), MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground")
+    ground = Map(info, known.field, known.surface, landmarks)
+    monkeypatch.setattr(localize_module, "load_map", lambda folder: ground)
+
+
+def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:
+    found = textured_map().landmarks
+    assert found is not None
+    return replace(found, cameras=cameras)
+
+
+@pytest.mark.slow
+def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored(monkeypatch, landmarks_of(CAMERA))
+    status, out, err = bidnerf("localize", "MAP", photo, "--json")
+    assert status == 0, err
+    answer = json.loads(out)
+    assert answer["converged"]
+    error = pose_error(SE3.from_matrix(torch.tensor(answer["T_world_camera"])), unseen().T_ref_camera)
+    assert error.translation < 0.05
+    assert error.rotation_deg < 3
+    assert "camera unknown, assumed to be that of the map's images" in err
+
+
+@pytest.mark.parametrize("option", [["--no-landmarks"], ["--method", "inerf-lm", "--start", "start.json"]])
+def test_methods_that_do_not_estimate_a_focal_length_need_one(
+    bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, option: list[str]
+) -> None:
+    stored(monkeypatch, landmarks_of(CAMERA))
+    monkeypatch.chdir(tmp_path)
+    pose = unseen().T_ref_camera.matrix().tolist()
+    (tmp_path / "start.json").write_text(json.dumps({"T_world_camera": pose}))
+    status, out, err = bidnerf("localize", *option, "MAP", photo)
+    assert (status, out) == (1, "")
+    assert "no focal length in EXIF, expected a camera" in err
+
+
+def test_a_map_without_landmarks_does_not_tell_a_focal_length(
+    bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored(monkeypatch, None)
+    status, _, err = bidnerf("localize", "MAP", photo)
+    assert status == 1
+    assert "no focal length in EXIF, expected a camera" in err
+
+
+@pytest.mark.parametrize("factor", [0.7, 2.0])
+def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo: Path, factor: float) -> None:
+    wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+    frame = Frame.open(photo, assumed=[wrong])
+    assert frame.focal_is_approximate
+    found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))(frame)
+    assert found.converged
+    assert found.focal_factor == pytest.approx(1 / factor, rel=0.01)
+    assert "than assumed" in found.reason
+    assert pose_error(found.T_world_camera, unseen().T_ref_camera).translation < 0.02
+
+
+def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
+    rgb = torch.rot90(unseen().frame.rgb, 1, (0, 1)).contiguous()
+    camera = Intrinsics.from_focal(1.2 * CAMERA.fx, CAMERA.height, CAMERA.width)
+    frame = Frame("portrait", rgb, camera, focal_is_approximate=True)
+    found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))(frame)
+    assert found.converged
+    assert found.intrinsics is not None
+    assert found.intrinsics.fx == CAMERA.fx
+    turn = SE3.exp(torch.tensor([0, 0, 0, 0, 0, math.pi / 2], dtype=torch.float64))
+    error = pose_error(found.T_world_camera, unseen().T_ref_camera @ turn)
+    assert error.translation < 0.02
+    assert error.rotation_deg < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.7, 1.0, 1.15])
+def test_colours_alone_do_not_tell_an_approximate_focal_length(photo: Path, factor: float) -> None:
+    """Neither landmarks of unknown cameras nor colours: the ground looks nearly flat."""
+    frame = Frame.open(photo, assumed=[replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)])
+    for known in (landmarks_of(), None):
+        assert not Localizer(replace(textured_map(surface=True), landmarks=known))(frame).converged
+
+
+@pytest.mark.parametrize("sigma", [2.0, 3.5])
+def test_nor_do_those_of_a_blurred_photo(sigma: float) -> None:
+    blurred = faulty(unseen(), f"blur:{sigma}", 0).frame
+    camera = replace(CAMERA, fx=CAMERA.fx * 1.1, fy=CAMERA.fy * 1.1)
+    frame = replace(blurred, depth=None, intrinsics=camera, focal_is_approximate=True)
+    assert not Localizer(replace(textured_map(surface=True), landmarks=None))(frame).converged
+
+
+def test_colours_alone_suffice_with_a_known_focal_length(photo: Path) -> None:
+    frame = Frame.open(photo, camera=CAMERA)
+    assert Localizer(replace(textured_map(surface=True), landmarks=None))(frame).converged

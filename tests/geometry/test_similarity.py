@@ -1,0 +1,64 @@
+"""Similarities between point sets: what comes back, what does not, and scipy's rotation as a witness."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bidnerf_core.geometry import SE3, Similarity, fit_similarity, spread
+from refusals import refused
+
+GENERATOR = torch.Generator().manual_seed(0)
+CLOUD = torch.randn((20, 3), generator=GENERATOR, dtype=torch.float64)
+TRUTH = Similarity(0.37, SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.4, -1.1, 2.7], dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("count", [3, 4, 20])
+@pytest.mark.parametrize("flat", [False, True])
+def test_an_exact_one_comes_back(count: int, flat: bool) -> None:
+    points = CLOUD[:count] * torch.tensor([1.0, 1.0, 0.0 if flat else 1.0])
+    found = fit_similarity(points, TRUTH.apply(points))
+    assert found.scale == pytest.approx(TRUTH.scale, rel=1e-9)
+    torch.testing.assert_close(found.T_target_source.matrix(), TRUTH.T_target_source.matrix())
+
+
+def test_of_points_on_a_line_the_scale_is_known() -> None:
+    line = CLOUD[:1] * torch.linspace(-2, 5, 6)[:, None]
+    for points in (line, line[:2]):
+        found = fit_similarity(points, TRUTH.apply(points))
+        assert found.scale == pytest.approx(TRUTH.scale, rel=1e-9)
+        assert bool(found.T_target_source.is_rigid())
+        torch.testing.assert_close(found.apply(points), TRUTH.apply(points))
+
+
+def test_its_inverse_is_that_of_the_sets_exchanged() -> None:
+    there = TRUTH.apply(CLOUD)
+    back = fit_similarity(there, CLOUD)
+    torch.testing.assert_close(back.apply(there), CLOUD)
+    assert back.scale == pytest.approx(1 / TRUTH.scale)
+
+
+def test_a_mirror_image_is_answered_with_a_rotation() -> None:
+    mirrored = CLOUD * torch.tensor([1.0, 1.0, -1.0])
+    found = fit_similarity(CLOUD, mirrored)
+    assert float(torch.linalg.det(found.T_target_source.rotation)) == pytest.approx(1)
+
+
+def test_the_rotation_is_scipys_and_the_scale_the_least_squares_one() -> None:
+    noisy = TRUTH.apply(CLOUD) + 0.1 * torch.randn(CLOUD.shape, generator=GENERATOR, dtype=torch.float64)
+    found = fit_similarity(CLOUD, noisy)
+    a, b = CLOUD - CLOUD.mean(0), noisy - noisy.mean(0)
+    rotation, _ = Rotation.align_vectors(b.numpy(), a.numpy())
+    torch.testing.assert_close(found.T_target_source.rotation, torch.from_numpy(rotation.as_matrix()))
+    turned = found.T_target_source.rotate(a)
+    assert found.scale == pytest.approx(float((turned * b).sum() / (a * a).sum()))  # d/ds |b - s R a|^2 = 0
+
+
+def test_points_that_tell_nothing_are_refused() -> None:
+    same = torch.full((4, 3), 0.1, dtype=torch.float64)
+    some = CLOUD[:4]
+    for source, target in ((some[:1], some[:1]), (same, some), (some, same), (some[:0], some[:0])):
+        with refused(found=f"{len(source)} pairs of points", expected="2 or more distinct ones"):
+            fit_similarity(source, target)
+    assert spread(same) == 0

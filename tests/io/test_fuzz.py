@@ -1,0 +1,410 @@
+"""Malformed files end in one line, whatever is wrong with them: drawn files and options, and each defect that was found."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import json
+import os
+import struct
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save
+
+import tiny
+from bidnerf_core import Frame, load_map
+from bidnerf_core.camera import read_camera
+from bidnerf_core.datasets import open_dataset, read_depth_points
+from bidnerf_core.depth import read_depth_image
+from bidnerf_core.errors import InputError, printable
+from bidnerf_core.evaluation import read_results
+from bidnerf_core.io import (
+    read_archive,
+    read_array,
+    read_file,
+    read_image,
+    read_record,
+    read_tensors,
+    to_plain,
+)
+from bidnerf_core.maps import MapInfo, load_info, save_map
+from bidnerf_core.maps import load_map as load
+from bidnerf_core.results import read_pose
+from bidnerf_core.training import TrainingState
+from bidnerf_hashgrid import backend
+from commands import Run
+
+ROBUSTNESS = Path(__file__).parents[1] / "robustness"
+
+
+@pytest.fixture(scope="module")
+def malformed() -> Iterator[Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROBUSTNESS))
+        yield importlib.import_module("damage")
+        sys.modules.pop("damage")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset ``data``, an untrained map ``map``, and a file of each other kind."""
+    folder = tmp_path_factory.mktemp("sound")
+    tiny.write_dataset(folder / "data", train=2, test=1)
+    bounds = tiny.demo_object().bounds
+    info = MapInfo("hashgrid", to_plain(tiny.config()), bounds, step=5, complete=True)
+    field = backend.build(tiny.config(), bounds)
+    save_map(folder / "map", info, TrainingState(5, field.state_dict(), {}))
+    (folder / "pose.json").write_text(json.dumps({"T_world_camera": np.eye(4).tolist()}))
+    (folder / "camera.json").write_text(json.dumps({"fl_x": 32, "cx": 12, "cy": 12, "w": 24, "h": 24}))
+    (folder / "points.txt").write_text("0 0 1\n0 1 1\n")
+    np.save(folder / "points.npy", np.ones((3, 3)))
+    np.savez(folder / "points.npz", points=np.ones((3, 3)), T_camera_sensor=np.eye(4))
+    np.save(folder / "depth.npy", np.ones((24, 24)))
+    return folder
+
+
+READERS: dict[str, tuple[str, str, Callable[[Path], object]]] = {
+    # The name of a sound file in the folder, the table of damages, and what reads the file.
+    "record": ("data/transforms.json", "JSON", read_record),
+    "dataset": ("data/transforms.json", "JSON", lambda p: open_dataset(p.parent).views("train")),
+    "camera": ("camera.json", "JSON", lambda p: read_camera(p, (24, 24))),
+    "pose": ("pose.json", "JSON", read_pose),
+    "map": ("map/map.json", "JSON", lambda p: load(p.parent)),
+    "results": ("pose.json", "JSON", lambda p: read_results([p])),
+    "image": ("data/images/t_0000.png", "IMAGES", read_image),
+    "photo": ("data/images/t_0000.png", "IMAGES", lambda p: Frame.open(p, hfov=40.0)),
+    "depth": ("data/depth/t_0000.png", "IMAGES", lambda p: read_depth_image(p, 0.001)),
+    "depth array": ("depth.npy", "ARRAYS", lambda p: read_depth_image(p, 0.001)),
+    "points": ("points.txt", "POINTS", read_depth_points),
+    "array of points": ("points.npy", "ARRAYS", read_depth_points),
+    "archive of points": ("points.npz", "ARRAYS", read_depth_points),
+    "weights": ("map/weights", "TENSORS", lambda p: load(p.parent)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", READERS)
+def test_a_damaged_file_is_refused_in_one_line_or_read(
+    kind: str, malformed: Any, folder: Path, tmp_path: Path
+) -> None:
+    name, table, read = READERS[kind]
+    content = next(folder.glob(f"{name}*")).read_bytes()
+    count = 0
+    for number, (damage, function) in enumerate(getattr(malformed, table).items()):
+        place = tmp_path / str(number)
+        copy = place / name
+        if name.partition("/")[0] in ("data", "map"):
+            _linked(folder / name.partition("/")[0], place / name.partition("/")[0])
+            copy = next(place.glob(f"{name}*"))
+            copy.unlink()
+        else:
+            place.mkdir()
+        copy.write_bytes(function(Random(f"{kind}/{damage}"), content))
+        count += refused(functools.partial(read, copy))
+    assert count >= 2
+
+
+def refused(read: Callable[[], object]) -> bool:
+    """Return whether ``read`` raises an ``InputError``, which has one line. No other error may come."""
+    try:
+        read()
+    except InputError as error:
+        message = str(error)
+    else:
+        return False
+    assert "\n" not in message
+    return True
+
+
+def _linked(source: Path, to: Path) -> None:
+    """Copy a folder; its files are links."""
+    for file in source.rglob("*"):
+        if file.is_file():
+            copy = to / file.relative_to(source)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            os.link(file, copy)
+
+
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@pytest.mark.slow
+@settings(max_examples=30)
+@given(
+    values=st.dictionaries(
+        st.sampled_from([f.name for f in dataclasses.fields(MapInfo)]), JSON_VALUES, max_size=4
+    )
+)
+def test_any_value_in_the_description_of_a_map_is_judged(values: dict[str, Any], folder: Path) -> None:
+    place = folder / "described"
+    place.mkdir(exist_ok=True)
+    sound = json.loads((folder / "map" / "map.json").read_text())
+    (place / "map.json").write_text(json.dumps(sound | values))
+    refused(lambda: load_info(place))
+
+
+@settings(max_examples=30)
+@given(content=st.binary(max_size=60), header=JSON_VALUES, length=st.none() | st.integers(0, 2**64 - 1))
+def test_any_header_of_tensors_is_judged(
+    content: bytes, header: Any, length: int | None, tmp_path: Path
+) -> None:
+    text = json.dumps(header).encode()
+    path = tmp_path / "t.safetensors"
+    path.write_bytes(struct.pack("<Q", len(text) if length is None else length) + text + content)
+    refused(lambda: read_tensors(path))
+
+
+WORDS = st.sampled_from(
+    [
+        "info",
+        "train",
+        "render",
+        "localize",
+        "evaluate",
+        "compare",
+        "report",
+        "bake",
+        "backends",
+        "--out",
+        "--seed",
+        "--json",
+        "--size",
+        "--trials",
+        "--nothing",
+        "--frame",
+        "--help",
+        "--split",
+        "--method",
+        "--level",
+        "\x1b[2J",
+        "�",
+        "1e400",
+        "-1",
+        "nan",
+        "a/b",
+    ]
+) | st.text(max_size=6)
+
+
+@settings(max_examples=30)
+@given(words=st.lists(WORDS, max_size=4))
+def test_any_words_end_in_a_status_and_printable_text(words: list[str], bidnerf: Run) -> None:
+    status, out, err = bidnerf(*words)
+    assert status in (0, 1, 2)
+    assert "Traceback" not in out + err
+    assert all(c == "\n" or c.isprintable() or c == "\udcff" for c in out + err)
+    assert status == 0 or err
+
+
+# Files in the place of which something else stands.
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def hollow(path: Path) -> None:
+    """Four gigabytes of which the disk holds nothing."""
+    path.touch()
+    os.truncate(path, 4 * 2**30)
+
+
+NO_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "a pipe": (pipe, "is a named pipe"),
+    "a folder": (Path.mkdir, "is a folder"),
+    "a device": (lambda path: path.symlink_to("/dev/zero"), "is a device"),
+    "nothing": (lambda path: None, "no such file"),
+    "4 GB": (hollow, "expected"),
+}
+FILES: dict[str, Callable[[Path], object]] = {
+    "record": read_record, "pose": read_pose, "results": lambda p: read_results([p]), "tensors": read_tensors,
+    "camera": lambda p: read_camera(p, (24, 24)), "array": lambda p: read_array(p, "an array"),
+    "archive": lambda p: read_archive(p, ["points"], "an archive"), "points": read_depth_points,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", FILES)
+@pytest.mark.parametrize("what", NO_FILES)
+def test_what_is_no_file_of_a_usable_size_is_refused_before_it_is_read(
+    kind: str, what: str, tmp_path: Path
+) -> None:
+    make, said = NO_FILES[what]
+    make(tmp_path / "x")
+    with pytest.raises(InputError, match=said):
+        FILES[kind](tmp_path / "x")
+
+
+def test_a_size_that_is_too_large_is_named(tmp_path: Path) -> None:
+    hollow(tmp_path / "x")
+    with pytest.raises(InputError, match="has 4,096 MiB, expected a pose of at most 128 MiB"):
+        read_file(tmp_path / "x", "a pose")
+
+
+def npy(shape: str, kind: str = "<f8", content: bytes = b"\0" * 100) -> bytes:
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header + content
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        npy("(100000, 100000)"),
+        npy("(1000000000000,)"),
+        npy("(-1, 3)"),
+        npy("(1, 2"),
+        npy("(" * 500),
+        npy("(2,)", "O"),
+    ],
+)
+def test_arrays_are_judged_by_their_header(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(InputError, match="not readable as an array"):
+        read_array(tmp_path / "a.npy", "a .npy file")
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("points.npy", content)
+    with pytest.raises(InputError, match="not readable as an array"):
+        read_depth_points(tmp_path / "a.npz")
+
+
+def test_arrays_come_back_as_they_were(tmp_path: Path) -> None:
+    for array in (
+        np.arange(6.0).reshape(2, 3),
+        np.asfortranarray(np.eye(3, dtype="u2")),
+        np.zeros((0, 3)),
+    ):
+        np.save(tmp_path / "a.npy", array)
+        np.savez_compressed(tmp_path / "a.npz", points=array)
+        for found in (
+            read_array(tmp_path / "a.npy", "x"),
+            read_archive(tmp_path / "a.npz", ["points"], "x")["points"],
+        ):
+            assert found.dtype == array.dtype
+            np.testing.assert_array_equal(found, array)
+
+
+def test_an_archive_that_unpacks_to_more_than_an_image_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_core.io.tensors.LARGEST_ARRAY", 10**6)
+    np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**5, 3)))
+    with pytest.raises(InputError, match=r"points\.npy has 2 MiB"):
+        read_depth_points(tmp_path / "a.npz")
+
+
+def test_a_field_that_is_larger_than_its_weights_takes_no_memory(folder: Path, tmp_path: Path) -> None:
+    """64 levels of 2^30 entries would be half a terabyte."""
+    _linked(folder / "map", tmp_path)
+    description = json.loads((tmp_path / "map.json").read_text())
+    description["config"]["encoding"] |= {
+        "levels": 64,
+        "log2_table_size": 30,
+        "finest_resolution": 1e6,
+        "base_resolution": 1e4,
+    }
+    (tmp_path / "map.json").unlink()
+    (tmp_path / "map.json").write_text(json.dumps(description))
+    with pytest.raises(InputError, match="tensor 'encoding"):
+        load_map(tmp_path)
+
+
+def test_a_field_that_needs_numbers_to_be_built_is_loaded_too(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def build(self: Any, config: Any, bounds: Any) -> Any:
+        made = real(self, config, bounds)
+        float(next(iter(made.parameters())).flatten()[0])  # fails where there are shapes only
+        return made
+
+    real = type(backend).build
+    monkeypatch.setattr(type(backend), "build", build)
+    assert load_map(folder / "map").info.step == 5
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [b"", b"\0" * 8, save({"a": tiny.torch.zeros(3)})[:-1], save({"a": tiny.torch.zeros(3)}) + b"\0"],
+)
+def test_a_file_of_tensors_has_the_length_that_its_header_says(tensors: bytes, tmp_path: Path) -> None:
+    (tmp_path / "t").write_bytes(tensors)
+    with pytest.raises(InputError, match="expected a safetensors file"):
+        read_tensors(tmp_path / "t")
+
+
+WRONG_ARGUMENTS = """
+import numpy as np
+from bidnerf_core import Frame, InputError, Intrinsics
+from bidnerf_core.io.images import pixel_array
+camera, image = Intrinsics(32, 32, 12, 12, 24, 24), np.zeros((24, 24, 3), "u1")
+calls = [
+    lambda: Intrinsics("1", 1, 0, 0, 24, 24), lambda: Intrinsics(1, None, 0, 0, 24, 24),
+    lambda: Intrinsics(1, 1, 0, 0, 24.5, 24), lambda: Intrinsics(1, 1, 0, 0, True, 24),
+    lambda: Intrinsics(1, 1, 0, 0, 24, 24, None), lambda: Intrinsics(1, 1, 0, 0, 24, 24, ("a",) * 4),
+    lambda: Intrinsics.from_hfov(40, 10**400, 24), lambda: Intrinsics.from_focal(40, 24, 10**400),
+    lambda: Intrinsics.from_hfov("40", 24, 24), lambda: Intrinsics.from_focal(10**400, 24, 24),
+    lambda: Frame.from_numpy([[1, 2], [3]], camera), lambda: Frame.from_numpy(image, camera, depth=[[1, 2], [3]]),
+    lambda: Frame.from_numpy(image, camera, depth=np.zeros((0, 24))),
+    lambda: Frame.open("a.png", hfov=40.0, largest="1"), lambda: Frame.open("a.png", hfov=40.0, largest=1.5),
+]
+for number, call in enumerate(calls):
+    try:
+        call()
+    except InputError as error:
+        print(number, len(str(error).splitlines()))
+assert Intrinsics(np.float32(2), np.float64(3), 0, np.int64(1), np.int32(24), 24).fx == 2
+"""
+
+
+def test_arguments_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    """In a process of its own, since the checks of types in tests come before those of the library."""
+    iio.imwrite(tmp_path / "a.png", np.zeros((24, 24, 3), np.uint8))
+    done = subprocess.run(
+        [sys.executable, "-c", WRONG_ARGUMENTS], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [f"{number} 1" for number in range(15)]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["backends", "--x\x1b[2Jy"], ["info", "a", "b\x9b31m"], ["info", "a", "--json", "\x1b]0;x\x07"]],
+)
+def test_wrong_usage_repeats_no_control_characters(words: list[str], bidnerf: Run) -> None:
+    status, out, err = bidnerf(*words)
+    assert status == 2
+    assert all(c == "\n" or c.isprintable() for c in out + err)
+    assert printable(words[-1])[:4] in err
+
+
+def test_results_go_into_names_that_could_control_the_terminal(bidnerf: Run, tmp_path: Path) -> None:
+    out = tmp_path / "\x1b[2Jr.jsonl"
+    quick = ["--trials", 1, "--workers", 1, "--method", "bid", "--max-steps", 1, "--rays", 32]
+    status, said, err = bidnerf("evaluate", "demo:blobs", "--out", out, *quick)
+    assert status == 0
+    assert "\x1b" not in said + err
+    assert "\\x1b[2Jr.jsonl" in said
+
+
+def test_a_pipe_in_the_place_of_a_page_does_not_hang_a_report(bidnerf: Run, tmp_path: Path) -> None:
+    quick = ["--trials", 1, "--workers", 1, "--method", "bid", "--max-steps", 1, "--rays", 32]
+    assert bidnerf("evaluate", "demo:blobs", "--out", tmp_path / "r.jsonl", *quick).status == 0
+    (tmp_path / "out").mkdir()
+    os.mkfifo(tmp_path / "out" / "index.html")
+    status, _, err = bidnerf("report", tmp_path / "r.jsonl", "--out", tmp_path / "out")
+    assert status == 1
+    assert "holds something other than a bidnerf report" in err

@@ -1,0 +1,353 @@
+"""Decoding image files and arrays: what they become, and what is said of those that are not usable."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import tracemalloc
+import warnings
+import zlib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image, features
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import as_floats, photos_in
+from bidnerf_core.io import (
+    IMAGE_SUFFIXES,
+    LARGEST_IMAGE,
+    decode,
+    files,
+    open_image,
+    over,
+    pixel_array,
+    read_compact_image,
+    read_header,
+    read_image,
+    reduced,
+    resampled,
+)
+from bidnerf_core.io.images import ImageHeader
+from photo_files import noise
+from refusals import refused
+
+READERS = pytest.mark.parametrize("read", [read_image, read_header], ids=["image", "header"])
+
+
+def empty_png(path: Path, width: int, height: int, declared: tuple[int, int] | None = None) -> Path:
+    """Write the PNG of a black image without making the image: a few kilobytes, whatever the size.
+
+    Its header may declare another size.
+    """
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", *(declared or (width, height)), 8, 0, 0, 0, 0)
+    packer = zlib.compressobj()
+    rows = b"".join(packer.compress(bytes(width + 1)) for _ in range(height)) + packer.flush()
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", rows), chunk(b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    return path
+
+
+@READERS
+@pytest.mark.parametrize("size", [(13360, 13360), (60000, 60000)])
+def test_images_of_too_many_pixels_take_no_memory(
+    tmp_path: Path, read: Callable[[Path], object], size: tuple[int, int]
+) -> None:
+    path = empty_png(tmp_path / "bomb.png", size[0], 1, size)
+    tracemalloc.start()
+    with refused(where=path, found="megapixels", expected="at most 178 megapixels"):
+        read(path)
+    assert tracemalloc.get_traced_memory()[1] < 5e6
+    tracemalloc.stop()
+
+
+def test_the_limit_lets_large_photos_pass(tmp_path: Path) -> None:
+    side = int(LARGEST_IMAGE**0.5)
+    assert read_header(empty_png(tmp_path / "large.png", side, side)) == ImageHeader(side, side, False)
+
+
+@pytest.mark.parametrize(
+    ("mode", "has_alpha"), [("L", False), ("LA", True), ("RGB", False), ("RGBA", True), ("1", False)]
+)
+def test_the_header_says_what_decoding_gives(tmp_path: Path, mode: str, has_alpha: bool) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(noise(6, 9, 4)).convert(mode).save(path)
+    colour, alpha = read_image(path)
+    assert read_header(path) == ImageHeader(9, 6, has_alpha)
+    assert colour.shape == (6, 9, 3)
+    assert (alpha is not None) == has_alpha
+
+
+def test_palettes_become_colours(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    image = Image.fromarray(noise(6, 9)).quantize(16)
+    image.save(path)
+    expected = torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
+    torch.testing.assert_close(read_image(path)[0], expected)
+    image.save(path, transparency=0)
+    alpha = read_image(path)[1]
+    assert alpha is not None
+    assert alpha.equal((torch.from_numpy(np.array(image)) != 0).float())
+    assert read_header(path).has_alpha
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3)])
+def test_sixteen_bits_have_the_range_that_the_sensor_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: int, shape: tuple[int, ...]
+) -> None:
+    values = np.random.default_rng(0).integers(0, 2**bits, shape, dtype=np.uint16)
+    values.flat[0] = 2**bits - 1
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), values if values.ndim == 2 else values[..., ::-1])
+    expected = torch.from_numpy(values.reshape(20, 30, -1).astype(np.float32) / (2**bits - 1)).expand(
+        20, 30, 3
+    )
+    monkeypatch.setattr("bidnerf_core.io.images.STRIP", 90)
+    for read in (read_image, read_compact_image):
+        found, alpha = read(path)
+        assert alpha is None
+        torch.testing.assert_close(found, expected)
+    if values.ndim == 2:
+        assert decode(path).dtype == np.uint16, "depth images keep their values"
+
+
+def test_eight_bits_stay_bytes(tmp_path: Path) -> None:
+    for mode in ("L", "RGB", "CMYK", "RGBA", "P"):
+        path = tmp_path / f"{mode}.{'jpg' if mode == 'CMYK' else 'png'}"
+        image = Image.fromarray(noise(16, 24)).convert("RGB").resize((48, 32))
+        (image.quantize(16) if mode == "P" else image.convert(mode)).save(path)
+        compact, alpha = read_compact_image(path, (1.0, 1.0, 1.0))
+        floats, expected = read_image(path, (1.0, 1.0, 1.0))
+        assert (alpha is None) == (expected is None)
+        assert (compact.dtype == torch.uint8) == (mode in ("L", "RGB", "CMYK"))
+        assert torch.equal(as_floats(compact), floats)
+
+
+def test_the_first_bytes_count_not_the_name(tmp_path: Path) -> None:
+    pixels = noise(16, 24)
+    for name, kind in (("a.heic", "JPEG"), ("b.jpg", "PNG"), ("c", "JPEG"), ("d.JPG", "WEBP"), ("e", "TIFF")):
+        Image.fromarray(pixels).save(tmp_path / name, format=kind)
+        assert read_image(tmp_path / name)[0].shape == (16, 24, 3)
+    (tmp_path / "notes.txt").write_text("BMW: no image")
+    (tmp_path / "empty").write_bytes(b"")
+    photos, others = photos_in(tmp_path)
+    assert [photo.name for photo in photos] == ["a.heic", "b.jpg", "c", "d.JPG", "e"]
+    assert {other.name for other in others} == {"notes.txt", "empty"}
+
+
+# Files.
+
+
+@READERS
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    pipe = tmp_path / "pipe.png"
+    os.mkfifo(pipe)
+    for path, found in (
+        (pipe, "is a named pipe"),
+        (tmp_path, "is a folder"),
+        (Path("/dev/null"), "is a device"),
+        (tmp_path / "none.png", "no such file"),
+        (tmp_path / "a\0b.png", "cannot be opened"),
+        (tmp_path / ("a" * 300), "cannot be opened"),
+    ):
+        with refused(where=path, found=found, expected="an image file"):
+            read(path)
+
+
+def test_permission_that_is_denied_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(noise(3, 4)).save(path)
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    path.chmod(0)
+    if os.access(path, os.R_OK):  # nothing is denied to root
+        monkeypatch.setattr(files.Path, "open", refuse)
+    with refused(where=path, found="permission denied", expected="a readable file: an image file"):
+        read_image(path)
+
+
+def test_heic_without_its_package_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    path = tmp_path / "IMG_1.jpg"  # the content counts, not the name
+    path.write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    with refused(where=path, found="pip install pillow-heif"):
+        read_image(path)
+
+
+FOREIGN = {
+    "eps": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\n{} loop\n",
+    "psd": b"8BPS\x00\x01" + bytes(6) + struct.pack(">HIIHH", 3, 8, 8, 8, 3) + bytes(40),
+    "icns": b"icns" + struct.pack(">I", 16) + b"ic07" + struct.pack(">I", 8),
+}
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".eps", ".tif"])
+def test_only_formats_of_images_are_decoded_and_no_program_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    """EPS is drawn by a program; whatever a file is called, its content is not given to one."""
+    started = tmp_path / "started"
+    for name in ("gs", "gswin32c", "gswin64c"):
+        (tmp_path / name).write_text(f"#!/bin/sh\ntouch {started}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    for kind, content in FOREIGN.items():
+        path = tmp_path / f"{kind}{suffix}"
+        path.write_bytes(content)
+        for read in (read_image, read_header, decode):
+            with refused(where=path, found="is in none of the formats PNG, JPEG, TIFF"):
+                read(path)
+    assert not started.exists()
+
+
+def test_the_formats_that_photos_have_are_decoded(tmp_path: Path) -> None:
+    for suffix in (*IMAGE_SUFFIXES, ".gif", *([".avif"] if features.check("avif") else [])):
+        path = tmp_path / f"a{suffix}"
+        Image.fromarray(noise(16, 24)).convert("L" if suffix == ".pgm" else "RGB").save(path)
+        assert read_image(path)[0].shape == (16, 24, 3)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA"])
+def test_strips_give_what_the_whole_image_gives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    path = tmp_path / "a.png"
+    image = Image.fromarray(noise(50, 41, 4))
+    (image.convert("RGB").quantize(16) if mode == "P" else image.convert(mode)).save(path)
+    background = (0.2, 0.5, 0.9)
+
+    def parts() -> list[torch.Tensor | None]:
+        whole, small = read_image(path, background), read_image(path, background, (13, 16))
+        return [*whole, *small, torch.tensor(decode(path))]
+
+    before = parts()
+    monkeypatch.setattr("bidnerf_core.io.images.STRIP", 41 * 7)
+    for one, other in zip(before, parts(), strict=True):
+        assert one is other is None or torch.equal(one, other)  # type: ignore[arg-type]
+    torch.testing.assert_close(before[2], reduced(before[0], 13, 16))  # type: ignore[arg-type]
+
+
+def test_a_large_image_that_is_reduced_takes_little_memory(tmp_path: Path) -> None:
+    path = empty_png(tmp_path / "large.png", 6000, 6000)
+    tracemalloc.start()
+    rgb, _ = read_image(path, size=(64, 64))
+    assert rgb.shape == (64, 64, 3)
+    assert tracemalloc.get_traced_memory()[1] < 60e6  # 432 MB as floats
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
+def test_every_cut_of_a_file_is_one_line(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(noise(20, 30)).save(path)
+    whole = path.read_bytes()
+    for count in (0, 1, 10, len(whole) // 4, len(whole) // 2, len(whole) * 3 // 4):
+        path.write_bytes(whole[:count])
+        with refused(where=path):
+            read_image(path)
+
+
+def test_an_error_within_the_context_keeps_its_words(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(noise(3, 4)).save(path)
+    with pytest.raises(InputError, match=r"^mine$"), open_image(path):
+        raise InputError("mine")
+
+
+# Arrays.
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "float16", "float32", "float64", "bool"])
+@pytest.mark.parametrize("torch_array", [False, True])
+def test_arrays_are_scaled_by_their_type(kind: str, torch_array: bool) -> None:
+    full = {"uint8": 255, "uint16": 65535}.get(kind, 1)
+    array = (np.array([[0.0, 1.0], [1.0, 0.0]]) * full).astype(kind)
+    found = pixel_array(torch.from_numpy(array) if torch_array else array, "rgb")
+    assert found.dtype == torch.float32
+    assert found[..., 0].tolist() == [[0, 1], [1, 0]]
+
+
+def test_what_leaves_the_range_by_rounding_is_clamped() -> None:
+    found = pixel_array(np.array([[-5e-4, 1.0005]]), "rgb")
+    assert found.flatten().tolist() == [0, 1]
+
+
+CHANNELS = "(height, width) or (height, width, 1 to 4)"
+
+
+@pytest.mark.parametrize(
+    ("array", "found", "expected"),
+    [
+        (np.full((2, 2), np.nan), "rgb has 4 values that are NaN or infinite", "[0, 1]"),
+        (np.full((2, 2, 3), np.inf), "rgb has 12 values that are NaN or infinite", "[0, 1]"),
+        (np.linspace(0, 255, 12).reshape(2, 2, 3), "floats from 0 to 255", "[0, 1]; divide by 255"),
+        (np.linspace(-1, 1, 12).reshape(2, 2, 3), "rgb has floats from -1 to 1", "[0, 1]"),
+        (np.zeros((2, 2, 3), dtype=np.int64), "rgb has dtype int64", "uint8 in [0, 255]"),
+        (np.zeros((2, 2, 3), dtype=complex), "rgb has dtype complex128", "uint8"),
+        (np.zeros((2, 2), dtype=object), "rgb has dtype object", "uint8"),
+        (np.zeros((3, 20, 30)), "rgb has shape (3, 20, 30)", "move the channels last"),
+        (np.zeros((20, 30, 5)), "rgb has shape (20, 30, 5)", CHANNELS),
+        (np.zeros((20, 0, 3)), "rgb has shape (20, 0, 3)", CHANNELS),
+        (np.zeros(20), "rgb has shape (20,)", CHANNELS),
+    ],
+)
+def test_arrays_that_are_no_images(array: np.ndarray, found: str, expected: str) -> None:
+    with refused(found=found, expected=expected):
+        pixel_array(array, "rgb")
+
+
+def test_reducing_keeps_means_and_commutes_with_compositing() -> None:
+    """An area filter: each new pixel is the mean of a block, and both steps are linear in premultiplied colour."""
+    image = torch.from_numpy(noise(12, 20, 4)).float() / 255
+    small = reduced(image, 5, 3)
+    torch.testing.assert_close(small, image.reshape(3, 4, 5, 4, 4).mean((1, 3)))
+    torch.testing.assert_close(reduced(image, 7, 5).mean((0, 1)), image.mean((0, 1)), atol=1e-5, rtol=0)
+    premultiplied = image[..., :3] * image[..., 3:]
+    expected = reduced(premultiplied, 5, 3) + 0.3 * (1 - small[..., 3:])
+    torch.testing.assert_close(reduced(over(image[..., :3], image[..., 3], (0.3,) * 3), 5, 3), expected)
+
+
+@pytest.mark.parametrize("size", [(29, 17), (40, 30), (41, 1), (8, 6)])
+def test_reducing_is_opencvs_area_filter(size: tuple[int, int]) -> None:
+    image = noise(30, 41).astype(np.float32) / 255
+    expected = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(reduced(torch.from_numpy(image), *size).numpy(), expected, atol=1e-6)
+
+
+def test_resampling_takes_the_nearest_and_invents_nothing() -> None:
+    image = torch.arange(12.0).reshape(3, 4)
+    assert resampled(image, 8, 6).equal(image.repeat_interleave(2, 0).repeat_interleave(2, 1))
+    assert resampled(resampled(image, 12, 9), 4, 3).equal(image)
+    assert set(resampled(image, 7, 5).flatten().tolist()) <= set(image.flatten().tolist())
+
+
+def test_threads_that_read_images_leave_warnings_as_they_were(tmp_path: Path) -> None:
+    """Filters of warnings belong to the process: one that stays behind would silence all later warnings of an application."""
+    Image.fromarray(noise(300, 400)).save(tmp_path / "a.png")
+    before = list(warnings.filters)
+    with ThreadPoolExecutor(4) as pool:
+        for _ in pool.map(read_image, [tmp_path / "a.png"] * 400):
+            pass
+    assert warnings.filters == before
+
+
+def test_oddities_of_a_file_cause_no_warning(tmp_path: Path) -> None:
+    """Run apart, since pytest has filters of its own."""
+    path = empty_png(tmp_path / "large.png", 9500, 1, (9500, 9500))  # Pillow warns from 89 megapixels on
+    code = f"from pathlib import Path; from bidnerf_core.io.images import read_header; read_header(Path({str(path)!r}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""

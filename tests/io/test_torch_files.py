@@ -1,0 +1,103 @@
+"""What ``torch.save`` wrote is read without running code, and without allocating what is only declared."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bidnerf_core.io import check_sizes, outline_of, read_saved
+from refusals import refused
+
+Saved = Callable[[Any], Path]
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Saved:
+    def save(content: Any) -> Path:
+        torch.save(content, tmp_path / "a.ckpt")
+        return tmp_path / "a.ckpt"
+
+    return save
+
+
+class Code:
+    def __init__(self, command: str) -> None:
+        self.command = command
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, (self.command,)
+
+
+def test_numbers_of_numpy_do_not_prevent_reading(saved: Saved) -> None:
+    """nerfstudio's trainer stores learning rates as such; they are no code, but torch refuses them."""
+    path = saved({"weights": torch.arange(3.0), "schedulers": {"rate": np.float64(0.1), "step": np.int64(3)}})
+    found = read_saved(path, "a checkpoint")
+    assert torch.equal(found["weights"], torch.arange(3.0))
+    assert not isinstance(found["schedulers"]["rate"], float)
+
+
+MEASURED = """
+import os, sys
+from pathlib import Path
+from bidnerf_core.io.torch_files import outline_of, read_saved
+from bidnerf_core.service.metrics import resident_bytes
+
+kept = []
+for read in (outline_of, read_saved):
+    before = resident_bytes(os.getpid())
+    kept.append(read(Path(sys.argv[1]), "a checkpoint"))
+    print(resident_bytes(os.getpid()) - before)
+"""
+
+
+def test_the_outline_of_a_file_leaves_its_numbers_there(saved: Saved) -> None:
+    path = saved({"weights": torch.rand(16 * 2**20), "step": 3, "rate": np.float64(0.1)})
+    # In a process of its own: this one may have memory to spare from earlier tests.
+    ran = subprocess.run([sys.executable, "-c", MEASURED, path], capture_output=True, text=True, check=True)
+    small, large = map(int, ran.stdout.split())
+    assert small < 8 * 2**20 < 32 * 2**20 < large
+    outline, whole = outline_of(path, "a checkpoint"), read_saved(path, "a checkpoint")
+    assert outline["step"] == 3
+    assert torch.equal(outline["weights"], whole["weights"])
+
+
+@pytest.mark.parametrize("read", [read_saved, outline_of])
+def test_both_formats_of_torch_are_read(read: Callable[[Path, str], Any], tmp_path: Path) -> None:
+    for zipped in (True, False):
+        torch.save({"a": torch.arange(3.0)}, tmp_path / "a.pt", _use_new_zipfile_serialization=zipped)
+        assert torch.equal(read(tmp_path / "a.pt", "a checkpoint")["a"], torch.arange(3.0))
+
+
+def test_code_is_refused_and_not_run(saved: Saved, tmp_path: Path) -> None:
+    path = saved({"a": Code(f"touch {tmp_path}/mark")})
+    for read in (outline_of, read_saved):
+        with refused(where=path, found="would run code (posix.system)", expected="a checkpoint"):
+            read(path, "a checkpoint")
+    assert not (tmp_path / "mark").exists()
+
+
+def test_damage_and_absence_are_told_in_one_line(saved: Saved, tmp_path: Path) -> None:
+    path = saved({"a": torch.zeros(100)})
+    path.write_bytes(path.read_bytes()[:-200])
+    for file, said in ((path, "damaged"), (tmp_path / "none", "no such file"), (tmp_path, "no such file")):
+        for read in (read_saved, outline_of):
+            with refused(where=file, found=said, expected="a checkpoint"):
+                read(file, "a checkpoint")
+
+
+def test_a_number_that_stands_for_many(saved: Saved) -> None:
+    shared = torch.zeros(50)
+    path = saved({"a": [shared, shared], "b": (shared[:20], shared.reshape(5, 10).t())})
+    check_sizes(path, read_saved(path, "a checkpoint"), "a checkpoint")
+    for large in (torch.zeros(1).expand(10**9), torch.zeros(2, 2).to_sparse()):
+        path = saved({"a": [large]})
+        with refused(where=path, found="has only", expected="a checkpoint"):
+            check_sizes(path, read_saved(path, "a checkpoint"), "a checkpoint")

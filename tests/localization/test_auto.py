@@ -1,0 +1,264 @@
+"""Method ``auto``: poses without a start, with one, from depth rays, and where there is no surface or no depth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import baked
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import Observations, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import (
+    AutoConfig,
+    Localization,
+    Outcome,
+    PointCloud,
+    Problem,
+    by_depth,
+    rig,
+    settings_of,
+)
+from bidnerf_core.localization.search.by_points import PointSearch
+from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.localization.settings import LEAST_POINTS
+from bidnerf_core.mapping import bake
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import GaussianBlobs, demo_room, orbit
+from problems import FieldMap, localize
+from tiny import depth_rays_of
+
+QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)
+"""The field of these tests does not show the toy."""
+
+
+def found_for(problem: Problem, seed: int = 0) -> Localization:
+    return localize(problem, "auto", QUICK, seed)
+
+
+def assert_right(found: Localization, truth: SE3) -> None:
+    error = pose_error(found.T_world_camera, truth)
+    assert float(error.translation) < 0.05
+    assert float(error.rotation_deg) < 1
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_no_start_is_needed(number: int) -> None:
+    view = baked.unseen()[number]
+    found = found_for(baked.problem(view))
+    assert_right(found, view.T_ref_camera)
+    assert found.converged, found.reason
+    assert found.method == "auto"
+    assert found.T_world_camera.rotation.dtype == torch.float64
+    assert found.steps == len(found.losses) == len(found.poses.translation) - 1
+    assert found.losses[-1] < found.losses[0]
+    assert found.covariance is not None
+    xi = (found.T_world_camera.inverse() @ view.T_ref_camera).log()
+    assert xi @ torch.linalg.solve(found.covariance, xi) < 16.8  # 99 % of chi^2 with 6 degrees of freedom
+
+
+@pytest.mark.parametrize("gain", [0.4, 1.5])
+def test_another_exposure_is_accepted_by_depth(gain: float) -> None:
+    view = baked.unseen()[0]
+    exposed = replace(view, frame=replace(view.frame, rgb=(gain * view.frame.rgb).clamp(max=1)))
+    found = found_for(baked.problem(exposed))
+    assert_right(found, view.T_ref_camera)
+    assert found.converged, found.reason
+
+
+def approximate(view: View) -> View:
+    return replace(view, frame=replace(view.frame, focal_is_approximate=True))
+
+
+def test_measured_points_do_not_tell_an_approximate_focal_length() -> None:
+    """A wrong one spreads them, for which a shifted pose partly makes up. The rays of a lidar do not depend on it."""
+    view = baked.unseen()[0]
+    found = found_for(baked.problem(approximate(view)))
+    assert found.outcome is Outcome.IMPRECISE
+    assert "the focal length is approximate" in found.reason
+    colour = approximate(colour_only(view))
+    lidar = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour], None, in_camera(view))
+    assert found_for(lidar).converged
+
+
+@pytest.mark.slow
+def test_a_rejection_says_that_the_map_has_no_landmarks() -> None:
+    view = baked.unseen()[0]
+    noise = torch.rand(view.frame.rgb.shape, generator=torch.Generator().manual_seed(0))
+    blank = torch.full_like(noise, 0.5)
+    rejected = [
+        found_for(baked.problem(replace(view, frame=replace(view.frame, rgb=rgb, depth=None))))
+        for rgb in (noise, blank)
+    ]
+    assert not any(found.converged for found in rejected)
+    advice = "; the map has no landmarks ('bidnerf bake' makes them)"
+    assert [found.reason.endswith(advice) for found in rejected] == [True, False]
+
+
+def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
+    view = baked.unseen()[0]
+    aside = replace(baked.toy(), keyframes=torch.eye(4, dtype=torch.float64)[None])
+    start = perturb(view.T_ref_camera, 0.2, 10, 0)
+    found = localize(
+        baked.problem(view, start=start, surface=aside),
+        "auto",
+        AutoConfig(hypotheses=32, rounds=1, refine_steps=0),
+    )
+    assert_right(found, view.T_ref_camera)
+    assert torch.equal(found.poses[0].matrix(), start.matrix())
+    assert torch.allclose(found.poses[-1].matrix(), found.T_world_camera.matrix())
+
+
+def test_a_rig_is_placed_by_its_last_camera() -> None:
+    views = baked.unseen()
+    found = found_for(baked.problem(*views))
+    assert_right(found, views[-1].T_ref_camera)
+    assert found.converged, found.reason
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    problem = baked.problem(baked.unseen()[1])
+    first = found_for(problem, 3)
+    torch.manual_seed(99)
+    again = found_for(problem, 3)
+    assert torch.equal(first.T_world_camera.matrix(), again.T_world_camera.matrix())
+    assert torch.equal(first.losses, again.losses)
+    assert not torch.equal(first.T_world_camera.matrix(), found_for(problem, 4).T_world_camera.matrix())
+
+
+def shown(field: GaussianBlobs, count: int, seed: int) -> list[View]:
+    """Return images of what a field shows, with its depth."""
+    views = []
+    for place, T in enumerate(orbit(3.5, count, elevation=(-10.0, 60.0), seed=seed)):
+        image = render_image(field, baked.CAMERA, T, baked.BOUNDS)
+        depth = torch.where(image.opacity > 0.95, image.depth, 0)
+        views.append(View(Frame(f"{place:04d}", image.rgb, baked.CAMERA, depth), T))
+    return views
+
+
+def test_the_field_refines_what_the_surface_found() -> None:
+    field = GaussianBlobs.random(density=60.0)
+    surface = bake(field, baked.BOUNDS, [], shown(field, 12, seed=0), baked.CONFIG)
+    view = shown(field, 1, seed=5)[0]
+    problem = rig(FieldMap(field, baked.BOUNDS, surface), [view], None)
+    generator = torch.Generator().manual_seed(0)
+    search = PointSearch(surface, PointCloud.measured(problem.views, None, 500, generator))
+    near = perturb(view.T_ref_camera, 0.08, 3, 0)
+    nothing = torch.zeros(0, dtype=torch.float64)
+    found = SearchResult(near[None], search.score(near[None]), math.inf, near[None], nothing)
+    refined, share = by_depth._refined(problem, search, found, AutoConfig(refine_steps=4), generator)
+    error = pose_error(refined.T[0], view.T_ref_camera)
+    assert float(error.translation) < 0.02
+    assert float(error.rotation_deg) < 0.5
+    assert torch.equal(refined.path[0].matrix(), near.matrix())
+    assert len(refined.path.translation) > 1
+    assert share > 0.9
+
+
+def test_a_field_that_does_not_show_the_surface_hardly_moves_the_pose() -> None:
+    """Measured points hold the pose on the surface, and the disagreement of the rays rejects it."""
+    problem = baked.problem(baked.unseen()[0])
+    found = localize(problem, "auto", replace(QUICK, refine_steps=3), 0)
+    moved = pose_error(found.T_world_camera, found_for(problem).T_world_camera)
+    assert float(moved.translation) < 0.05
+    assert float(moved.rotation_deg) < 2.0
+    assert not found.converged
+    assert found.outcome is Outcome.RENDERING_MISMATCH
+    assert "of the rendered rays agree with the measurements" in found.reason
+
+
+def test_an_image_of_something_else_is_not_found() -> None:
+    room = baked.images(replace(demo_room(), bounds=baked.BOUNDS), 1, seed=0)[0]
+    found = found_for(baked.problem(room))
+    assert not found.converged
+    assert found.covariance is not None
+
+
+def test_the_answer_has_no_gradient_and_the_mode_of_autograd_stays() -> None:
+    with torch.enable_grad():
+        found = found_for(baked.problem(baked.unseen()[0]))
+    assert not found.T_world_camera.rotation.requires_grad
+    assert torch.is_grad_enabled()
+
+
+def colour_only(view: View) -> View:
+    return View(replace(view.frame, depth=None), view.T_ref_camera)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda v, T: rig(FieldMap(baked.FIELD, baked.BOUNDS), [v], T), "the map has no surface"),
+        (
+            lambda v, T: rig(FieldMap(baked.FIELD, baked.BOUNDS), [colour_only(v)], T),
+            "the map has no surface",
+        ),
+    ],
+    ids=["depth", "no depth"],
+)
+def test_without_surface_a_start_is_needed(make, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    view = baked.unseen()[0]
+    with pytest.raises(InputError, match=said) as raised:
+        found_for(make(view, None))
+    assert "needs a start" in str(raised.value)
+    assert "\n" not in str(raised.value)
+    short = settings_of("bid", {"max_steps": 2, "rays": 32})
+    monkeypatch.setattr("bidnerf_core.localization.auto.BidConfig", lambda: short)
+    found = found_for(make(view, view.T_ref_camera))
+    assert (found.method, found.steps) == ("bid", 2)
+    assert said in found.reason
+
+
+@pytest.mark.parametrize("wrong", [{"points": 10}, {"hypotheses": 0}, {"rounds": 0}, {"rounds": 1000}])
+def test_settings_are_checked(wrong: dict[str, int]) -> None:
+    (name,) = wrong
+    with pytest.raises(InputError, match=f"{name} is"):
+        AutoConfig(**wrong)
+
+
+def in_camera(view: View) -> Observations:
+    """Return the depth image of a view as rays in the frame of its camera."""
+    return depth_rays_of([View(view.frame, SE3.identity())])
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_depth_rays_stand_in_for_a_depth_image(number: int) -> None:
+    """A colour image beside a lidar, without a start."""
+    view = baked.unseen()[number]
+    problem = rig(
+        FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, in_camera(view)
+    )
+    found = found_for(problem)
+    assert_right(found, view.T_ref_camera)
+    assert found.converged, found.reason
+    assert found.covariance is not None
+
+
+def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_sees_them() -> None:
+    """A narrow image gives colours to the middle of the scan only; the rest counts by its shape."""
+    view = baked.unseen()[0]
+    camera = replace(baked.CAMERA, cx=12.0, cy=12.0, width=24, height=24)
+    narrow = View(Frame("narrow", view.frame.rgb[24:48, 24:48], camera), view.T_ref_camera)
+    rays = in_camera(view)
+    start = perturb(view.T_ref_camera, 0.1, 5, 0)
+    problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [narrow], start, rays)
+    cloud = PointCloud.measured(problem.views, rays, 1000, torch.Generator().manual_seed(0))
+    assert 0.1 < float(cloud.coloured.float().mean()) < 0.9
+    assert_right(found_for(problem), view.T_ref_camera)
+
+
+def test_a_few_depth_rays_are_too_little_to_search_by() -> None:
+    """The images decide where there are fewer points than a shape needs."""
+    view = baked.unseen()[0]
+    few = in_camera(view)[: LEAST_POINTS - 1]
+    problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, few)
+    quick = {"hypotheses": 8, "rounds": 1, "coarse_steps": 1, "fine_steps": 1, "fine_rays": 64}
+    found = localize(problem, "auto", quick)
+    alone = localize(problem.without_depth(), "auto", quick)
+    assert torch.equal(found.T_world_camera.matrix(), alone.T_world_camera.matrix())
+    assert "newly drawn rays" in found.reason

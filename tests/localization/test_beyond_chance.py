@@ -1,0 +1,164 @@
+"""Agreement beyond chance: a plain wall looks the same from anywhere, so that no pose before it is accepted."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import NO_RIVAL, AutoConfig, Localization, Outcome, Problem, Support, rig
+from bidnerf_core.localization.beyond_chance import log_odds, support
+from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
+from bidnerf_core.scenes import look_at
+from problems import FieldMap, localize
+
+CAMERA = Intrinsics(70.0, 70.0, 40.0, 30.0, 80, 60)
+BOUNDS = SceneBounds((-2.0, -2.0, -0.2), (2.0, 2.0, 0.2), 0.1, 8.0)
+POSES = [look_at((x, y, 1.8), (x, y + 0.1, 0.0)) for x in (-0.8, -0.3, 0.3, 0.8) for y in (-0.6, 0.0, 0.5)]
+QUICK = AutoConfig(hypotheses=24, rounds=1)
+MIDDLE = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A wall of one colour, all but a little unevenness, or with a texture all over; below z = 0."""
+
+    texture: float
+    sampler: RaySampler = field(default_factory=lambda: Stratified(48))
+
+    def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
+        x, y, z = positions.unbind(-1)
+        waves = torch.stack(
+            [(5 * x + 2 * y).sin() * (3 * y).cos(), (4 * y - x).sin(), (3 * x + 4 * y).cos()], -1
+        )
+        uneven = 0.004 * (2.2 * x + 1.3 * y).sin()[..., None]
+        return FieldValues(150 * torch.sigmoid(-z / 0.01), 0.7 + uneven + self.texture * waves)
+
+
+@functools.cache
+def wall(texture: float) -> tuple[Wall, SurfaceMap]:
+    seen = Wall(texture)
+    return seen, bake(seen, BOUNDS, [(CAMERA, T) for T in POSES], config=BakeConfig(cells=50_000))
+
+
+def photograph(T: SE3, texture: float, depth: bool = False) -> View:
+    seen = render_image(Wall(texture), CAMERA, T, BOUNDS)
+    noise = 0.01 * torch.randn(seen.rgb.shape, generator=Generator().manual_seed(1))
+    rgb = (seen.rgb + noise).clamp(0, 1)
+    return View(
+        Frame("frame", rgb, CAMERA, torch.where(seen.opacity > 0.9, seen.depth, 0) if depth else None), T
+    )
+
+
+def found(view: View, texture: float, method: str = "auto") -> Localization:
+    scene, surface = wall(texture)
+    start = None if method == "auto" else view.T_ref_camera
+    problem: Problem = rig(FieldMap(scene, BOUNDS, surface), [View(view.frame, SE3.identity())], start)
+    return localize(problem, method, QUICK if method == "auto" else None)
+
+
+QUERY = look_at((0.1, -0.2, 1.6), (0.3, 0.2, 0.0))
+
+
+def foreign(kind: str) -> View:
+    """An image of another plain wall."""
+    rgb = torch.full((CAMERA.height, CAMERA.width, 3), 0.7)
+    if kind == "cable":
+        rgb[:, 30:32] = 0.1
+    if kind == "plant":
+        rgb[20:28, 50:58] = torch.tensor([0.2, 0.5, 0.2])
+    if kind == "gradient":
+        rgb += 0.05 * torch.linspace(-1, 1, CAMERA.width)[None, :, None]
+    return View(
+        Frame(kind, rgb + 0.01 * torch.randn(rgb.shape, generator=Generator().manual_seed(2)), CAMERA), QUERY
+    )
+
+
+@pytest.mark.parametrize("depth", [False, True], ids=["RGB", "RGB-D"])
+def test_no_pose_before_a_bare_wall_is_accepted(depth: bool) -> None:
+    answer = found(photograph(QUERY, 0.0, depth), 0.0)
+    assert not answer.converged, answer.reason
+
+
+@pytest.mark.parametrize("kind", ["cable", "plant", "gradient"])
+def test_no_image_of_another_bare_wall_is_accepted(kind: str) -> None:
+    assert not found(foreign(kind), 0.0).converged
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["bid", "bid-lm", "inerf", "inerf-lm"])
+def test_no_method_accepts_a_start_before_a_bare_wall(method: str) -> None:
+    answer = found(photograph(QUERY, 0.0), 0.0, method)
+    assert answer.outcome is Outcome.UNDETERMINED, answer.reason
+
+
+@pytest.mark.parametrize("method", ["auto", "bid-lm", "inerf-lm"])
+def test_a_textured_wall_determines_the_pose(method: str) -> None:
+    answer = found(photograph(QUERY, 0.1), 0.1, method)
+    assert answer.converged, answer.reason
+    assert float((answer.T_world_camera.translation - QUERY.translation).norm()) < 0.05
+    assert answer.confidence is not None
+    assert answer.confidence > 0.8
+
+
+def costs_about(best: SE3, noise: float, slope: tuple[float, ...]) -> object:
+    """Costs that grow with the square of an update, by ``slope`` along each axis, and noise of 400 measurements."""
+    generator = Generator().manual_seed(0)
+    each = noise * torch.randn(400, generator=generator, dtype=torch.float64)
+
+    def costs(T: SE3) -> Tensor:
+        count = len(T.translation)
+        back = SE3(best.inverse().rotation.expand(count, 3, 3), best.inverse().translation.expand(count, 3))
+        moved = (back @ T).log()
+        fresh = noise * torch.randn((count, 400), generator=generator, dtype=torch.float64)
+        return (moved**2 * torch.tensor(slope, dtype=torch.float64)).sum(-1)[:, None] + each + fresh
+
+    return costs
+
+
+def test_a_pose_is_determined_if_all_directions_are() -> None:
+    T = SE3.identity()
+    full = support(costs_about(T, 0.05, (1.0,) * 3 + (20.0,) * 3), T, MIDDLE)  # type: ignore[arg-type]
+    assert full.confidence > 0.99
+    assert full.rejection() is None
+    sliding = support(costs_about(T, 0.05, (0.0, 1.0, 1.0, 0.0, 0.0, 20.0)), T, MIDDLE)  # type: ignore[arg-type]
+    assert sliding.confidence < 0.8
+    said = sliding.rejection()
+    assert said is not None
+    assert said.outcome is Outcome.UNDETERMINED
+
+
+def test_only_poses_farther_away_than_the_displacement_are_rivals() -> None:
+    T, costs = SE3.identity(), costs_about(SE3.identity(), 0.05, (1.0,) * 6)
+    near, far = (torch.tensor([x, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64) for x in (0.1, 1.0))
+    alone = support(costs, T, MIDDLE, others=T[None].retract(near[None]))  # type: ignore[arg-type]
+    assert alone.other == NO_RIVAL
+    both = support(costs, T, MIDDLE, others=T[None].retract(torch.stack([near, far])))  # type: ignore[arg-type]
+    assert math.isfinite(both.other)
+
+
+def test_odds_are_antisymmetric_and_grow_with_the_number_of_measurements(generator: Generator) -> None:
+    one, other = torch.rand((2, 4000), generator=generator, dtype=torch.float64) + torch.tensor(
+        [[0.0], [0.1]]
+    )
+    assert float(log_odds(other[None], one)) == pytest.approx(-float(log_odds(one[None], other)))
+    assert float(log_odds(other[None], one)) > 1.5 * float(log_odds(other[None, :1000], one[:1000]))
+    assert float(log_odds(one[None], one)) == 0
+
+
+def test_confidence_is_that_of_the_pose_among_its_rivals() -> None:
+    assert Support(0.0, 0.0, 0.0, 0.0).confidence == pytest.approx(0.25)
+    sure = Support(explained=1.0, plain=20.0, displaced=20.0, other=NO_RIVAL)
+    assert sure.confidence > 0.999
+    assert replace(sure, other=0.0).confidence == pytest.approx(0.5)
+    said = replace(sure, other=0.0).rejection()
+    assert said is not None
+    assert said.outcome is Outcome.AMBIGUOUS

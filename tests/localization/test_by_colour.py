@@ -1,0 +1,139 @@
+"""Poses by colour alone, as ``auto`` finds them without depth: a closed-form field, its baked surface, and plain images."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import pytest
+import torch
+
+import baked
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import faulty
+from bidnerf_core.fields import render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Localization, Outcome, Problem, rig
+from bidnerf_core.localization.acceptance import without_ambiguous_intrinsics
+from bidnerf_core.localization.by_colour import without_the_imprecise
+from bidnerf_core.mapping import SurfaceMap, bake, build_landmarks
+from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf_core.scenes import GaussianBlobs, orbit
+from landmark_scene import Points, ring
+from problems import FieldMap, localize
+
+BOUNDS = replace(baked.BOUNDS, lower=(-1.2, -1.2, -1.2), upper=(1.2, 1.2, 1.2))
+FIELD = GaussianBlobs.random(density=60.0)
+QUICK = AutoConfig(hypotheses=48, rounds=1)
+SEEN = orbit(3.5, 24, elevation=(-10.0, 80.0), seed=0)
+UNSEEN = orbit(3.5, 3, elevation=(-10.0, 80.0), seed=7)
+
+
+@functools.cache
+def surface() -> SurfaceMap:
+    return bake(FIELD, BOUNDS, [(baked.CAMERA, T) for T in SEEN], config=baked.CONFIG)
+
+
+def photograph(T: SE3, depth: bool = False) -> View:
+    seen = render_image(FIELD, baked.CAMERA, T, BOUNDS)
+    return View(Frame("frame", seen.rgb, baked.CAMERA, seen.depth if depth else None), T)
+
+
+def problem(*views: View, start: SE3 | None = None) -> Problem:
+    return rig(FieldMap(FIELD, BOUNDS, surface()), views, start)
+
+
+def assert_right(found: Localization, truth: SE3) -> None:
+    error = pose_error(found.T_world_camera, truth)
+    assert float(error.translation) < 0.03
+    assert float(error.rotation_deg) < 0.5
+    assert found.converged, found.reason
+
+
+@pytest.mark.slow
+def test_no_start_is_needed() -> None:
+    truth = UNSEEN[1]
+    found = localize(problem(photograph(truth)), "auto", QUICK)
+    assert_right(found, truth)
+    assert found.method == "auto"
+    assert found.steps == len(found.losses) == len(found.poses.translation) - 1
+    assert found.covariance is not None
+    assert float(normalized_error_squared(found.T_world_camera, truth, found.covariance)) < 16.8
+
+
+@pytest.mark.slow
+def test_the_second_round_leaves_out_what_hides_the_scene() -> None:
+    """Nothing suggests that the pose is right, however, where a third of the image cannot be explained."""
+    truth = UNSEEN[0]
+    hidden = faulty(photograph(truth), "occluder:0.3", seed=1)
+    found = [localize(problem(hidden), "auto", replace(QUICK, rounds=rounds)) for rounds in (1, 2)]
+    off = [float(pose_error(answer.T_world_camera, truth).translation) for answer in found]
+    assert off[0] > 0.3
+    assert off[1] < 0.03
+    assert all(answer.outcome is Outcome.RENDERING_MISMATCH for answer in found)
+
+
+def test_measured_depth_that_is_too_little_does_no_harm() -> None:
+    view = photograph(UNSEEN[2], depth=True)
+    assert view.frame.depth is not None
+    depth = torch.zeros_like(view.frame.depth)
+    depth[30:33, 30:40] = view.frame.depth[30:33, 30:40]
+    few = View(replace(view.frame, depth=depth), view.T_ref_camera)
+    assert_right(localize(problem(few), "auto", QUICK, 3), UNSEEN[2])
+
+
+def test_a_start_is_one_more_place_to_look() -> None:
+    truth = UNSEEN[0]
+    aside = replace(surface(), keyframes=surface().keyframes[:1])
+    turned = truth @ SE3.exp(torch.tensor([0.07, 0.0, 0.07, 0.07, 0.2, 0.07], dtype=torch.float64))
+    started = rig(FieldMap(FIELD, BOUNDS, aside), [photograph(truth)], turned)
+    found = localize(started, "auto", replace(QUICK, hypotheses=96))
+    assert_right(found, truth)
+    assert torch.equal(found.poses[0].matrix(), turned.matrix())
+
+
+def test_an_image_of_something_else_is_rejected() -> None:
+    view = baked.unseen()[0]
+    other = View(replace(view.frame, depth=None), view.T_ref_camera)
+    found = localize(problem(other), "auto", QUICK)
+    assert not found.converged
+    assert "expected" in found.reason
+
+
+def test_a_map_without_surface_needs_a_start() -> None:
+    with pytest.raises(InputError, match=r"no surface .*needs a start") as raised:
+        localize(rig(FieldMap(FIELD, BOUNDS), [photograph(UNSEEN[0])], None), "auto", QUICK)
+    assert "\n" not in str(raised.value)
+
+
+def accepted() -> Localization:
+    return Localization(
+        T_world_camera=SE3.identity(), outcome=Outcome.CONVERGED, reason="well", steps=0, seconds=0.0, loss=0.0,
+        method="auto", poses=SE3.identity()[None], losses=torch.zeros(0, dtype=torch.float64),
+        covariance=0.05**2 * torch.eye(6, dtype=torch.float64),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("typical", "kept"), [(0.0, True), (0.02, True), (0.003, False)])
+def test_an_answer_far_less_certain_than_those_of_the_map_is_rejected(typical: float, kept: bool) -> None:
+    found = without_the_imprecise(accepted(), typical)
+    assert found.converged == kept
+    if not kept:
+        assert found.outcome is Outcome.IMPRECISE
+        assert "0.05" in found.reason
+        assert "0.003" in found.reason
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(1.0, True), (1.05, False), (0.96, False), (1.5, True)])
+def test_a_pose_by_colour_with_intrinsics_near_the_maps_own_is_rejected(factor: float, kept: bool) -> None:
+    """Intrinsics that differ as those of another camera do are not questioned."""
+    points, camera = Points(), baked.CAMERA
+    cameras = (replace(camera, fx=factor * camera.fx, fy=factor * camera.fy),)
+    matcher = LandmarkMatcher(replace(build_landmarks(ring(points), points), cameras=cameras))
+    query = replace(problem(photograph(UNSEEN[0])), matcher=matcher)
+    found = without_ambiguous_intrinsics(accepted(), query)
+    assert found.converged == kept
+    if not kept:
+        assert found.outcome is Outcome.MISCALIBRATED
+        assert "intrinsics" in found.reason

@@ -1,0 +1,293 @@
+"""First-order methods: what updates turn about, when descents stop, and where pixels are drawn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import SceneBounds, render_image
+from bidnerf_core.frames import DrawerName, Frame, View, draw, uniform
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import (
+    NO_RIVAL,
+    AdamSettings,
+    AdamSteps,
+    BidConfig,
+    DescentDiagnostics,
+    DescentSettings,
+    InerfConfig,
+    Outcome,
+    Pivot,
+    Problem,
+    RayCounts,
+    ReachSettings,
+    SampledLoss,
+    objective_of,
+    pivot,
+    rig,
+    settings_of,
+)
+from bidnerf_core.localization.solvers.history import WINDOW
+from bidnerf_core.localization.solvers.pivots import PivotName
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import GaussianBlobs, orbit
+from bidnerf_hashgrid import backend as hashgrid
+from problems import FieldMap, localize, single
+
+BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
+CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
+TRUTH = orbit(4.0, 3, seed=1)[1]
+FIELD = GaussianBlobs.random()
+XI = torch.tensor([0.02, -0.01, 0.03, 0.05, -0.07, 0.04], dtype=torch.float64)
+
+
+def photograph(T_world_camera: SE3 = TRUTH) -> Frame:
+    image = render_image(FIELD, CAMERA, T_world_camera, BOUNDS)
+    return Frame("frame", image.rgb, CAMERA, image.depth)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return single(FIELD, BOUNDS, photograph(), perturb(TRUTH, 0.2, 4.0, seed=3))
+
+
+@pytest.mark.parametrize("pixels", ["interest-regions", "uniform"])
+def test_inerf_finds_its_place(problem: Problem, pixels: DrawerName) -> None:
+    found = localize(problem, "inerf", {"rays": 256, "max_steps": 150, "pixels": pixels}, seed=0)
+    before, after = (pose_error(T, TRUTH) for T in (problem.start, found.T_world_camera))
+    assert found.method == "inerf"
+    assert float(after.translation) < 0.25 * float(before.translation)
+    assert float(after.rotation_deg) < 0.25 * float(before.rotation_deg)
+
+
+def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
+    """Alone at its few corners this soft scene says too little of the pose; that they are looked at can be seen."""
+    losses = [
+        localize(problem, "inerf", {"rays": 64, "max_steps": 1, "pixels": name}).loss
+        for name in ("uniform", "interest-points", "interest-regions")
+    ]
+    assert len(set(losses)) == 3
+
+
+def test_inerf_uses_no_depth(problem: Problem) -> None:
+    frame = problem.views[0].frame
+    wrong = torch.full((40, 48), 7.0)
+    few = {"rays": 64, "max_steps": 3}
+    answers = [
+        localize(single(FIELD, BOUNDS, replace(frame, depth=depth), problem.start), "inerf", few)
+        for depth in (None, wrong)
+    ]
+    assert torch.equal(answers[0].poses.matrix(), answers[1].poses.matrix())
+
+
+def test_an_image_of_a_single_colour_determines_nothing() -> None:
+    """The loss of a plain background is 0 wherever no ray meets anything."""
+    plain = Frame("plain", torch.ones((CAMERA.height, CAMERA.width, 3)), CAMERA)
+    away = SE3(TRUTH.rotation, TRUTH.translation + 10)
+    found = localize(single(FIELD, BOUNDS, plain, away), "bid", {"rays": 64, "max_steps": 2})
+    assert found.outcome is Outcome.UNDETERMINED
+    assert "fit about as well" in found.reason or "single-colour" in found.reason
+
+
+@pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.CONVERGED), (1e-6, Outcome.RENDERING_MISMATCH)])
+def test_colours_have_to_be_explained_better_than_by_a_single_one(
+    problem: Problem, share: float, outcome: Outcome
+) -> None:
+    settings = {"rays": 256, "max_steps": 150, "plain_share": share}
+    assert localize(problem, "inerf", settings, seed=0).outcome is outcome
+
+
+def test_the_loss_of_depth_is_not_compared_with_that_of_a_colour(problem: Problem) -> None:
+    found = localize(
+        problem, "bid", {"rays": 64, "max_steps": 80, "converged_loss": 10.0, "plain_share": 0.0}
+    )
+    assert isinstance(found.diagnostics, DescentDiagnostics)
+    assert found.diagnostics.support.plain == NO_RIVAL
+    assert "contrast" not in found.reason
+
+
+def test_inerf_takes_one_image() -> None:
+    views = [View(photograph(T), T) for T in (orbit(4.0, 3, seed=1)[0], TRUTH)]
+    with pytest.raises(InputError, match="one image, got 2; method bid"):
+        localize(rig(FieldMap(FIELD, BOUNDS), views, TRUTH), "inerf")
+
+
+def test_the_learning_rate_is_inerfs(problem: Problem) -> None:
+    """Adam's first step is as long as the learning rate, in each entry of the tangent vector (Kingma and Ba 2015, section 2.1)."""
+    found = localize(problem, "inerf", {"rays": 64, "max_steps": 1})
+    xi = (found.poses[1] @ found.poses[0].inverse()).log()  # a left update
+    torch.testing.assert_close(xi.abs(), torch.full((6,), 0.01, dtype=torch.float64), rtol=1e-3, atol=0)
+    config = InerfConfig().adam
+    assert config.learning_rate * config.decay ** (200 / config.decay_steps) == pytest.approx(0.01 * 0.8**2)
+
+
+def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
+    few = {"rays": 64, "max_steps": 4, "pixels": "interest-regions"}
+    same = {
+        **few, "learning_rate": 0.01, "decay": 0.8, "decay_steps": 100, "colour_loss": "l2", "pivot": "world",
+        "level": None, "depth_weight": 0.0, "candidates": 1,
+    }  # fmt: skip
+    one, other = localize(problem, "inerf", few), localize(problem, "bid", same)
+    assert torch.equal(one.poses.matrix(), other.poses.matrix())
+
+
+@pytest.mark.parametrize("name", ["scene", "camera", "world"])
+def test_no_update_is_no_motion(problem: Problem, name: PivotName) -> None:
+    stayed = pivot(name, problem).moved(TRUTH, torch.zeros(6, dtype=torch.float64))
+    torch.testing.assert_close(stayed.matrix(), TRUTH.matrix())
+
+
+def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
+    torch.testing.assert_close(pivot("camera", problem).moved(TRUTH, XI).matrix(), TRUTH.retract(XI).matrix())
+    torch.testing.assert_close(
+        pivot("world", problem).moved(TRUTH, XI).matrix(), (SE3.exp(XI) @ TRUTH).matrix()
+    )
+    about = pivot("scene", problem)
+    assert about.T_camera_pivot is not None
+    middle = about.T_camera_pivot.translation
+    assert abs(float(middle.norm()) - 4) < 1  # the blobs are about the origin, four metres away
+    turn = torch.cat([torch.zeros(3, dtype=torch.float64), XI[3:]])
+    torch.testing.assert_close(about.moved(TRUTH, turn).apply(middle), TRUTH.apply(middle))  # it stays
+
+
+def test_a_turn_moves_the_camera_as_far_as_a_shift(problem: Problem) -> None:
+    assert pivot("camera", problem).lever_arm == 1
+    assert pivot("world", problem).lever_arm == 1
+    about = pivot("scene", problem)
+    turn = torch.tensor([0, 0, 0, 1e-4, 0, 0], dtype=torch.float64)
+    shift = float((about.moved(TRUTH, turn).translation - TRUTH.translation).norm())
+    assert shift == pytest.approx(1e-4 * about.lever_arm, rel=0.05)
+
+
+def test_fixed_pixels_are_drawn_once(problem: Problem) -> None:
+    objective = objective_of(BidConfig().colour, BidConfig().depth)
+    for renew in (True, False):
+        generator = torch.Generator().manual_seed(0)
+        loss = SampledLoss(
+            problem, objective, RayCounts(64), DescentSettings(renew=renew), ReachSettings(), generator
+        )
+        assert torch.equal(loss(problem.start), loss(problem.start)) is not renew
+
+
+def test_descents_stop_on_the_loss_on_the_step_or_at_the_end(problem: Problem) -> None:
+    few = {"rays": 64, "max_steps": WINDOW + 5, "level": None}
+    assert localize(problem, "bid", few).reason.startswith(f"reached {WINDOW + 5} steps; mean loss")
+    loss = localize(problem, "bid", {**few, "stop_loss": 10.0})
+    assert loss.steps == WINDOW
+    assert loss.reason.startswith(f"mean loss of {WINDOW} steps fell below 10; mean loss")
+    step = localize(problem, "bid", {**few, "stop_step": 10.0})
+    assert step.steps == WINDOW
+    assert step.reason.startswith(f"mean length of {WINDOW} steps fell below 10; mean loss")
+    assert localize(problem, "bid", {**few, "stop_step": 1e-6}).steps == WINDOW + 5
+
+
+def test_best_is_no_worse_than_last_by_its_own_measure(problem: Problem) -> None:
+    wild = {"rays": 64, "max_steps": 40, "level": None, "learning_rate": 0.3, "decay": 1.0}
+    last, best = (localize(problem, "bid", {**wild, "answer": name}) for name in ("last", "best"))
+    assert torch.equal(last.poses.matrix(), best.poses.matrix())
+    assert best.loss <= last.loss
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"stop_step": -1.0}, "stop_step is -1.0, expected a number from 0 up"),
+        ({"stop_loss": -1.0}, "stop_loss is -1.0"),
+        ({"colour_scale": 0.0}, "colour_scale is 0.0"),
+        ({"rays": 0}, "rays is 0"),
+    ],
+)
+def test_bad_settings_are_named(settings: dict[str, float], message: str) -> None:
+    for method in ("bid", "inerf"):
+        with pytest.raises(InputError, match=message):
+            settings_of(method, settings)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_thresholds_are_finite(value: float) -> None:
+    with pytest.raises(InputError, match=f"stop_loss is {value}, expected a number from 0 up"):
+        AdamSettings(stop_loss=value)
+
+
+def test_rays_are_moved_to_the_device_of_the_field(problem: Problem) -> None:
+    """The device "meta" stands for a GPU: it is another device, and one that every machine has."""
+    elsewhere = hashgrid.build(tiny.config(), BOUNDS).to("meta")
+    assert replace(problem, field=elsewhere).device.type == "meta"
+    assert problem.device.type == "cpu"  # a field without parameters
+    pixels = draw(problem.views, 8, uniform, torch.Generator().manual_seed(0), device="meta")
+    rays = pixels.rays(problem.start, BOUNDS)
+    parts = (pixels.origins, pixels.directions, pixels.rgb, pixels.distance, rays.origins, rays.near)
+    assert {part.device.type for part in parts} == {"meta"}
+
+
+def test_updates_are_those_of_torch() -> None:
+    """Steps on a quadratic loss of the translation, beside torch's own Adam on the same gradients."""
+    goal = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64)
+    config = AdamSettings(learning_rate=0.1, decay=0.5, decay_steps=10)
+    steps = AdamSteps(
+        lambda T: (T.translation - goal).square().sum(), Pivot(SE3.identity()), config, SE3.identity()
+    )
+    place = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([place])
+    for number in range(2 * WINDOW):
+        optimizer.param_groups[0]["lr"] = 0.1 * 0.5 ** (number / 10)
+        optimizer.zero_grad()
+        (place - goal).square().sum().backward()
+        optimizer.step()
+        steps()
+        torch.testing.assert_close(steps.T.translation, place.detach())
+
+
+def test_a_block_holds_the_steps_that_were_taken() -> None:
+    config = AdamSettings(learning_rate=0.1)
+    steps = AdamSteps(lambda T: T.translation.sum() + 1, Pivot(SE3.identity()), config, SE3.identity())
+    for _ in range(WINDOW):
+        steps()
+    poses, losses, finite = steps.block()
+    assert finite.all()
+    torch.testing.assert_close(losses[1:], poses.translation[:-1].sum(-1) + 1)
+    torch.testing.assert_close(poses[WINDOW - 1].matrix(), steps.T.matrix())
+    taken = poses.matrix().clone()
+    steps()
+    torch.testing.assert_close(steps.block()[0][0].matrix(), steps.T.matrix())
+    assert torch.equal(poses.matrix(), taken)  # not overwritten by later steps
+
+
+def test_each_step_of_a_descent_follows_from_the_one_before(problem: Problem) -> None:
+    """No step is longer than Adam allows, also from one block of steps to the next."""
+    settings = {"rays": 64, "max_steps": 3 * WINDOW, "learning_rate": 0.01, "decay": 1.0}
+    found = localize(problem, "bid", settings)
+    steps = (found.poses[:-1].inverse() @ found.poses[1:]).log()
+    assert float(steps[:, 3:].norm(dim=-1).max()) < 0.05
+    assert float(steps[:, :3].norm(dim=-1).max()) < 0.3
+    assert len(torch.unique(found.poses.translation, dim=0)) == 3 * WINDOW + 1
+
+
+def test_a_step_that_is_not_finite_leaves_the_pose() -> None:
+    steps = AdamSteps(
+        lambda T: T.translation.sum() / 0, Pivot(SE3.identity()), AdamSettings(), SE3.identity()
+    )
+    steps()
+    _, _, finite = steps.block()
+    assert torch.equal(steps.T.matrix(), SE3.identity().matrix())
+    assert not finite[0]
+
+
+@pytest.mark.parametrize("name", ["camera", "world", "scene"])
+def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one(
+    problem: Problem, name: PivotName
+) -> None:
+    about, zero = pivot(name, problem), torch.zeros(6, dtype=torch.float64)
+    exact, linear = (
+        lambda xi, move=move: move(TRUTH, xi).matrix() for move in (about.moved, about.moved_linearly)
+    )
+    torch.testing.assert_close(linear(zero), exact(zero))
+    derivatives = [torch.autograd.functional.jacobian(update, zero) for update in (linear, exact)]
+    torch.testing.assert_close(*derivatives)

@@ -1,0 +1,232 @@
+"""Depth that no pixel measured: a lidar's, or a few points; and files of such points."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import read_depth_points
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import Observations, SceneBounds, render, render_image
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import (
+    ColourSettings,
+    DepthSettings,
+    DescentSettings,
+    Problem,
+    RayCounts,
+    ReachSettings,
+    SampledLoss,
+    objective_of,
+    window,
+)
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import GaussianBlobs, orbit
+from problems import localize, single
+from tiny import depth_rays_of
+
+BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
+CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
+TRUTH = orbit(4.0, 3, seed=1)[1]
+FIELD = GaussianBlobs.random()
+OBJECTIVE = objective_of(ColourSettings(), DepthSettings())
+T_CAMERA_LIDAR = SE3.exp(torch.tensor([0.3, -0.4, 0.1, 0.2, 1.5, -0.4], dtype=torch.float64))
+
+
+def scan() -> torch.Tensor:
+    """Points (n 3) of the lidar's frame, measured in a wide cone at rays that are no pixels; NaN where no return."""
+    ahead = torch.randn((2000, 3), generator=torch.Generator().manual_seed(5), dtype=torch.float64) * 0.3
+    ahead[:, 2] += 1.0
+    directions = T_CAMERA_LIDAR.inverse().rotate(torch.nn.functional.normalize(ahead, dim=-1))
+    T = TRUTH @ T_CAMERA_LIDAR
+    with torch.no_grad():
+        turned = T.rotate(directions)
+        found = render(FIELD, BOUNDS.rays(T.translation.expand_as(turned), turned))
+    return torch.where((found.opacity > 0.9)[:, None], found.distance[:, None] * directions, torch.nan)
+
+
+def lidar() -> Observations:
+    return Observations.from_points(scan(), T_CAMERA_LIDAR)
+
+
+def photograph(depth: bool = False) -> Frame:
+    image = render_image(FIELD, CAMERA, TRUTH, BOUNDS)
+    return Frame("frame", image.rgb, CAMERA, image.depth if depth else None)
+
+
+def depth_loss(problem: Problem, T: SE3, count: int = 10**6) -> float:
+    """The part of the loss that the depth rays add."""
+    values = []
+    for counts in (RayCounts(16, count), RayCounts(16, 0)):
+        generator = torch.Generator().manual_seed(0)
+        loss = SampledLoss(problem, OBJECTIVE, counts, DescentSettings(), ReachSettings(), generator)
+        values.append(float(loss(T)))
+    return values[0] - values[1]
+
+
+def test_points_come_back() -> None:
+    points = scan()
+    rays = lidar()
+    met = points.isfinite().all(-1)
+    assert 100 < len(rays) == int(met.sum())
+    torch.testing.assert_close(rays.points, T_CAMERA_LIDAR.apply(points[met]))
+    torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones_like(rays.distance))
+    torch.testing.assert_close(rays.origins, T_CAMERA_LIDAR.translation.expand(len(rays), 3))
+
+
+def test_no_residual_at_the_truth_and_some_elsewhere() -> None:
+    problem = single(FIELD, BOUNDS, photograph(), TRUTH, lidar())
+    assert abs(depth_loss(problem, TRUTH)) < 1e-8
+    assert depth_loss(problem, perturb(TRUTH, 0.2, 5.0, seed=0)) > 1e-4
+
+
+def test_a_moved_world_leaves_the_depth_loss_as_it_is() -> None:
+    motion = SE3.exp(torch.tensor([0.2, -0.1, 0.3, 0.5, -0.7, 1.1], dtype=torch.float64))
+    roomy = SceneBounds((-30.0,) * 3, (30.0,) * 3, 2.0, 6.5, BOUNDS.background)
+    start = perturb(TRUTH, 0.2, 5.0, seed=0)
+    here = depth_loss(single(FIELD, roomy, photograph(), start, lidar()), start)
+    moved = motion @ start
+    there = depth_loss(single(FIELD.moved(motion), roomy, photograph(), moved, lidar()), moved)
+    assert here == pytest.approx(there, rel=1e-3)
+
+
+def test_a_pose_is_found_from_colour_and_a_lidar() -> None:
+    """The camera has no depth."""
+    start = perturb(TRUTH, 0.3, 6.0, seed=3)
+    config = {
+        "rays": 64, "depth_rays": 128, "max_steps": 120, "learning_rate": 0.08, "depth_weight": 0.3, "level": None,
+    }  # fmt: skip
+    found = localize(single(FIELD, BOUNDS, photograph(), start, lidar()), "bid", config)
+    error = pose_error(found.T_world_camera, TRUTH)
+    assert float(error.translation) < 0.05
+    assert float(error.rotation_deg) < 1.0
+
+
+def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:
+    """All black to the eye: no pixel has a gradient that is of use, but the distance comes right."""
+    dark = Frame("dark", torch.zeros(40, 48, 3), CAMERA)
+    start = TRUTH.retract(torch.tensor([0, 0, -0.2, 0, 0, 0], dtype=torch.float64))
+    config = {
+        "rays": 1, "depth_rays": 200, "max_steps": 60, "learning_rate": 0.03, "level": None, "depth_weight": 1e3,
+        "pivot": "camera",
+    }  # fmt: skip
+    found = localize(single(FIELD, BOUNDS, dark, start, lidar()), "bid", config)
+    backward = TRUTH.inverse().apply(found.T_world_camera.translation)[2]
+    assert abs(float(backward)) < 0.03
+
+
+def test_weight_zero_leaves_depth_rays_out() -> None:
+    start = perturb(TRUTH, 0.3, 6.0, seed=3)
+    few = {"rays": 32, "max_steps": 3, "depth_weight": 0.0, "level": None, "pivot": "camera"}
+    with_rays, without = (
+        localize(single(FIELD, BOUNDS, photograph(), start, rays), "bid", few) for rays in (lidar(), None)
+    )
+    assert torch.equal(with_rays.poses.matrix(), without.poses.matrix())
+
+
+def test_the_gradient_by_the_pose_is_the_numerical_one() -> None:
+    drawn = lidar().drawn(40, torch.Generator().manual_seed(0), torch.float64)
+    start = perturb(TRUTH, 0.1, 2.0, seed=1)
+    here = drawn.rays(start, BOUNDS)
+
+    def loss(xi: torch.Tensor) -> torch.Tensor:
+        moved = drawn.rays(start.retract(xi), BOUNDS)  # the sampled interval is held, as autograd does
+        parts = (moved.origins, moved.directions, here.near, here.far)
+        rays = type(here)(*(part[None] for part in parts))
+        return OBJECTIVE.loss(render(FIELD, rays), drawn[None])
+
+    zero = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(loss, zero, eps=1e-6, atol=1e-6)
+
+
+def test_rays_are_drawn_from_the_generator_or_all_taken() -> None:
+    rays = lidar()
+    one, same, other = (rays.drawn(50, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1))
+    assert len(one) == 50
+    assert torch.equal(one.distance, same.distance)
+    assert not torch.equal(one.distance, other.distance)
+    assert one.distance.dtype == torch.float32
+    assert len(rays.drawn(10**6, torch.Generator())) == len(rays)
+
+
+def test_sparse_depth_images_become_rays() -> None:
+    """Twenty pixels of a depth image, as structure from motion leaves them: every one is looked at."""
+    dense = photograph(depth=True)
+    assert dense.depth is not None
+    kept = dense.depth > 0
+    index = kept.reshape(-1).nonzero()[::17, 0]
+    depth = torch.zeros(40 * 48)
+    depth[index] = dense.depth.reshape(-1)[index]
+    frame = Frame("frame", dense.rgb, CAMERA, depth.reshape(40, 48))
+    T = SE3.exp(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.0, -0.2], dtype=torch.float64))
+    rays = depth_rays_of([View(frame, T)])
+    assert len(rays) == len(index)
+    seen = T.inverse().apply(rays.points)
+    torch.testing.assert_close(seen[:, 2].float(), depth[index])
+    rows, columns = index // 48, index % 48
+    torch.testing.assert_close(
+        CAMERA.project(seen), torch.stack([columns, rows], -1).double() + 0.5, atol=1e-6, rtol=0
+    )
+
+
+def test_nothing_measured_is_told() -> None:
+    for points in (torch.zeros(3, 3), torch.full((2, 3), torch.nan), torch.zeros(0, 3)):
+        with pytest.raises(InputError, match="nothing was measured"):
+            Observations.from_points(points, SE3.identity())
+
+
+def test_files_of_points(tmp_path: Path) -> None:
+    points = np.array([[0.1, 0.2, 1.5], [-1.0, 0.0, 2.0]])
+    (tmp_path / "p.txt").write_text("# x y z intensity\n0.1 0.2 1.5 7\n\n-1.0 0 2.0 9\n")
+    (tmp_path / "p.csv").write_text("0.1,0.2,1.5\n-1.0,0,2.0\n")
+    np.save(tmp_path / "p.npy", points)
+    np.savez(tmp_path / "camera.npz", points=points)
+    for name in ("p.txt", "p.csv", "p.npy", "camera.npz"):
+        torch.testing.assert_close(read_depth_points(tmp_path / name).points, torch.from_numpy(points))
+    T = T_CAMERA_LIDAR
+    np.savez(tmp_path / "lidar.npz", points=points.astype(np.float32), T_camera_sensor=T.matrix().numpy())
+    found = read_depth_points(tmp_path / "lidar.npz")
+    torch.testing.assert_close(found.points, T.apply(torch.from_numpy(points)), atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.origins[0], T.translation)
+
+
+def test_files_that_are_none_are_told(tmp_path: Path) -> None:
+    (tmp_path / "words.txt").write_text("no points here")
+    (tmp_path / "two.txt").write_text("1 2\n3 4\n")
+    (tmp_path / "ragged.txt").write_text("1 2 3\n3 4\n")
+    (tmp_path / "decimal_commas.txt").write_text("1,5 2,5\n3,5 4,5\n")
+    (tmp_path / "empty.txt").write_text("")
+    (tmp_path / "zeros.txt").write_text("0 0 0\n")
+    (tmp_path / "binary.txt").write_bytes(bytes(range(256)))
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 broken")
+    (tmp_path / "empty.npy").write_bytes(b"")
+    np.save(tmp_path / "words.npy", np.array([["a", "b", "c"]]))
+    np.save(tmp_path / "objects.npy", np.array([[{}, {}, {}]], dtype=object))
+    np.savez(tmp_path / "other.npz", cloud=np.ones((2, 3)))
+    with zipfile.ZipFile(tmp_path / "no_array.npz", "w") as archive:
+        archive.writestr("points.npy", b"no array at all")
+    np.savez(tmp_path / "scaled.npz", points=np.ones((2, 3)), T_camera_sensor=2 * np.eye(4))
+    np.savez(tmp_path / "flat.npz", points=np.ones((2, 3)), T_camera_sensor=np.eye(3))
+    np.savez(tmp_path / "text.npz", points=np.ones((2, 3)), T_camera_sensor=np.array("no"))
+    for name in [*(path.name for path in tmp_path.iterdir()), "missing.txt"]:
+        with pytest.raises(InputError, match=name):
+            read_depth_points(tmp_path / name)
+
+
+def test_a_window_is_the_last_items() -> None:
+    items = list("abcdefgh")
+    assert window(items, 4, 3) == ("c", "d", "e")
+    assert window(items, 7, 3, stride=2) == ("d", "f", "h")
+    assert window(items, 1, 3) == ("a", "b")
+    assert window(items, 0, 1) == ("a",)
+    for wrong in ((8, 1), (-1, 1), (0, 0)):
+        with pytest.raises(InputError, match="window"):
+            window(items, *wrong)
+    assert len(window(items, 7, 100)) == 8

@@ -1,0 +1,140 @@
+"""The second pose of a plane: refinement that began at the wrong one of two minima is led to the other."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from bidnerf_core import Outcome
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import LandmarkPose, Problem, propose, rig
+from bidnerf_core.localization.alternatives import decide, pose_at
+from bidnerf_core.localization.landmarks.twins import second_pose, tilted_to_the_other_side
+from bidnerf_core.mapping import ObservedPoints, build_landmarks, resect
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import look_at
+from bidnerf_core.testing import textured_map
+from landmark_scene import Points, looking_in, ring
+from pinned_landmarks import PointMatcher
+
+FOCAL, NOISE = 400.0, 0.3  # pixels
+TILT = 0.5  # radians
+
+
+def points(relief: float) -> Tensor:
+    """Points on a square of a metre, up to half of ``relief`` (metres) off its plane."""
+    unit = torch.rand((60, 3), generator=Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    return unit * torch.tensor([1.0, 1.0, relief], dtype=torch.float64)
+
+
+def pose(distance: float) -> SE3:
+    return look_at(
+        (distance * math.sin(TILT), 0.1, distance * math.cos(TILT)), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    )
+
+
+def observed(T: SE3, places: Tensor) -> ObservedPoints:
+    local, count = T.inverse().apply(places), len(places)
+    off = torch.randn((count, 2), generator=Generator().manual_seed(1), dtype=torch.float64)
+    nothing, eye = torch.zeros(count, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    return ObservedPoints(
+        points=places,
+        deviations=torch.full((count, 2), 1e-3, dtype=torch.float64),
+        directions=torch.nn.functional.normalize(T.translation - places, dim=-1),
+        image=local[:, :2] / local[:, 2:] + NOISE / FOCAL * off,
+        focal=torch.full((count,), FOCAL, dtype=torch.float64),
+        depth=nothing,
+        rotation=eye.expand(count, 3, 3),
+        translation=torch.zeros((count, 3), dtype=torch.float64),
+        exposure_times=nothing,
+    )
+
+
+def degrees(one: SE3, other: SE3) -> float:
+    return math.degrees(float(torch.linalg.vector_norm((one.inverse() @ other).log()[3:])))
+
+
+def test_from_the_other_side_a_plane_looks_the_same_and_twice_it_is_the_same() -> None:
+    T, plane = pose(60.0), points(0.0)
+    there = tilted_to_the_other_side(plane, T)
+    seen = [where.inverse().apply(plane) for where in (T, there)]
+    pixels = [FOCAL * local[:, :2] / local[:, 2:] for local in seen]
+    torch.testing.assert_close(pixels[0], pixels[1], atol=0.05, rtol=0)
+    assert degrees(T, there) == pytest.approx(2 * math.degrees(TILT), rel=0.05)
+    torch.testing.assert_close(tilted_to_the_other_side(plane, there).matrix(), T.matrix(), atol=1e-9, rtol=0)
+    assert float(torch.linalg.det(there.rotation)) == pytest.approx(1)
+
+
+def test_a_pose_at_the_wrong_minimum_is_led_to_the_right_one() -> None:
+    T, plane = pose(6.0), points(0.0)
+    data = observed(T, plane)
+    wrong = resect(data, tilted_to_the_other_side(plane, T), NOISE)
+    assert degrees(wrong.T_world_rig, T) > 20  # it is a minimum
+    found = second_pose(data, wrong)
+    assert found is not None
+    assert found.log_odds < -3
+    assert degrees(found.fit.T_world_rig, T) < 2
+    back = second_pose(data, found.fit)
+    assert back is not None
+    assert back.log_odds == pytest.approx(-found.log_odds, rel=1e-3)
+
+
+def test_from_very_far_nothing_tells_the_two_apart() -> None:
+    T, plane = pose(25.0), points(0.0)
+    data = observed(T, plane)
+    found = second_pose(data, resect(data, T, NOISE))
+    assert found is not None
+    assert abs(found.log_odds) < 3
+
+
+def test_points_off_the_plane_leave_no_second_pose_that_fits() -> None:
+    T, solid = pose(6.0), points(0.5)
+    data = observed(T, solid)
+    found = second_pose(data, resect(data, T, NOISE))
+    assert found is None or found.log_odds > 10
+
+
+def poster(T: SE3, depth: float | None = None, start: SE3 | None = None) -> tuple[Problem, LandmarkPose]:
+    """Return an image of a small poster, seen from far away at an angle, and the pose that landmarks give it."""
+    points = Points(noise=0.3)
+    points.positions = points.positions * torch.tensor([0.3, 0.3, 0.0], dtype=torch.float64)
+    matcher = PointMatcher(build_landmarks(ring(points), points), points)
+    problem = rig(textured_map(), [points.view(T, depth=depth, seed=100)], start, matcher=matcher)
+    found = propose(matcher, problem.views, seek_rivals=True)
+    assert found is not None
+    return problem, found
+
+
+FAR = looking_in(0.5, 0.3, 20.0)
+
+
+def test_a_small_poster_from_afar_is_ambiguous() -> None:
+    problem, found = poster(FAR)
+    rejection = decide(problem, found.T_world_camera, found, rays=0, seed=0).rejection
+    assert rejection is not None
+    assert rejection.outcome is Outcome.AMBIGUOUS
+    assert "plane" in rejection.reason
+
+
+@pytest.mark.parametrize(("depth", "start"), [(1.0, None), (None, FAR)])
+def test_a_start_or_depth_tells_the_two_poses_of_a_poster_apart(
+    depth: float | None, start: SE3 | None
+) -> None:
+    problem, found = poster(FAR, depth, start)
+    better = decide(problem, found.T_world_camera, found, rays=0, seed=0).better
+    if better is not None:
+        assert problem.matcher is not None
+        there = pose_at(problem, problem.matcher, found, better)
+        assert there is not None
+        found = there
+    assert float(pose_error(found.T_world_camera, FAR).translation) < 1.5
+    assert decide(problem, found.T_world_camera, found, rays=0, seed=0).rejection is None
+
+
+def test_from_near_a_poster_has_one_pose() -> None:
+    problem, found = poster(looking_in(0.5))
+    assert found.rivals == ()
+    assert decide(problem, found.T_world_camera, found, rays=0, seed=0).rejection is None

@@ -1,0 +1,174 @@
+"""Residuals and objectives: colour, depth, matter in free space, and one objective for both kinds of solver."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bidnerf_core.fields import (
+    DEPTH_RESIDUALS,
+    Objective,
+    Observations,
+    Rays,
+    RaySamples,
+    Rendering,
+    SceneBounds,
+    depth_residual,
+    free_space,
+    masked_mean,
+    render,
+)
+from bidnerf_core.geometry import RobustName
+from bidnerf_core.localization import BidConfig, ColourSettings, DepthSettings, objective_of
+from bidnerf_core.scenes import GaussianBlobs
+
+BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
+
+
+def objective(
+    colour: RobustName, depth: RobustName, depth_weight: float, free_space_weight: float = 0.0
+) -> Objective:
+    """Return the objective of robust losses with a scale of 0.1."""
+    settings = DepthSettings(depth_weight, depth, 0.1, free_space_weight=free_space_weight)
+    return objective_of(ColourSettings(colour, 0.1), settings)
+
+
+def wall(at: float, opacity: float = 1.0) -> Rendering:
+    """Return two views of three rays each; all weight in one sample."""
+    shape = (2, 3)
+    middle = torch.full((*shape, 1), at)
+    samples = RaySamples(middle, middle, torch.ones(*shape, 1, dtype=torch.bool))
+    seen = torch.full(shape, opacity)
+    return Rendering(torch.full((*shape, 3), 0.5), seen * at, seen, seen[..., None], samples)
+
+
+def measured(distance: torch.Tensor) -> Observations:
+    zero = torch.zeros(2, 3, 3)
+    return Observations(zero, zero, torch.full((2, 3, 3), 0.5), distance, distance > -1)
+
+
+def test_free_space_counts_what_is_in_front_and_nothing_else() -> None:
+    distance = torch.full((2, 3), 2.0)
+    distance[0, 0] = 0
+    in_front = free_space(wall(1.2), distance, 0.1)
+    torch.testing.assert_close(in_front, torch.where(distance > 0, 0.7, 0.0))
+    torch.testing.assert_close(free_space(wall(1.2, 0.5), distance, 0.1), 0.5 * in_front)
+    for at in (1.95, 2.0, 5.0):
+        assert float(free_space(wall(at), distance, 0.1).abs().max()) == 0
+
+
+def test_matter_on_both_sides_is_distinguished_from_a_surface() -> None:
+    """Half of the weight before, half behind: the mean depth is right, and only the free-space term rejects it."""
+    middles = torch.tensor([1.0, 3.0]).expand(2, 3, 2)
+    weights = torch.full((2, 3, 2), 0.5)
+    samples = RaySamples(middles, middles, torch.ones(2, 3, 2, dtype=torch.bool))
+    both = Rendering(torch.full((2, 3, 3), 0.5), torch.full((2, 3), 2.0), torch.ones(2, 3), weights, samples)
+    pixels = measured(torch.full((2, 3), 2.0))
+    assert float(objective("l2", "huber", 1.0).loss(both, pixels)) == 0
+    assert float(objective("l2", "huber", 1.0, free_space_weight=1.0).loss(both, pixels)) > 0.01
+
+
+def test_the_derivative_by_the_rays_is_the_numerical_one() -> None:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.tensor([[0.0, 0.0, -3.5]], dtype=torch.float64).expand(12, 3)
+    aims = 0.6 * torch.randn((12, 3), generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(aims - origins, dim=-1)
+    field, here = GaussianBlobs.random(), BOUNDS.rays(origins, directions)
+    probe = Observations.of_depth(origins, directions, torch.full((12,), 4.2, dtype=torch.float64))
+    in_front = objective("l2", "cauchy", 0.0, free_space_weight=1.0)
+
+    def loss(shift: torch.Tensor) -> torch.Tensor:
+        rays = Rays((origins + shift)[None], directions[None], here.near[None], here.far[None])
+        return in_front.loss(render(field, rays), probe[None])
+
+    zero = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    assert float(loss(zero).detach()) > 1e-3
+    assert torch.autograd.gradcheck(loss, zero, eps=1e-6, atol=1e-7)
+
+
+def test_views_count_alike_however_many_of_their_pixels_were_measured() -> None:
+    """Eq. 6: the mean over views of their means over measured rays."""
+    distance = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
+    found = objective("l2", "l2", 1.0).loss(wall(2.4), measured(distance))
+    assert float(found) == pytest.approx(0.5 * 0.4**2)
+    assert float(objective("l2", "l2", 1.0).loss(wall(2.4), measured(torch.zeros(2, 3)))) == 0
+    torch.testing.assert_close(
+        masked_mean(depth_residual(wall(2.4), measured(distance)), distance > 0), torch.tensor([0.4, 0.4])
+    )
+
+
+def test_the_papers_objective_has_hubers_loss_for_both() -> None:
+    """Eq. 5 with ``rho(r) = delta (r - delta / 2)`` for depths that are 0.4 m off, and colours that agree."""
+    distance = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
+    default = objective_of(BidConfig().colour, BidConfig().depth)
+    assert float(default.loss(wall(2.4), measured(distance))) == pytest.approx(0.1 * (0.4 - 0.05))
+
+
+def test_weight_zero_uses_no_depth() -> None:
+    assert not objective("l2", "l2", 0.0).uses_depth
+    assert objective("l2", "l2", 0.0, free_space_weight=0.1).uses_depth
+    assert float(objective("l2", "l2", 0.0).loss(wall(9.0), measured(torch.full((2, 3), 2.0)))) == 0
+
+
+SOME = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
+
+
+def random_rendering() -> Rendering:
+    """Return a rendering of (2, 3) rays that differs from anything measured; float64."""
+    generator = torch.Generator().manual_seed(3)
+    middles = torch.rand((2, 3, 4), generator=generator, dtype=torch.float64).cumsum(-1)
+    weights = 0.25 * torch.rand((2, 3, 4), generator=generator, dtype=torch.float64)
+    samples = RaySamples(middles, middles, torch.ones(2, 3, 4, dtype=torch.bool))
+    rgb = torch.rand((2, 3, 3), generator=generator, dtype=torch.float64)
+    return Rendering(rgb, (weights * middles).sum(-1), weights.sum(-1), weights, samples)
+
+
+@pytest.mark.parametrize("loss", ["huber", "l2", "l1", "cauchy", "geman-mcclure"])
+@pytest.mark.parametrize("free", [0.0, 0.7])
+@pytest.mark.parametrize("miss", [None, 3.0])
+def test_the_loss_is_the_weighted_sum_of_rho(loss: RobustName, free: float, miss: float | None) -> None:
+    """Adam takes ``loss``, Levenberg-Marquardt takes residuals, weights and rho: both minimise one function."""
+    colour, depth = ColourSettings(loss, 0.2), DepthSettings(2.5, loss, 0.3, free_space_weight=free)
+    whole = objective_of(colour, depth, miss_scales=miss)
+    pixels, rendering = measured(SOME), random_rendering()
+    weights = whole.weights(pixels)
+    total = (weights * whole.rho(whole.residuals(rendering, pixels))).sum()
+    assert float(total) == pytest.approx(float(whole.loss(rendering, pixels)), rel=1e-6)
+    assert weights.shape[-1] == len(whole.scales) == (5 if free else 4)
+
+
+@pytest.mark.parametrize("loss", ["huber", "l2", "cauchy", "geman-mcclure"])
+def test_the_robust_weights_are_the_derivative_of_rho_over_the_residual(loss: RobustName) -> None:
+    whole = objective(loss, loss, 1.0, free_space_weight=1.0)
+    residuals = torch.linspace(-0.9, 0.95, 35, dtype=torch.float64).reshape(7, 5).requires_grad_()
+    (slope,) = torch.autograd.grad(whole.rho(residuals).sum(), residuals)
+    expected = whole.robust_weights(residuals.detach()) * residuals.detach()
+    torch.testing.assert_close(slope, expected)
+
+
+def test_weights_of_what_was_not_measured_are_zero() -> None:
+    """Each view's mean over its measured rays, and the mean over the views (eq. 6)."""
+    found = objective("l2", "l2", 3.0).weights(measured(SOME))
+    torch.testing.assert_close(found[..., :3], torch.full((2, 3, 3), 1 / 6))
+    torch.testing.assert_close(found[..., 3], 3 * torch.tensor([[0.5, 0.0, 0.0], [1 / 6] * 3]))
+    assert not bool(objective("l2", "l2", 3.0).weights(measured(torch.zeros(2, 3)))[..., 3].any())
+
+
+def test_a_ray_that_meets_nothing_is_off_by_the_miss() -> None:
+    pixels = measured(torch.full((2, 3), 2.0))
+    torch.testing.assert_close(depth_residual(wall(2.4, 0.0), pixels, 0.3), torch.full((2, 3), 0.3))
+    torch.testing.assert_close(depth_residual(wall(2.4, 1.0), pixels, 0.3), torch.full((2, 3), 0.4))
+    torch.testing.assert_close(depth_residual(wall(2.4, 0.5), pixels, 0.3), torch.full((2, 3), 0.35))
+    torch.testing.assert_close(depth_residual(wall(2.4, 0.0), pixels), torch.full((2, 3), -2.0))
+
+
+def test_a_depth_residual_of_ones_own_is_named_by_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    def halved(rendering: Rendering, observed: Observations, miss: float | None = None) -> torch.Tensor:
+        return (rendering.distance - observed.distance) / 2
+
+    monkeypatch.setitem(DEPTH_RESIDUALS, "halved", halved)
+    found = objective_of(ColourSettings(), DepthSettings(depth_residual="halved"))
+    pixels = measured(SOME)
+    torch.testing.assert_close(
+        found.residuals(wall(2.4), pixels)[..., 3], torch.where(SOME > 0, torch.tensor(0.2), 0.0)
+    )

@@ -1,0 +1,400 @@
+"""The tracker on a closed-form scene: accuracy, loss and recovery, times, state, threads."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import read_tensors_and_metadata
+from bidnerf_core.localization.tracking.state import METHOD, CorrectedCamera
+from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf_core.testing import CAMERA, textured_map, view
+from flights import (
+    FRAMES,
+    INTERVAL,
+    assert_honest,
+    assert_right,
+    covered,
+    flight,
+    flight_pose,
+    localizer,
+    tracked,
+    without_depth,
+)
+
+CHI2_99 = 16.8  # of six degrees of freedom
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [True, False], ids=["rgb-d", "rgb"])
+def test_a_sequence_is_tracked_with_honest_covariances(depth: bool) -> None:
+    frames = [(t, frame if depth else without_depth(frame), T) for t, frame, T in flight()]
+    answers = tracked(frames)
+    assert_right(answers, frames)
+    assert {answer.method for answer in answers} == {METHOD}
+    squared = [
+        float(normalized_error_squared(a.T_world_camera, T, a.covariance))
+        for a, (_, _, T) in zip(answers, frames, strict=True)
+        if a.covariance is not None
+    ]
+    assert len(squared) == FRAMES
+    assert sum(value < CHI2_99 for value in squared) >= FRAMES - 1
+
+
+def test_most_frames_are_tracked_without_detecting_keypoints(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The optical flow carries landmarks on; keypoints are detected where these become few."""
+    from bidnerf_core.mapping import Sift
+
+    localizer()  # building its map detects keypoints as well
+    calls = list[int]()
+    detect = Sift.__call__
+    monkeypatch.setattr(Sift, "__call__", lambda self, rgb: (calls.append(1), detect(self, rgb))[1])
+    tracked(flight())
+    assert len(calls) < FRAMES // 2
+
+
+def test_the_order_of_time_may_be_reversed() -> None:
+    """Times that decrease are as good as times that increase."""
+    frames = flight()[::-1]
+    assert_right(tracked(frames), frames)
+
+
+@pytest.mark.parametrize("depth", [True, False], ids=["rgb-d", "rgb"])
+def test_a_covered_camera_is_reported_at_once_and_the_way_is_found_again(depth: bool) -> None:
+    frames = [(t, frame if depth else without_depth(frame), T) for t, frame, T in flight()]
+    dark = range(5, 9)
+    frames = [(t, covered(f) if i in dark else f, T) for i, (t, f, T) in enumerate(frames)]
+    tracker = Tracker(localizer())
+    answers = tracked(frames[:9], tracker)
+    assert [answer.converged for answer in answers] == [True] * 5 + [False] * 4
+    assert tracker.lost_frames == 4
+    assert "lost for 4 frames" in answers[-1].reason
+    sizes = [
+        float(answer.covariance.diagonal().sum()) for answer in answers[4:] if answer.covariance is not None
+    ]
+    assert sizes == sorted(sizes)
+    assert len(sizes) == 5
+    after = tracked(frames[9:], tracker)
+    assert_right(after[2:], frames[11:])
+    assert tracker.tracking
+
+
+@pytest.mark.parametrize("count", [4, 5])
+def test_frames_that_show_nothing_do_not_delay_the_search(count: int) -> None:
+    tracker = Tracker(localizer())
+    frames = [(t, covered(f) if 3 <= i < 3 + count else f, T) for i, (t, f, T) in enumerate(flight())]
+    answers = tracked(frames[: 4 + count], tracker)
+    assert [answer.converged for answer in answers[3:]] == [False] * count + [True]
+
+
+@pytest.mark.slow
+def test_frames_that_come_slowly_are_all_searched() -> None:
+    """Lost for more frames than are all searched, by images of another place."""
+    count = 3
+    generator = torch.Generator().manual_seed(0)
+    tracker, frames = Tracker(localizer(), TrackerConfig(patience=1)), flight()
+    slow = [(0.5 * i, f, T) for i, (_, f, T) in enumerate(frames)]
+    elsewhere = [
+        (t, replace(without_depth(f), rgb=torch.rand(f.rgb.shape, generator=generator)), T)
+        for t, f, T in slow[2 : 2 + count]
+    ]
+    answers = tracked([*slow[:2], *elsewhere, *slow[2 + count : 3 + count]], tracker)
+    assert [answer.converged for answer in answers[2:]] == [False] * count + [True]
+
+
+def test_a_camera_that_is_carried_elsewhere_is_lost_and_found() -> None:
+    """The motion cannot be foreseen, so no answer may follow the prediction."""
+    elsewhere = [
+        (t, view(flight_pose(n + 60), f"far {n}").frame, flight_pose(n + 60))
+        for n, (t, _, _) in enumerate(flight()[6:10], 6)
+    ]
+    frames = [*flight()[:6], *elsewhere]
+    answers = tracked(frames)
+    assert_honest(answers, frames)
+    assert_right(answers[8:], frames[8:])
+
+
+def test_a_foreign_scene_is_never_accepted() -> None:
+    answers = tracked(flight()[:3])
+    assert all(answer.converged for answer in answers)
+    tracker = Tracker(localizer())
+    tracked(flight()[:3], tracker)
+    foreign = [tracker(view(flight_pose(n), f"{n}", seed=9).frame, 0.1 * n) for n in range(3, 7)]
+    assert not any(answer.converged for answer in foreign)
+    assert all(answer.T_world_camera.is_rigid() for answer in foreign)
+
+
+def test_depth_may_stop_midway() -> None:
+    frames = [(t, f if i < 6 else without_depth(f), T) for i, (t, f, T) in enumerate(flight())]
+    assert_right(tracked(frames), frames)
+
+
+def test_depth_of_another_unit_is_left_out() -> None:
+    """Feet read as metres: each frame is tracked by its colours, and says so."""
+    frames = list[tuple[float, Frame, SE3]]()
+    for t, frame, T in flight()[:8]:
+        assert frame.depth is not None
+        frames.append((t, replace(frame, depth=3.28 * frame.depth), T))
+    answers = tracked(frames)
+    assert_right(answers, frames)
+    assert all("without depth: it is 3.2" in answer.reason for answer in answers)
+
+
+def test_repeated_frames_do_not_make_it_more_certain() -> None:
+    """The errors of the map are the same in each of them."""
+    tracker = Tracker(localizer())
+    tracked(flight()[:5], tracker)
+    time, frame, truth = flight()[5]
+    answers = [tracker(frame, time) for _ in range(12)]
+    assert_right(answers, [(time, frame, truth)] * 12)
+    first, last = (answers[i].covariance for i in (0, -1))
+    assert first is not None
+    assert last is not None
+    assert float(last.diagonal()[:3].sum()) > 0.5 * float(first.diagonal()[:3].sum())
+
+
+def test_frames_out_of_order_are_tracked() -> None:
+    frames = flight()
+    for place in (3, 7, 10):
+        frames[place], frames[place + 1] = frames[place + 1], frames[place]
+    assert_right(tracked(frames), frames)
+
+
+@pytest.mark.parametrize("known", [0, 3], ids=["none", "every third"])
+def test_time_stamps_may_be_missing(known: int) -> None:
+    tracker = Tracker(localizer(), TrackerConfig(frame_seconds=0.1))
+    frames = flight()
+    answers = [tracker(f, t if known and i % known == 0 else None) for i, (t, f, _) in enumerate(frames)]
+    assert_right(answers, frames)
+
+
+@pytest.mark.parametrize("time", [float("nan"), float("inf")])
+def test_a_time_that_is_no_number_is_refused_and_changes_nothing(time: float) -> None:
+    tracker = Tracker(localizer())
+    tracked(flight()[:2], tracker)
+    with pytest.raises(InputError, match="time of the frame"):
+        tracker(flight()[2][1], time)
+    assert_right(tracked(flight()[2:4], tracker), flight()[2:4])
+
+
+def test_a_changed_image_size_is_no_obstacle() -> None:
+    frames = flight()[:6]
+    small = frames[3][1]
+    camera = small.intrinsics.scaled(0.75)
+    rgb = torch.nn.functional.interpolate(
+        small.rgb.permute(2, 0, 1)[None], (camera.height, camera.width), mode="area"
+    )[0].permute(1, 2, 0)
+    frames[3] = (frames[3][0], replace(small, rgb=rgb, depth=None, intrinsics=camera), frames[3][2])
+    answers = tracked(frames)
+    assert_honest(answers, frames)
+    assert_right(answers[:3] + answers[5:], frames[:3] + frames[5:])
+
+
+def test_a_saved_state_continues_bit_for_bit(tmp_path: Path) -> None:
+    tracker = Tracker(localizer())
+    tracked(flight()[:6], tracker)
+    tracker.save(tmp_path / "state")
+    other = Tracker(localizer())
+    other.restore(tmp_path / "state")
+    one, two = tracked(flight()[6:9], tracker), tracked(flight()[6:9], other)
+    for a, b in zip(one, two, strict=True):
+        assert torch.equal(a.T_world_camera.matrix(), b.T_world_camera.matrix())
+        assert a.covariance is not None
+        assert b.covariance is not None
+        assert torch.equal(a.covariance, b.covariance)
+
+
+def test_the_state_of_a_lost_tracker_is_saved_too(tmp_path: Path) -> None:
+    tracker = Tracker(localizer())
+    tracker.save(tmp_path / "fresh")
+    tracked(flight()[:3], tracker)
+    tracker(covered(flight()[3][1]), 0.3)
+    tracker.save(tmp_path / "lost")
+    tracker.restore(tmp_path / "fresh")
+    assert not tracker.tracking
+    assert tracker.lost_frames == 0
+    tracker.restore(tmp_path / "lost")
+    assert tracker.lost_frames == 1
+
+
+def test_files_that_hold_no_state_are_refused(tmp_path: Path) -> None:
+    tracker = Tracker(localizer())
+    for name, content in (("text", b"no state"), ("empty", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name):
+            tracker.restore(tmp_path / name)
+    with pytest.raises(InputError, match="missing"):
+        tracker.restore(tmp_path / "missing")
+
+
+def test_a_state_with_damaged_numbers_or_tensors_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    tracker = Tracker(localizer())
+    tracked(flight()[:3], tracker)
+    path = tmp_path / "state"
+    tracker.save(path)
+    tensors, metadata = read_tensors_and_metadata(path, "a state")
+    content = json.loads(metadata["bidnerf"])
+
+    def refused(tensors: dict[str, torch.Tensor], numbers: dict[str, Any], said: str) -> None:
+        save_file(tensors, path, {"bidnerf": json.dumps(content | {"state": numbers})})
+        with pytest.raises(InputError, match=said):
+            tracker.restore(path)
+        assert tracker.tracking
+
+    whole = content["state"]
+    for name, value in (
+        ("frames", "3"),
+        ("age", -1),
+        ("interval", 0),
+        ("reach", 0.0),
+        ("reach", None),
+        ("noise", []),
+    ):
+        refused(tensors, whole | {name: value}, name)
+    for name in (n for n in tensors if n.startswith(("points.", "motion."))):
+        refused(tensors | {name: tensors[name][None].contiguous()}, whole, name)
+    refused(tensors | {"motion.noise": -tensors["motion.noise"]}, whole, "variance")
+    refused(tensors | {"motion.rotation": 2 * tensors["motion.rotation"]}, whole, "not rigid")
+    refused({n: t for n, t in tensors.items() if n != "points.pixels"}, whole, "pixels")
+
+
+def test_trackers_in_threads_share_a_localizer() -> None:
+    """Each gives what it gives alone."""
+    ways = [flight()[:6], flight()[::-1][:6]]
+    alone = [tracked(frames) for frames in ways]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(tracked, ways))
+    for a, b in zip(alone, together, strict=True):
+        for one, two in zip(a, b, strict=True):
+            assert torch.equal(one.T_world_camera.matrix(), two.T_world_camera.matrix())
+
+
+def test_a_map_without_landmarks_is_tracked_by_depth() -> None:
+    frames = flight()
+    answers = tracked(frames, Tracker(localizer(landmarks=False)))
+    assert_honest(answers, frames)
+    assert sum(answer.converged for answer in answers) >= FRAMES - 2
+    assert (
+        max(
+            float(pose_error(a.T_world_camera, T).translation)
+            for a, (_, _, T) in zip(answers, frames, strict=True)
+            if a.converged
+        )
+        < 0.03
+    )
+
+
+def test_a_start_replaces_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise AssertionError("searched")
+
+    monkeypatch.setattr("bidnerf_core.localization.tracker.relocalized", fail)
+    start = flight_pose(0).retract(torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64))
+    tracker = Tracker(localizer(), start=start)
+    assert_right(tracked(flight()[:3], tracker), flight()[:3])
+
+
+def test_a_beginning_that_nobody_recognises_is_reported() -> None:
+    tracker = Tracker(localizer())
+    answer = tracker(covered(without_depth(flight()[0][1])), 0.0)
+    assert answer.covariance is not None
+    assert not answer.converged
+    assert answer.outcome is not Outcome.CONVERGED
+    assert_right(tracked(flight()[1:3], tracker), flight()[1:3])
+
+
+def test_a_map_that_cannot_be_searched_asks_for_a_start() -> None:
+    bare = replace(textured_map(), landmarks=None)
+    with pytest.raises(InputError, match="start"):
+        Tracker(Localizer(bare))(flight()[0][1], 0.0)
+
+
+def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
+    """It stands in the state, and corrects later frames whose focal length is approximate; calibrated ones stay as they are."""
+    frames = flight()[:4]
+    off = replace(frames[0][1].intrinsics, fx=1.06 * 130, fy=1.06 * 130)
+    known = [(t, replace(f, depth=None, intrinsics=off, focal_is_approximate=True), T) for t, f, T in frames]
+    scene = textured_map(surface=True)
+    assert scene.landmarks is not None
+    recognised = replace(scene, landmarks=replace(scene.landmarks, cameras=(CAMERA,)))
+    tracker = Tracker(Localizer(recognised))  # colours alone do not confirm an approximate focal length
+    tracker._state = replace(tracker._state, camera=CorrectedCamera(off, CAMERA, True))
+    answers = tracked(known, tracker)
+    assert_right(answers, known)
+    assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 1.06] * 4, rel=0.01)
+    assert [answer.intrinsics for answer in answers] == [CAMERA] * 4
+    exact = flight()[4:6]
+    answers = tracked(exact, tracker)
+    assert_right(answers, exact)
+    assert [answer.focal_factor for answer in answers] == [1, 1]
+    assert [answer.intrinsics for answer in answers] == [None, None]
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_misstated_camera_of_the_map_is_corrected_in_all_frames(depth: bool) -> None:
+    scene = textured_map(surface=True)
+    assert scene.landmarks is not None
+    scatter = torch.full((4,), 0.002, dtype=torch.float64)
+    landmarks = replace(scene.landmarks, cameras=(CAMERA,), calibration_scatter=scatter, correlation=1.0)
+    localizer = Localizer(replace(scene, landmarks=landmarks))
+    stated = replace(CAMERA, fx=0.97 * CAMERA.fx, fy=0.97 * CAMERA.fy, cx=CAMERA.cx + 1.5)
+    frames = [
+        (t, replace(f, intrinsics=stated, depth=f.depth if depth else None), T) for t, f, T in flight()[:4]
+    ]
+    answers = tracked(frames, Tracker(localizer))
+    assert_right(answers, frames)
+    assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 0.97] * 4, rel=1e-6)
+
+
+def test_corrections_of_intrinsics_follow_one_another(tmp_path: Path) -> None:
+    first = CorrectedCamera(replace(CAMERA, fx=140.0, cx=60.0), CAMERA, False)
+    second = CorrectedCamera(CAMERA, replace(CAMERA, fx=133.0, cy=50.0), False)
+    both = first.then(second)
+    frame = replace(flight()[0][1], intrinsics=first.given)
+    assert both.corrected(frame).intrinsics == second.corrected(first.corrected(frame)).intrinsics
+    assert both.focal_factor(frame) == pytest.approx((133 / 140) ** 0.5)  # those down did not change
+    other = replace(frame, intrinsics=replace(first.given, fx=154.0))  # it has focused nearer
+    refocused = first.corrected(other).intrinsics
+    assert refocused.fx == pytest.approx(154 * 130 / 140)
+    assert replace(refocused, fx=CAMERA.fx) == CAMERA
+    tracker = Tracker(localizer())
+    tracker._state = replace(tracker._state, camera=both)
+    tracker.save(tmp_path / "state.safetensors")
+    again = Tracker(localizer())
+    again.restore(tmp_path / "state.safetensors")
+    assert again._state.camera == both
+
+
+def test_the_state_does_not_grow(tmp_path: Path) -> None:
+    """Neither in memory nor as a file, however long the sequence."""
+    tracker, sizes = Tracker(localizer()), []
+    to_and_fro = [flight()[n] for n in (*range(8), *range(6, 0, -1))]
+    for lap in range(3):
+        for place, (_, frame, _) in enumerate(to_and_fro):
+            tracker(frame, INTERVAL * (lap * len(to_and_fro) + place))
+        tracker.save(tmp_path / "state")
+        sizes.append((tmp_path / "state").stat().st_size)
+        assert len(tracker._state.points) <= tracker.config.points
+    assert max(sizes) < 1.25 * min(sizes)
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (textured_map(), r"Tracker: got a MapWithLandmarks, expected a Localizer; Localizer\(map\)"),
+        (3, "got a int"),
+    ],
+)
+def test_a_tracker_takes_a_localizer(given: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        Tracker(given)

@@ -1,0 +1,150 @@
+"""Keypoints: the pixel convention, descriptors as bytes, and images without any."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import tiny
+from bidnerf_core import InputError
+from bidnerf_core.mapping import (
+    Features,
+    Keypoints,
+    Sift,
+    byte_of_zero,
+    detected,
+    paired_squared_distances,
+    quantized,
+    squared_distances,
+    strongest,
+    tracked_views,
+    unrelated_distance,
+)
+from bidnerf_core.mapping.landmarks.features import root_normalized
+
+
+def blobs(centres: list[tuple[float, float]], sigma: float = 3.0) -> torch.Tensor:
+    """Bright spots at (u, v), where the first pixel's centre is (0.5, 0.5)."""
+    v, u = torch.meshgrid(torch.arange(100) + 0.5, torch.arange(140) + 0.5, indexing="ij")
+    image = sum(torch.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2)) for x, y in centres)
+    return (0.1 + 0.8 * torch.as_tensor(image))[..., None].expand(-1, -1, 3)
+
+
+def textured(seed: int) -> torch.Tensor:
+    noise = torch.rand((1, 3, 20, 28), generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.interpolate(noise, (120, 160), mode="bicubic")[0].permute(1, 2, 0).clamp(0, 1)
+
+
+@pytest.mark.parametrize("centre", [(40.5, 50.5), (71.25, 33.8), (90.0, 60.0)])
+def test_a_spot_is_found_at_its_centre(centre: tuple[float, float]) -> None:
+    found = Sift()(blobs([centre]))
+    off = (found.pixels - torch.tensor(centre)).norm(dim=-1)
+    assert float(off.min()) < 0.06
+
+
+def test_a_blank_image_has_no_keypoints() -> None:
+    found = Sift()(torch.full((50, 60, 3), 0.5))
+    assert len(found) == 0
+    assert found.descriptors.shape == (0, 128)
+
+
+def test_at_most_as_many_as_asked_for_and_always_the_same() -> None:
+    image = textured(0)
+    assert 30 <= len(Sift(count=30)(image)) <= 31  # of equal contrast, OpenCV keeps both
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(Sift(), [image] * 4))
+    for other in found[1:]:
+        assert torch.equal(other.pixels, found[0].pixels)
+        assert torch.equal(other.descriptors, found[0].descriptors)
+
+
+def test_sift_is_a_detector() -> None:
+    assert isinstance(Sift(), Features)
+
+
+def test_distances_of_bytes_are_exact(generator: torch.Generator) -> None:
+    a, b = (torch.randint(0, 256, (n, 128), generator=generator).byte() for n in (7, 9))
+    expected = (a[:, None].long() - b.long()).square().sum(-1)
+    assert torch.equal(squared_distances(a, b).long(), expected)
+    rows, columns = torch.tensor([0, 3, 6]), torch.tensor([8, 1, 0])
+    assert torch.equal(paired_squared_distances(a, b, rows, columns).long(), expected[rows, columns])
+
+
+def test_root_normalised_descriptors_are_unit_and_compare_as_hellinger(generator: torch.Generator) -> None:
+    raw = torch.rand(5, 128, generator=generator)
+    root = root_normalized(raw)
+    torch.testing.assert_close(root.norm(dim=-1), torch.ones(5))
+    shares = raw / raw.sum(-1, keepdim=True)
+    torch.testing.assert_close(root @ root.T, (shares[:, None] * shares).sqrt().sum(-1))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_zero_and_scale_of_descriptors_are_measured(signed: bool, generator: torch.Generator) -> None:
+    exact = torch.randn(4000, 64, generator=generator)
+    exact = exact if signed else exact.abs()
+    bytes_ = quantized(exact / exact.norm(dim=-1, keepdim=True))
+    assert byte_of_zero(bytes_) == (128 if signed else 0)
+    pairs = squared_distances(bytes_[:2000], bytes_[2000:])
+    assert unrelated_distance(bytes_) == pytest.approx(float(pairs.mean().sqrt()), rel=0.01)
+
+
+def test_zero_of_bits_is_half_of_them_and_of_nothing_0(generator: torch.Generator) -> None:
+    bits = 32 * torch.randint(0, 2, (500, 256), generator=generator).byte()
+    assert byte_of_zero(bits) == 16
+    for few in (bits[:0], bits[:1]):
+        assert byte_of_zero(few) == 0
+        assert unrelated_distance(few) == 0
+
+
+def test_quantising_keeps_the_order_of_signed_descriptors(generator: torch.Generator) -> None:
+    exact = torch.randn(40, 64, generator=generator)
+    exact = exact / exact.norm(dim=-1, keepdim=True)
+    bytes_ = quantized(exact)
+    close = torch.cdist(bytes_.float(), bytes_.float()) / 256
+    torch.testing.assert_close(close, torch.cdist(exact, exact), atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize("options", [{"count": 0}, {"contrast": -0.1}, {"contrast": 1.0}])
+def test_useless_settings_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=next(iter(options))):
+        Sift(**options)  # type: ignore[arg-type]
+
+
+SOUND = Keypoints(torch.rand(5, 2), torch.ones(5), torch.zeros(5, 8, dtype=torch.uint8))
+UNUSABLE: list[tuple[Any, str]] = [
+    (None, "returned a NoneType, expected Keypoints"),
+    (replace(SOUND, descriptors=np.zeros((5, 8), np.uint8)), "Tensor, Tensor and ndarray, expected tensors"),
+    (replace(SOUND, descriptors=SOUND.descriptors[:3]), r"shapes \(5, 2\), \(5,\) and \(3, 8\), expected"),
+    (replace(SOUND, descriptors=SOUND.descriptors.float()), "dtype torch.float32, expected torch.uint8"),
+    (replace(SOUND, pixels=SOUND.pixels * torch.nan), "outside the image of 40x30 pixels"),
+    (replace(SOUND, pixels=SOUND.pixels + 40), "outside the image of 40x30 pixels"),
+]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(("found", "said"), UNUSABLE, ids=range(len(UNUSABLE)))
+def test_a_detector_that_returns_no_keypoints_of_the_image_is_told(found: Any, said: str) -> None:
+    def stranger(rgb: torch.Tensor) -> Any:
+        return found
+
+    image = torch.zeros(30, 40, 3)
+    assert detected(lambda rgb: SOUND, image) is SOUND
+    with pytest.raises(InputError, match=f"detector stranger: .*{said}"):
+        detected(stranger, image)
+    with pytest.raises(InputError, match=f"detector stranger: .*{said}"):
+        strongest(stranger, 3)(image)
+
+
+def test_descriptors_of_different_lengths_are_told() -> None:
+    lengths = iter((8, 8, 9))
+
+    def stranger(rgb: torch.Tensor) -> Keypoints:
+        return replace(SOUND, descriptors=torch.zeros(5, next(lengths), dtype=torch.uint8))
+
+    with pytest.raises(InputError, match="descriptors have 8 and 9 channels in different images"):
+        tracked_views(tiny.views(3), stranger)

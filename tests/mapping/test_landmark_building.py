@@ -1,0 +1,249 @@
+"""Landmarks from posed views: where they are, how surely, and what does not make any."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
+from bidnerf_core.mapping import (
+    LandmarkConfig,
+    LandmarkMap,
+    Sift,
+    Sightings,
+    build_landmarks,
+    likely_pairs,
+    robust_covariance,
+    tracked_views,
+    update_scatter,
+)
+from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
+from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks
+from landmark_scene import PINHOLE, Points, looking_in, ring
+
+
+def truth(points: Points, landmarks: LandmarkMap) -> torch.Tensor:
+    """The true position of each landmark, told by its descriptor."""
+    off = (landmarks.descriptors[:, None].float() - points.descriptors.float()).square().sum(-1)
+    return points.positions[off.argmin(1)]
+
+
+def test_exact_views_give_exact_landmarks() -> None:
+    points = Points()
+    found = build_landmarks(ring(points), points)
+    assert len(found) > 0.9 * points.count
+    assert float((found.positions - truth(points, found)).norm(dim=-1).max()) < 1e-4
+    assert int(found.views.max()) > 5
+
+
+def test_errors_are_as_large_as_the_deviations_say() -> None:
+    points = Points(noise=0.4)
+    found = build_landmarks(ring(points), points)
+    off = (found.positions - truth(points, found)).double()
+    along = (off * found.directions).sum(-1) / found.deviations[:, 1]
+    assert 0.7 < float(along.abs().median()) / 0.6745 < 1.4
+    assert found.noise == pytest.approx(0.4, rel=0.25)
+
+
+def test_each_image_sees_landmarks_as_far_away_as_they_are() -> None:
+    points = Points(noise=0.4)
+    views = ring(points)
+    seen, off = tracked_views(views, points).seen(LandmarkConfig()), []
+    assert len(seen) == len(views)
+    for view, part in zip(views, seen, strict=True):
+        local = view.T_ref_camera.inverse().apply(points.positions)
+        nearest = (PINHOLE.project(local) - part.pixels.double()[:, None]).norm(dim=-1).min(dim=1)
+        assert float(nearest.values.max()) < 4
+        off.append((part.distance - local[nearest.indices].norm(dim=-1)) / part.deviation)
+    assert len(torch.cat(off)) > 0.9 * sum(len(found.pixels) for found in points.seen)
+    assert 0.7 < float(torch.cat(off).abs().median()) / 0.6745 < 1.4
+
+
+def test_a_lens_with_distortion_changes_nothing() -> None:
+    points = Points()
+    bent = replace(PINHOLE, distortion=(0.1, -0.05, 0.001, 0.002))
+    found = build_landmarks(ring(points, intrinsics=bent), points)
+    assert float((found.positions - truth(points, found)).norm(dim=-1).max()) < 1e-3
+
+
+def test_a_moved_world_has_moved_landmarks() -> None:
+    points = Points(noise=0.3)
+    views = ring(points)
+    T = SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
+    here = build_landmarks(views, points)
+    there = build_landmarks([View(v.frame, T @ v.T_ref_camera) for v in views], points)
+    torch.testing.assert_close(there.positions.double(), T.apply(here.positions.double()), atol=1e-4, rtol=0)
+    torch.testing.assert_close(there.deviations, here.deviations, atol=1e-5, rtol=1e-3)
+
+
+def test_the_order_of_the_views_does_not_matter() -> None:
+    points = Points(noise=0.3)
+    views = ring(points)
+    a, b = build_landmarks(views, points), build_landmarks(views[::-1], points)
+    off = torch.cdist(a.positions.double(), b.positions.double()).amin(1)
+    assert len(a) == len(b)
+    assert float(off.max()) < 1e-3
+
+
+def test_without_parallax_measured_depth_places_the_points() -> None:
+    points = Points()
+    turned = [
+        looking_in(0.0) @ SE3.exp(torch.tensor([0, 0, 0, 0, 0.05 * i, 0], dtype=torch.float64))
+        for i in range(4)
+    ]
+    with pytest.raises(InputError, match="no landmark"):
+        build_landmarks([points.view(T) for T in turned], points)
+    found = build_landmarks([points.view(T, depth=1.0) for T in turned], points)
+    assert len(found) > 100
+    assert int(found.views.max()) == 4
+    assert float((found.positions - truth(points, found)).norm(dim=-1).median()) < 1e-3
+
+
+def test_keypoints_of_one_image_become_landmarks_only_if_asked_for() -> None:
+    points = Points()
+    view = points.view(looking_in(0.0), depth=1.0)
+    assert len(build_landmarks([view], points)) > 100
+    with pytest.raises(InputError, match="no landmark"):
+        build_landmarks([view], points, LandmarkConfig(singles=False))
+
+
+def test_the_best_seen_are_kept_and_the_rest_is_reported() -> None:
+    points = Points()
+    said: list[str] = []
+    views = ring(points)
+    everything = build_landmarks(views, points)
+    found = build_landmarks(views, points, LandmarkConfig(most=50), report=said.append)
+    assert len(found) == 50
+    assert f"{len(everything)} landmarks found, 50 kept" in said[0]
+    assert int(found.views.min()) >= int(everything.views.sort(descending=True).values[49])
+
+
+def test_progress_ends_at_its_total() -> None:
+    points = Points(count=50)
+    told: list[tuple[int, int]] = []
+    build_landmarks(ring(points, 4), points, progress=lambda done, total: told.append((done, total)))
+    assert [done for done, _ in told] == list(range(1, told[-1][1] + 1))
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_blank_images_are_refused(count: int) -> None:
+    blank = Frame("b", torch.full((40, 60, 3), 0.5), Intrinsics(50, 50, 30, 20, 60, 40))
+    with pytest.raises(InputError, match="landmark"):
+        build_landmarks([View(blank, looking_in(0.1 * i)) for i in range(count)], Sift())
+
+
+@pytest.mark.parametrize("options", [{"neighbours": 0}, {"most": 0}, {"parallax": 0.0}, {"parallax": 90.0}])
+def test_useless_settings_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=next(iter(options))):
+        LandmarkConfig(**options)  # type: ignore[arg-type]
+
+
+def sightings(point: torch.Tensor, cameras: list[SE3], noise: float, trials: int, seed: int = 0) -> Sightings:
+    """One point, seen ``trials`` times by all cameras; noise in pixels at a focal length of 300."""
+    generator = torch.Generator().manual_seed(seed)
+    rotation = torch.stack([T.rotation.mT for T in cameras]).repeat(trials, 1, 1)
+    centre = torch.stack([T.translation for T in cameras]).repeat(trials, 1)
+    local = (rotation @ (point - centre)[..., None])[..., 0]
+    image = local[:, :2] / local[:, 2:]
+    image = image + noise / 300 * torch.randn(image.shape, dtype=torch.float64, generator=generator)
+    index = torch.arange(trials).repeat_interleave(len(cameras))
+    view = torch.arange(len(index))
+    focal = torch.full((len(index),), 300.0, dtype=torch.float64)
+    return Sightings(index, view, rotation, centre, image, focal, torch.zeros_like(focal))
+
+
+def test_covariance_of_a_triangulated_point_is_that_of_many_trials() -> None:
+    point, cameras = (
+        torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64),
+        [looking_in(0.15 * i) for i in range(4)],
+    )
+    seen = sightings(point, cameras, 0.5, 3000)
+    found, unit = refined_points(seen, intersected(seen, 3000), 50.0)
+    sampled = (found - point).mT @ (found - point) / len(found)
+    expected = 0.25 * unit.mean(0)
+    whitened = torch.linalg.solve(torch.linalg.cholesky(expected), sampled)
+    whitened = torch.linalg.solve(torch.linalg.cholesky(expected), whitened.mT)
+    torch.testing.assert_close(whitened, torch.eye(3, dtype=torch.float64), atol=0.15, rtol=0)
+
+
+def test_one_wrong_observation_of_six_does_not_pull_a_point_away() -> None:
+    point, cameras = (
+        torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64),
+        [looking_in(0.15 * i) for i in range(6)],
+    )
+    seen = sightings(point, cameras, 0.0, 1)
+    seen.image[2] += 0.1  # 30 pixels
+    found = intersected(seen, 1)
+    for scale in (5.0, 1.0, 0.2):
+        found, _ = refined_points(seen, found, scale)
+    assert float((found[0] - point).norm()) < 1e-3
+
+
+def test_parallax_is_the_angle_between_two_rays() -> None:
+    cameras = [looking_in(0.0, 0.0), looking_in(0.2, 0.0)]
+    seen = sightings(torch.zeros(3, dtype=torch.float64), cameras, 0.0, 1)
+    assert float(parallax(seen, torch.zeros(1, 3, dtype=torch.float64))) == pytest.approx(0.2)
+
+
+def test_a_match_that_would_join_two_keypoints_of_an_image_is_left_out() -> None:
+    def match(a: int, b: int, ambiguity: float) -> Matches:
+        return Matches(torch.tensor([[a, b]]), torch.tensor([ambiguity]))
+
+    track = joined_tracks(
+        [(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1]
+    )
+    assert track[0] == track[2] == track[3]
+    assert track[1] != track[0]
+
+
+def test_likely_pairs_are_neighbours_on_the_ring() -> None:
+    points = Points(count=10)
+    views = [points.view(looking_in(2 * math.pi * i / 24)) for i in range(24)]
+    pairs = likely_pairs(views, 4)
+    apart = (pairs[:, 1] - pairs[:, 0]).minimum(24 - pairs[:, 1] + pairs[:, 0])
+    assert int(apart.max()) <= 5
+    assert int((apart == 1).sum()) == 24
+    assert likely_pairs(views[:2], 8).tolist() == [[0, 1]]
+
+
+def test_robust_covariance_is_right_for_normal_values_and_holds_with_outliers(
+    generator: torch.Generator,
+) -> None:
+    shape = torch.randn(6, 6, dtype=torch.float64, generator=generator)
+    values = torch.randn(4000, 6, dtype=torch.float64, generator=generator) @ shape.mT
+    whitening = torch.linalg.inv(shape)
+    values[:200] *= 30
+    found = whitening @ robust_covariance(values) @ whitening.mT
+    assert float(torch.linalg.eigvalsh(found)[0]) > 0.85
+    assert float(torch.linalg.eigvalsh(found)[-1]) < 1.4
+
+
+def test_scatter_of_updates_is_that_of_the_images_that_moved_if_most_did() -> None:
+    deviations = torch.tensor([3, 2, 1, 0.3, 0.2, 0.1], dtype=torch.float64)
+    noise = torch.randn((400, 6), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    updates = list(noise * deviations)
+    found = update_scatter(updates)
+    torch.testing.assert_close(found.diagonal().sqrt(), deviations, rtol=0.15, atol=0)
+    assert torch.equal(update_scatter([*updates, *[None] * 400]), found)
+    for few in ([*updates, *[None] * 401], updates[:7], []):
+        assert torch.equal(update_scatter(few), torch.zeros((6, 6), dtype=torch.float64))
+
+
+@pytest.mark.parametrize("zero", [0, 128])
+def test_descriptors_of_one_point_are_averaged_to_their_usual_length(
+    zero: int, generator: torch.Generator
+) -> None:
+    true = normalize(
+        torch.randn(300, 64, generator=generator).abs()
+        if not zero
+        else torch.randn(300, 64, generator=generator)
+    )
+    point = torch.arange(300).repeat(8)
+    seen = normalize(true[point] + 0.05 * torch.rand(2400, 64, generator=generator))
+    length = 512 if not zero else 256
+    found = _mean_descriptors((zero + length * seen).round().clamp(0, 255).byte(), point, 300).float() - zero
+    torch.testing.assert_close(found.norm(dim=-1), torch.full((300,), float(length)), rtol=0.01, atol=0)

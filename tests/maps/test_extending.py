@@ -1,0 +1,147 @@
+"""Maps that grow: new photos are located, trained on and recognised afterwards; nothing else changes the map in its folder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core.captures import stored_cameras
+from bidnerf_core.errors import Cancelled, InputError
+from bidnerf_core.maps.extending import locate
+from bidnerf_core.testing import training_views, view
+from commands import Run
+from photo_files import write_photo
+
+STEPS = 12
+BAKE = bn.BakeConfig(rays=20_000, measured=60_000, cells=20_000)
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of seven of ten images of the textured ground."""
+    folder = tmp_path_factory.mktemp("extend") / "map"
+    bn.train(
+        list(training_views()[:7]),
+        out=folder,
+        config=tiny.config(25),
+        bake=BAKE,
+    )
+    return folder
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix != ".lock"}
+
+
+@pytest.fixture
+def map_folder(stored: Path, tmp_path: Path) -> Path:
+    bn.load_map(stored).save(tmp_path / "map")
+    return tmp_path / "map"
+
+
+def test_new_photos_are_located_and_added(map_folder: Path) -> None:
+    before, new = bn.load_map(map_folder), training_views()[7:]
+    after = bn.extend(map_folder, new, steps=STEPS, config=BAKE)
+    assert [camera.name for camera in after.info.cameras[7:]] == [each.frame.name for each in new]
+    for camera, truth in zip(after.info.cameras[7:], new, strict=True):
+        assert float((camera.pose.translation - truth.T_ref_camera.translation).norm()) < 0.03
+    assert before.landmarks is not None
+    assert after.landmarks is not None
+    assert len(before.landmarks) < len(after.landmarks) < 2 * len(before.landmarks)
+    assert after.info.added == 3
+    assert "10 images, 3 of which were added later" in str(after.describe())
+    again = bn.load_map(map_folder)
+    assert again.info == after.info
+    assert len(again.landmarks or ()) == len(after.landmarks)
+    assert bn.Localizer(again)(new[0].frame).converged
+
+
+def test_the_same_photos_change_nothing(map_folder: Path) -> None:
+    before = files(map_folder)
+    same = bn.extend(map_folder, training_views()[:3], steps=STEPS, config=BAKE)
+    assert len(same.info.cameras) == 7
+    assert files(map_folder) == before
+
+
+def test_a_photo_that_was_added_under_another_name_is_known(stored: Path) -> None:
+    """Another folder's first photo has the name of the map's first one."""
+    scene, new = bn.load_map(stored), training_views()[7]
+    name = scene.info.cameras[0].name
+    frame = replace(new.frame, name=name)
+    located = locate(scene, [frame], "map")
+    assert [each.frame.name for each in located.views] == [f"{name}_2"]
+    info = replace(scene.info, cameras=(*scene.info.cameras, *stored_cameras(located.views)))
+    assert locate(replace(scene, info=info), [frame], "map").known == (name,)
+
+
+def test_another_scene_is_refused(map_folder: Path) -> None:
+    before = files(map_folder)
+    others = [replace(view(each.T_ref_camera, f"x{n}", 9)) for n, each in enumerate(training_views()[:2])]
+    with pytest.raises(InputError, match="localizes 0 of 2 photos, expected photos of its scene"):
+        bn.extend(map_folder, others, steps=STEPS, config=BAKE)
+    assert files(map_folder) == before
+
+
+def test_a_cancelled_extension_leaves_the_map(map_folder: Path) -> None:
+    before, steps = files(map_folder), []
+    with pytest.raises(Cancelled):
+        bn.extend(
+            map_folder, training_views()[7:], steps=STEPS, config=BAKE,
+            progress=lambda p: steps.append(p) if p.stage == "training" else None, cancel=lambda: len(steps) > 3,
+        )  # fmt: skip
+    assert files(map_folder) == before
+
+
+def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
+    """In a map in metres as well, whose field keeps the unit of its training."""
+    large = bn.load_map(map_folder).scaled(2.0)
+    old = [replace(v, frame=replace(v.frame, depth=None), T_ref_camera=bn.SE3(v.T_ref_camera.rotation, 2 * v.T_ref_camera.translation))
+           for v in training_views()[:7]]  # fmt: skip
+    after = bn.extend(large, training_views()[7:8], old, steps=STEPS, config=BAKE)
+    assert len(after.info.cameras) == 8
+    assert after.folder is None
+    truth = training_views()[7].T_ref_camera.translation
+    assert float((after.info.cameras[7].pose.translation - 2 * truth).norm()) < 0.06
+    with pytest.raises(InputError, match="none of the images that the map was built from"):
+        bn.extend(large, training_views()[7:8], [replace(old[0], frame=replace(old[0].frame, name="z"))])
+
+
+def test_photos_that_cannot_be_read_are_left_out(
+    map_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = bn.load_map(map_folder)
+    known, photos = training_views()[0].frame, tmp_path / "photos"
+    write_photo(photos / f"{known.name}.png", (known.rgb.numpy() * 255).round().astype("uint8"))
+    (photos / "b.png").write_bytes((photos / f"{known.name}.png").read_bytes()[:500])
+    with caplog.at_level("INFO", "bidnerf"):
+        assert len(bn.extend(scene, photos).info.cameras) == 7
+    assert "0 of 2 photos localized, 1 already in the map, 1 left out" in caplog.text
+    (photos / f"{known.name}.png").unlink()
+    with pytest.raises(InputError, match=r"none of 1 photo can be read: .*b\.png"):
+        bn.extend(scene, photos)
+
+
+@pytest.mark.parametrize(
+    ("photos", "message"),
+    [([], "no photos to add"), ([3], "photos holds a int"), (Path("nowhere"), "nowhere")],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_photo_is_refused(stored: Path, photos: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        bn.extend(stored, photos)  # type: ignore[arg-type]
+
+
+def test_the_command(bidnerf: Run, map_folder: Path, tmp_path: Path) -> None:
+    bn.write_transforms(
+        tmp_path / "new",
+        {"train": [replace(v, frame=replace(v.frame, depth=None)) for v in training_views()[7:9]]},
+    )
+    status, out, err = bidnerf("extend", map_folder, tmp_path / "new", "--steps", STEPS)
+    assert status == 0, err
+    assert "2 photos added, 9 images in all" in out
+    assert "2 of 2 photos localized" in err
+    assert bidnerf("extend", map_folder, tmp_path / "new", "--steps", 0)[0] == 2

@@ -1,0 +1,343 @@
+"""Maps made from Python: in memory and in folders, in threads, cancelled, resumed, described, rendered and saved."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core.io import FileInUse, to_plain
+from bidnerf_core.mapping import BakeConfig
+from bidnerf_core.maps import load_info
+from bidnerf_core.registry import PluginError
+from bidnerf_hashgrid import backend as hashgrid
+
+BAKE = BakeConfig(cells=20_000)
+DESCENT = bn.settings_of("bid", {"rays": 64, "max_steps": 3})
+
+
+def trained(out: Path | None = None, **options: Any) -> bn.Map:
+    given = {"config": tiny.config(), "bake": False, "background": tiny.BACKGROUND}
+    return bn.train(tiny.views(), out=out, **(given | options))
+
+
+def answer(scene: bn.Map, method: str = "bid") -> bn.Localization:
+    (view,) = tiny.views(1, seed=1)
+    start = bn.perturb(view.T_ref_camera, 0.1, 5.0, seed=0)
+    return bn.Localizer(scene, method, DESCENT if method == "bid" else None)(view.frame, start)
+
+
+def assert_same_field(one: bn.Map, other: bn.Map) -> None:
+    assert isinstance(one.field, nn.Module)
+    assert isinstance(other.field, nn.Module)
+    a, b = one.field.state_dict(), other.field.state_dict()
+    assert a.keys() == b.keys()
+    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+
+
+@pytest.fixture(scope="module")
+def scene() -> bn.Map:
+    """A map in memory, trained and baked."""
+    return trained(bake=BAKE)
+
+
+def test_a_map_in_memory_answers_as_the_one_that_is_saved_and_loaded(scene: bn.Map, tmp_path: Path) -> None:
+    assert scene.folder is None
+    assert scene.surface is not None
+    saved = scene.save(tmp_path / "map")
+    loaded = bn.load_map(tmp_path / "map")
+    assert_same_field(scene, loaded)
+    for method in ("bid", "auto"):
+        expected = answer(scene, method).T_world_camera.matrix()
+        assert torch.equal(answer(loaded, method).T_world_camera.matrix(), expected)
+    assert loaded.info == saved.info
+    assert loaded.capture == scene.capture
+    assert to_plain(loaded.describe().bounds) == to_plain(scene.describe().bounds)
+    with pytest.raises(bn.InputError, match="exists already"):
+        scene.save(tmp_path / "map")
+    assert bn.load_map(scene.save(tmp_path / "map", overwrite=True).folder or "").surface is not None
+
+
+def test_a_folder_a_path_a_dataset_and_views_give_the_same_map(tmp_path: Path) -> None:
+    data = bn.open_dataset(tiny.write_dataset(tmp_path / "data"))
+    options: dict[str, Any] = {"config": tiny.config(), "bake": False}
+    stored = bn.train(data, out=tmp_path / "map", **options)
+    assert stored.folder == tmp_path / "map"
+    assert stored.info == load_info(tmp_path / "map")
+    assert stored.info.data == "data"
+    views = bn.train(data.views("train"), background=data.background, **options)
+    for other in (bn.train(tmp_path / "data", **options), views, bn.load_map(tmp_path / "map")):
+        assert_same_field(stored, other)
+
+
+def test_an_incomplete_map_is_saved_with_what_resuming_needs(tmp_path: Path) -> None:
+    whole = trained()
+    with pytest.raises(bn.Cancelled):
+        trained(tmp_path / "map", cancel=after(5))
+    half = bn.load_map(tmp_path / "map").save(tmp_path / "copy")
+    assert not half.info.complete
+    assert_same_field(bn.resume(tmp_path / "copy", tiny.views(), bake=False), whole)
+
+
+def after(steps: int) -> Callable[[], bool]:
+    """Return a ``cancel`` that is True once it was asked ``steps`` times in the training itself."""
+    asked = iter(range(10**6))
+    return lambda: "fit" in names_of_callers() and next(asked) >= steps - 1
+
+
+def names_of_callers() -> set[str]:
+    frame, names = sys._getframe(1), set()
+    while frame is not None:
+        names.add(frame.f_code.co_name)
+        frame = frame.f_back  # type: ignore[assignment]
+    return names
+
+
+def test_cancelled_and_resumed_equals_uninterrupted(tmp_path: Path) -> None:
+    whole = trained(tmp_path / "whole")
+    with pytest.raises(bn.Cancelled, match=r"saved after step 5; --resume"):
+        trained(tmp_path / "half", cancel=after(5))
+    info = load_info(tmp_path / "half")
+    assert (info.step, info.complete) == (5, False)
+    resumed = bn.resume(tmp_path / "half", tiny.views(), bake=False)
+    assert resumed.info.complete
+    assert_same_field(resumed, whole)
+    with pytest.raises(bn.InputError, match="nothing to resume"):
+        bn.resume(tmp_path / "half", tiny.views(), bake=False)
+    assert bn.resume(tmp_path / "half", tiny.views(), bake=BAKE).surface is not None
+    with pytest.raises(bn.InputError, match="and baked, nothing to resume"):
+        bn.resume(tmp_path / "half", tiny.views())
+
+
+def test_cancelling_before_training_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(bn.Cancelled):
+        trained(tmp_path / "map", cancel=lambda: True)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(bn.Cancelled, match="nothing is stored"):
+        trained(cancel=after(3))
+
+
+class Failed(Exception):
+    pass
+
+
+def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(tmp_path: Path) -> None:
+    def fail(now: bn.Progress) -> None:
+        if now.stage == "training" and now.done == 7:
+            raise Failed("the caller's own")
+
+    with pytest.raises(Failed, match="the caller's own"):
+        trained(tmp_path / "map", progress=fail, checkpoint_seconds=0)
+    assert load_info(tmp_path / "map").step == 6
+    assert_same_field(bn.resume(tmp_path / "map", tiny.views(), bake=False), trained())
+
+
+def test_progress_counts_and_remarks_are_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    caplog.set_level(logging.INFO, "bidnerf")
+    seen = list[bn.Progress]()
+    trained(tmp_path / "map", bake=BAKE, progress=seen.append)
+    steps = [now.done for now in seen if now.stage == "training"]
+    assert steps == list(range(1, tiny.STEPS + 1))
+    last = next(now for now in reversed(seen) if now.stage == "training")
+    assert str(last).startswith(f"training: {tiny.STEPS}/{tiny.STEPS} steps, loss ")
+    assert "surface of" in caplog.text
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_thread_trains_while_another_localizes(scene: bn.Map) -> None:
+    expected, whole = answer(scene), trained()
+    with ThreadPoolExecutor(2) as pool:
+        training = pool.submit(trained, config=tiny.config(40))
+        found = [pool.submit(answer, scene).result() for _ in range(3)]
+        again = pool.submit(trained)
+        assert training.result().info.step == 40
+        assert_same_field(again.result(), whole)
+    for one in found:
+        assert torch.equal(one.T_world_camera.matrix(), expected.T_world_camera.matrix())
+
+
+def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_path: Path) -> None:
+    begun, refused = threading.Event(), threading.Event()
+
+    def wait(now: bn.Progress) -> None:
+        begun.set()
+        assert refused.wait(120)
+
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(trained, tmp_path / "map", progress=wait)
+        assert begun.wait(120)
+        for second in (trained, lambda out, **_: bn.resume(out, tiny.views())):
+            with pytest.raises(bn.InputError):
+                second(tmp_path / "map")
+        with pytest.raises(FileInUse, match="another bidnerf process is writing here"):
+            trained(tmp_path / "map", overwrite=True)
+        refused.set()
+        assert first.result().info.complete
+    assert load_info(tmp_path / "map").complete
+
+
+@pytest.mark.slow
+def test_a_process_that_trains_into_the_folder_of_a_thread_is_refused(tmp_path: Path) -> None:
+    tiny.write_dataset(tmp_path / "data")
+    program = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
+    words = ["train", str(tmp_path / "data"), "--out", str(tmp_path / "map"), "--overwrite", *tiny.options()]
+    ran = list[subprocess.CompletedProcess[str]]()
+
+    def compete(now: bn.Progress) -> None:
+        if not ran:
+            command = [sys.executable, "-c", program, *words]
+            ran.append(subprocess.run(command, capture_output=True, text=True, timeout=300))
+
+    assert trained(tmp_path / "map", progress=compete).info.complete
+    assert (ran[0].returncode, "another bidnerf process is writing here" in ran[0].stderr) == (1, True)
+
+
+def test_baking_stores_what_it_made_where_the_map_is(scene: bn.Map, tmp_path: Path) -> None:
+    bare = bn.train(tiny.views(), out=tmp_path / "map", config=tiny.config(), bake=False)
+    baked = bare.bake(tiny.views(), config=BAKE)
+    assert baked.surface is not None
+    assert load_info(tmp_path / "map") == baked.info
+    again = bn.load_map(tmp_path / "map").bake(tiny.views(), config=BAKE)
+    assert again.info.surface != baked.info.surface
+    with pytest.raises(bn.Cancelled):
+        baked.bake(tiny.views(), config=BAKE, cancel=lambda: True)
+    with pytest.raises(bn.InputError, match="rendered_landmarks uses no photos"):
+        baked.bake(tiny.views(), rendered_landmarks=True)
+    assert load_info(tmp_path / "map") == again.info
+
+
+def test_parts_that_were_not_read_are_saved(tmp_path: Path) -> None:
+    baked = trained(tmp_path / "map", bake=BAKE)
+    assert baked.surface is not None
+    bare = bn.load_map(tmp_path / "map", baked=False)
+    assert bare.surface is None
+    for folder in (tmp_path / "copy", tmp_path / "map"):
+        bare.save(folder, overwrite=True)
+        found = bn.load_map(folder)
+        assert found.surface is not None
+        assert len(found.surface.surfels) == len(baked.surface.surfels)
+
+
+def test_a_description_is_for_people_and_for_json(scene: bn.Map) -> None:
+    summary = scene.describe()
+    assert "in memory, written by bidnerf" in str(summary)
+    assert f"{tiny.STEPS} steps of backend hashgrid" in str(summary)
+    facts = summary.plain()
+    assert (facts["map"], facts["bytes"], facts["cameras"]) == ("", None, 6)
+    assert facts["surfels"] == summary.surfels > 0
+
+
+def test_a_notebook_shows_a_map_in_a_line(scene: bn.Map) -> None:
+    shown = repr(scene)
+    assert scene.surface is not None
+    assert len(shown) < 200
+    assert f"{len(scene.surface.surfels)} surfels" in shown
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
+    (view,) = tiny.views(1, seed=1)
+    image = scene.render(view)
+    scores = bn.rendering_scores(image, view.frame)
+    error = (image.rgb - view.frame.rgb).square().mean()
+    assert scores.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-3)
+    assert view.frame.depth is not None
+    assert len(scores.depth_errors) == int((view.frame.depth > 0).sum())
+    perfect = bn.rendering_scores(type(image)(view.frame.rgb, view.frame.depth, image.opacity), view.frame)
+    assert perfect.depth_error == 0
+    assert not torch.equal(scene.render(view, level=0).rgb, image.rgb)
+    with pytest.raises(bn.InputError, match="no level 2, expected 0 to 1"):
+        scene.render(view, level=2)
+    with pytest.raises(bn.InputError, match="view is a Frame, expected a View"):
+        scene.render(view.frame)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"data": []}, "data holds no views"),
+        ({"data": 3}, "data is or holds a int, expected a dataset, a path, or views"),
+        ({"data": [None]}, "data is or holds a NoneType"),
+        ({"data": "/nowhere"}, "/nowhere: no such folder"),
+        ({"backend": "hashgird"}, "hashgird"),
+        ({"config": {"stepps": 3}}, "no field 'stepps', did you mean 'steps'"),
+        ({"config": 7}, "config is a int, expected a HashGridConfig or a dict"),
+        ({"device": "tpu:9"}, "device 'tpu:9' does not work here"),
+        ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
+        ({"bake": "yes"}, "bake is 'yes', expected True, False or a BakeConfig"),
+        ({"progress": 3}, "progress is a int, expected a function"),
+        (
+            {"cancel": threading.Event()},
+            "cancel is a Event, expected a function, such as the is_set of an event",
+        ),
+        ({"refine_poses": "maybe"}, "refine_poses is 'maybe', expected one of auto, always, never"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_any_work(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(bn.InputError) as refused:
+        bn.train(**({"data": tiny.views(1), "config": tiny.config(1), "bake": False} | options))
+    assert said in str(refused.value)
+
+
+def test_a_backend_whose_module_is_no_field_is_refused_before_training(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Layers(type(hashgrid)):  # type: ignore[misc]
+        def build(self, config: Any, bounds: Any) -> Any:
+            return nn.Linear(3, 4)
+
+    kind = Layers(**vars(hashgrid))
+    monkeypatch.setattr("bidnerf_core.registry.registered", {("backends", "layers"): kind})
+    with pytest.raises(
+        bn.InputError, match=r"backend 'layers' built a Linear, expected .* query and sampler"
+    ):
+        bn.train(tiny.views(2), "layers", out=tmp_path / "map", bake=False)
+    assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_broken_detector_ends_training_with_an_error_and_the_map_in_its_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("bidnerf_core.registry.registered", {("features", "blind"): lambda rgb: None})
+    with pytest.raises(PluginError, match="returned a NoneType, expected Keypoints"):
+        trained(tmp_path / "map", features="blind", refine_poses="never", bake=BAKE)
+    assert load_info(tmp_path / "map").complete
+
+
+def test_photos_to_map_to_pose_to_overlay(tmp_path: Path) -> None:
+    """A notebook: ten lines, from photos to a picture of the pose that was found."""
+    tiny.write_dataset(tmp_path / "capture")
+    script = """
+import bidnerf_core as bn
+data = bn.open_dataset("capture")
+scene = bn.train(data, config={"steps": 3, "samples_per_step": 2048}, bake=False)
+print(scene.describe())
+view = data.views("test", ["t_0000"])[0]
+start = bn.perturb(view.T_ref_camera, translation=0.1, rotation_deg=5, seed=0)
+found = bn.Localizer(scene, "bid", bn.settings_of("bid", {"max_steps": 3}))(view.frame, start)
+print(found.outcome, bn.pose_error(found.T_world_camera, view.T_ref_camera))
+picture = bn.overlay(scene, view.frame, found)
+"""
+    assert len(script.strip().splitlines()) <= 12
+    names: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        exec(script, names)
+    assert names["picture"].dtype == np.uint8
+    assert names["picture"].shape[-1] == 3

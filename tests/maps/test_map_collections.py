@@ -1,0 +1,157 @@
+"""Several maps at once: which one an image shows, and the runner-up."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+import bidnerf_core as bn
+import bidnerf_core.maps.collection as collections_module
+from bidnerf_core.captures import stored_cameras
+from bidnerf_core.errors import InputError
+from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
+from bidnerf_core.mapping.landmarks.vocabulary import visible
+from bidnerf_core.maps import Map, MapInfo, maps_in
+from bidnerf_core.service.worker import Served, Worker
+from bidnerf_core.service.worker import _together as together_of
+from bidnerf_core.testing import BOUNDS, CAMERA, POSES, ground, training_views, view
+from commands import Run
+
+SEEDS = (0, 4, 5)
+
+
+def photo(seed: int) -> bn.View:
+    """Return an unseen image of a ground, without depth."""
+    image = view(POSES[1], "unseen", seed)
+    return replace(image, frame=replace(image.frame, depth=None))
+
+
+@pytest.fixture(scope="module")
+def grounds() -> list[Map]:
+    """Four grounds of other textures, of six images each."""
+    found = []
+    for seed in SEEDS:
+        images = [view(each.T_ref_camera, each.frame.name, seed) for each in training_views()[:6]]
+        info = MapInfo(
+            "ground", {}, BOUNDS, 1, True, f"ground{seed}", weights=f"g{seed}", cameras=stored_cameras(images)
+        )
+        surface = bake(ground(seed), BOUNDS, [], images, BakeConfig(cells=20_000))
+        found.append(Map(info, ground(seed), surface, build_landmarks(images)))
+    return found
+
+
+@pytest.mark.slow
+def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
+    maps = bn.MapCollection(grounds, asked=2)
+    assert maps.names == tuple(f"ground{seed}" for seed in SEEDS)
+    for seed in SEEDS[1:]:
+        image = photo(seed)
+        found = maps(image.frame)
+        assert found.map == f"ground{seed}"
+        assert found.converged
+        assert found.rival is None
+        assert found.ranking[0].map == found.map
+        assert len(found.asked) == 2
+        assert found.runner_up is not None
+        assert found.runner_up[0] == found.ranking[1].map
+        alone = bn.Localizer(grounds[SEEDS.index(seed)])(image.frame)
+        assert torch.equal(found.found.T_world_camera.matrix(), alone.T_world_camera.matrix())
+
+
+@pytest.mark.slow
+def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
+    """Under the names by which the maps are served, and with the localizers that serve them."""
+    served = {name: Served(scene, bn.Localizer(scene)) for name, scene in zip("ab", grounds, strict=False)}
+    together = together_of(served)
+    assert together is not None
+    assert together.localizer("b") is served["b"].localizer
+    assert together_of({"a": served["a"]}) is None
+    worker = Worker(served, together, 1e6, tmp_path, "cpu")
+    png = iio.imwrite("<bytes>", (255 * photo(SEEDS[1]).frame.rgb).byte().numpy(), extension=".png")
+    request = {"id": "1", "kind": "localize", "map": None, "parameters": {"name": "<i>", "focal": CAMERA.fx}}
+    reply = worker.answer(request, {"photo": png})
+    assert reply["status"] == 200, reply
+    body = reply["body"]
+    assert (body["frame"], body["map"], body["converged"]) == ("<i>", "b", True)
+    assert body["runner_up"]["map"] == "a"
+    alone = worker.answer(request | {"map": "b"}, {"photo": png})["body"]
+    assert alone["T_world_camera"] == body["T_world_camera"]
+
+
+@pytest.mark.slow
+def test_two_maps_of_one_place_are_rivals(grounds: list[Map]) -> None:
+    copy = grounds[0].scaled(2.0)
+    maps = bn.MapCollection([*grounds[:2], replace(copy, info=replace(copy.info, data="copy"))])
+    found = maps(photo(0).frame)
+    assert {found.map, found.rival} == {"ground0", "copy"}
+
+
+def test_landmarks_that_a_camera_sees(grounds: list[Map]) -> None:
+    landmarks = grounds[0].landmarks
+    assert landmarks is not None
+    camera = grounds[0].info.cameras[0]
+    seen = visible(landmarks, CAMERA, camera.pose)
+    assert 0.2 * len(landmarks) < len(seen.unique()) == len(seen) <= len(landmarks)
+    away = bn.SE3(
+        camera.pose.rotation @ torch.diag(torch.tensor([1.0, -1, -1]).double()), camera.pose.translation
+    )
+    assert not len(visible(landmarks, CAMERA, away))
+
+
+def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:
+    bare = replace(grounds[1], landmarks=None, info=replace(grounds[1].info, data="bare"))
+    maps = bn.MapCollection([bare, grounds[0]])
+    assert [each.map for each in maps.ranked(view(POSES[1]).frame)] == ["ground0", "bare"]
+    dark = bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), CAMERA)
+    assert {each.cosine for each in maps.ranked(dark)} == {-1.0}
+
+
+def test_what_is_no_map_is_refused(grounds: list[Map], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no map in it"):
+        bn.MapCollection(tmp_path)
+    with pytest.raises(InputError, match="two maps are named 'ground0'"):
+        bn.MapCollection([grounds[0], grounds[0]])
+    with pytest.raises(InputError, match="no map 'x', expected one of ground0"):
+        bn.MapCollection(grounds[:1]).localizer("x")
+    assert maps_in(tmp_path / "none") == []
+
+
+def test_the_command(
+    bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Folders of maps, whose landmarks are read, and of which only those that are asked are loaded."""
+    known = {f"m{seed}": scene for seed, scene in zip(SEEDS, grounds, strict=True)}
+    loaded = []
+
+    def load(folder: Path) -> Map:
+        loaded.append(folder.name)
+        return known[folder.name]
+
+    monkeypatch.setattr(collections_module, "load_info", lambda folder: known[folder.name].info)
+    monkeypatch.setattr(collections_module, "_landmarks", lambda scene, info: known[scene.name].landmarks)
+    monkeypatch.setattr(collections_module, "load_map", load)
+    for name in known:
+        (tmp_path / "maps" / name).mkdir(parents=True)
+        (tmp_path / "maps" / name / "map.json").write_text("{}")
+    file = tmp_path / "photo.png"
+    iio.imwrite(file, (255 * view(POSES[1], "", SEEDS[1]).frame.rgb).round().to(torch.uint8).numpy())
+    status, out, err = bidnerf("localize", tmp_path / "maps", file, "--focal", 130, "--json")
+    assert status == 0, err
+    answer = json.loads(out)
+    assert (answer["map"], answer["converged"]) == ("m4", True)
+    assert answer["runner_up"]["converged"] is False
+    assert len(loaded) == 2
+    two = (tmp_path / "maps" / "m0", tmp_path / "maps" / "m4")
+    status, out, err = bidnerf("localize", *two, file, "--focal", 130, "--out", tmp_path / "poses.json")
+    assert status == 0, err
+    assert out.startswith("photo: in m4: converged")
+    assert "runner-up m0: too few matches" in out
+    assert json.loads((tmp_path / "poses.json").read_text())[0]["map"] == "m4"
+    for words in (("--out", tmp_path / "poses.txt"), ("--perturb", 1, 1)):
+        assert bidnerf("localize", *two, file, *words)[0] == 2

@@ -1,0 +1,217 @@
+"""Maps in another unit: everything scales together, and scaling back gives the same map."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core.captures import stored_cameras
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields import levels
+from bidnerf_core.io import FileInUse, locked
+from bidnerf_core.maps import Anchor, Map, MapInfo
+from bidnerf_core.maps.anchor import load_anchor, save_anchor
+from bidnerf_core.maps.scaling import place_of
+from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen
+from commands import Run
+
+
+@pytest.fixture(scope="module")
+def ground() -> Map:
+    """The textured ground as a map of three cameras, in units of unknown length."""
+    known, view = textured_map(surface=True), unseen()
+    moves = torch.eye(3, 6, dtype=torch.float64)
+    views = [
+        bn.View(replace(view.frame, name=f"c{n}"), view.T_ref_camera.retract(move))
+        for n, move in enumerate(moves)
+    ]
+    info = MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground", cameras=stored_cameras(views))
+    return Map(info, known.field, known.surface, known.landmarks)
+
+
+@pytest.mark.slow
+def test_all_that_is_computed_scales(ground: Map) -> None:
+    view, large = unseen(), ground.scaled(4.0)
+    assert (ground.unit, large.unit) == ("units", "metres")
+    there = bn.View(view.frame, bn.SE3(view.T_ref_camera.rotation, 4 * view.T_ref_camera.translation))
+    before, after = ground.render(view), large.render(there)
+    torch.testing.assert_close(after.rgb, before.rgb, atol=2e-4, rtol=0)
+    torch.testing.assert_close(after.depth, 4 * before.depth, atol=1e-3, rtol=1e-4)
+    found, scaled = (bn.Localizer(scene)(view.frame) for scene in (ground, large))
+    assert found.converged
+    assert scaled.converged
+    assert (found.unit, scaled.unit) == ("units", "metres")
+    off = scaled.T_world_camera.translation - 4 * found.T_world_camera.translation
+    assert float(off.norm()) < 1e-3
+    assert len(levels(large.field)) == len(levels(ground.field))
+
+
+@pytest.mark.slow
+def test_scaling_back_gives_the_same_answers(ground: Map) -> None:
+    """To the last bit for a power of two, whose products are exact."""
+    back = ground.scaled(0.5).scaled(2.0, "units")
+    assert back.info == ground.info
+    assert torch.equal(back.render(unseen()).rgb, ground.render(unseen()).rgb)
+    before, after = (bn.Localizer(scene)(unseen().frame) for scene in (ground, back))
+    assert torch.equal(after.T_world_camera.matrix(), before.T_world_camera.matrix())
+    assert before.covariance is not None
+    assert after.covariance is not None
+    assert torch.equal(after.covariance, before.covariance)
+
+
+def test_a_known_length_gives_the_factor(ground: Map) -> None:
+    assert bn.factor_of_distance(ground, "c0", "c1", 2.8284271247) == pytest.approx(2)
+    assert bn.factor_of_distance(ground, "0,0,0", (0.0, 3.0, 4.0), 1.0) == pytest.approx(0.2)
+    low, high = (f"c0@{0.25 * CAMERA.width},{y * CAMERA.height}" for y in (0.4, 0.6))
+    apart = bn.factor_of_distance(ground, low, high, 1.0)
+    assert bn.factor_of_distance(ground.scaled(0.5), low, high, 1.0) == pytest.approx(2 * apart, rel=1e-3)
+    for bad in ("nobody", "c0@-3,1", "c0@1", "1,2", "1,2,nan"):
+        with pytest.raises(InputError, match=r"no place|outside"):
+            bn.factor_of_distance(ground, bad, "c1", 1.0)
+    assert bn.factor_of_distance(ground, "c0.png", "c1.JPG", 2.8284271247) == pytest.approx(2)
+    file, name = f"c0.png@{0.25 * CAMERA.width},1", f"c0@{0.25 * CAMERA.width},1"
+    assert torch.equal(place_of(ground, file), place_of(ground, name))
+    with pytest.raises(
+        InputError, match=r"no camera of 'c7.png'; photos held out for tests are not in the map .*'c0'"
+    ):
+        bn.factor_of_distance(ground, "c7.png", "c1", 1.0)
+    with pytest.raises(InputError, match="the same place"):
+        bn.factor_of_distance(ground, "c0", "c0", 1.0)
+
+
+def test_known_poses_give_the_factor(ground: Map) -> None:
+    """In any world: only the distances of the cameras count."""
+    T_other_world = bn.SE3.exp(torch.tensor([3.0, -2, 1, 0.5, 1.0, -0.3], dtype=torch.float64))
+    known = {
+        camera.name: T_other_world @ bn.SE3(camera.pose.rotation, 3 * camera.pose.translation)
+        for camera in ground.info.cameras
+    }
+    fit = bn.factor_of_poses(ground, known | {"elsewhere": bn.SE3.identity()})
+    assert fit.factor == pytest.approx(3)
+    assert (fit.cameras, fit.error) == (3, pytest.approx(0, abs=1e-9))
+    with pytest.raises(InputError, match="1 of 1 known poses"):
+        bn.factor_of_poses(ground, {"c0": known["c0"]})
+    wrong = {
+        name: bn.SE3(known["c0"].rotation, torch.tensor([x, 0.0, 0.0]).double())
+        for name, x in (("c0", 0), ("c1", 1), ("c2", 9))
+    }
+    with pytest.raises(InputError, match="known positions of the same capture"):
+        bn.factor_of_poses(ground, wrong)
+
+
+def test_a_map_in_metres_that_is_scaled_again_is_remarked(
+    ground: Map, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "bidnerf")
+    metric = ground.scaled(2.0)
+    metric.scaled(1.0)
+    assert not caplog.text
+    metric.scaled(2.0)
+    assert "was in metres before; its lengths are multiplied by 2 all the same" in caplog.text
+
+
+def test_known_positions_come_from_a_file(ground: Map, tmp_path: Path) -> None:
+    known, file = {c.name: 3 * c.pose.translation for c in ground.info.cameras}, tmp_path / "known.json"
+    file.write_text(json.dumps({f"{name}.jpg": place.tolist() for name, place in known.items()}))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(3)
+    poses = [{"frame": c.name, "T_world_camera": c.pose.matrix().tolist()} for c in ground.info.cameras]
+    file.write_text(json.dumps(poses))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    file.write_text("\n".join(map(json.dumps, poses)))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    file.write_text(json.dumps({pose["frame"]: pose["T_world_camera"] for pose in poses}))
+    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    form = re.escape(
+        'expected {"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_camera": 4x4 rows}, ...]'
+    )
+    for wrong in (
+        '{"c0": [1, 2]}',
+        '{"frames": [{"file_path": "c0"}]}',
+        "[[1, 2, 3]]",
+        "[]",
+        '{"c0": [1, 2, "3"]}',
+        "c0 1 2 3",
+    ):
+        file.write_text(wrong)
+        with pytest.raises(InputError, match=f"known.json: .*{form}$"):
+            bn.read_positions(file)
+
+
+@pytest.mark.parametrize("factor", [0, -1.0, float("nan"), float("inf"), 1e300, "2", True])
+def test_a_factor_is_a_positive_number(ground: Map, factor: float) -> None:
+    with pytest.raises(InputError, match="factor is"):
+        ground.scaled(factor)
+
+
+def test_an_interrupted_training_is_not_scaled(ground: Map) -> None:
+    with pytest.raises(InputError, match="cannot be scaled: its training stopped"):
+        replace(ground, info=replace(ground.info, complete=False)).scaled(2)
+
+
+def test_saving_takes_the_anchor_along(tmp_path: Path) -> None:
+    anchor = Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5)
+    bn.train(tiny.views(3), out=tmp_path / "a", config=tiny.config(2), bake=False)
+    save_anchor(tmp_path / "a", anchor)
+    bn.load_map(tmp_path / "a").save(tmp_path / "b")
+    assert load_anchor(tmp_path / "b") == anchor
+    bn.load_map(tmp_path / "b").scaled(0.5).save(tmp_path / "b", overwrite=True)
+    assert load_anchor(tmp_path / "b") == replace(anchor, metres_per_unit=1.0)
+
+
+def test_a_map_that_is_being_changed_is_not_read(
+    bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What another process writes between reading and writing would be lost."""
+    bn.train(tiny.views(3), out=tmp_path / "map", config=tiny.config(2), bake=False)
+    refused = list[str]()
+
+    def load(folder: Path) -> Map:
+        with pytest.raises(FileInUse) as found, locked(folder):
+            pass
+        refused.append(str(found.value))
+        return bn.load_map(folder)
+
+    monkeypatch.setattr("bidnerf_core.cli.scale.load_map", load)
+    assert bidnerf("scale", tmp_path / "map", "--factor", "2")[0] == 0
+    monkeypatch.setattr("bidnerf_core.maps.extending.load_map", load)
+    bidnerf("extend", tmp_path / "map", tmp_path)
+    assert len(refused) == 2
+    nothing = bidnerf("scale", tmp_path / "none", "--factor", "2")
+    assert (nothing.status, "none" in nothing.err, (tmp_path / "none").exists()) == (1, True, False)
+
+
+def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
+    trained = tmp_path / "map"
+    before = bn.train(tiny.views(3), out=trained, config=tiny.config(5), bake=False)
+    save_anchor(trained, Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5))
+    status, out, err = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half")
+    assert status == 0, err
+    assert "all lengths multiplied by 0.5" in out
+    half = bn.load_map(tmp_path / "half")
+    assert half.unit == "metres"
+    anchors = [load_anchor(folder) for folder in (trained, tmp_path / "half")]
+    places = [
+        anchor.geographic(scene.info.cameras[0].pose).place
+        for anchor, scene in zip(anchors, (before, half), strict=True)
+        if anchor is not None
+    ]
+    assert len(places) == 2
+    assert places[0].height == pytest.approx(places[1].height, abs=1e-6)
+    assert half.bounds.side == 0.5 * before.bounds.side
+    names = [camera.name for camera in before.info.cameras]
+    length = float((before.info.cameras[0].pose.translation - before.info.cameras[1].pose.translation).norm())
+    status, _, err = bidnerf("scale", tmp_path / "half", "--distance", names[0], names[1], length)
+    assert status == 0, err
+    back = bn.load_map(tmp_path / "half")
+    assert back.bounds.side == pytest.approx(before.bounds.side)
+    view = before.info.cameras[0]
+    assert view.pose.translation.tolist() == pytest.approx(back.info.cameras[0].pose.translation.tolist())
+    assert bidnerf("scale", tmp_path / "half")[0] == 2
+    assert bidnerf("scale", tmp_path / "half", "--factor", "-1")[0] == 1

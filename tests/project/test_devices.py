@@ -1,0 +1,159 @@
+"""Maps move to another device as a whole: every tensor does, and methods find the same poses there."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import baked
+import module_fields
+import tiny
+from bidnerf_core import Localizer, Map, load_backend
+from bidnerf_core.devices import moved
+from bidnerf_core.errors import InputError
+from bidnerf_core.io import to_plain
+from bidnerf_core.localization import AutoConfig
+from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.maps import MapInfo
+from bidnerf_core.scenes import HomogeneousBall
+from bidnerf_core.testing import DEVICE, Elsewhere, textured_field
+from problems import FieldMap
+
+CPU = torch.device("cpu")
+QUICK = AutoConfig(points=400, hypotheses=48, rounds=1, refine_steps=2, refine_rays=64, fused_rays=64)
+
+
+def tensors_in(value: Any, path: str = "map") -> Iterator[tuple[str, Tensor]]:
+    """Yield every tensor that can be reached from ``value`` by any attribute or item, with the way to it."""
+    if isinstance(value, Tensor):
+        yield path, value
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            yield from tensors_in(part, f"{path}[{key!r}]")
+    elif isinstance(value, list | tuple | set | frozenset):
+        for number, part in enumerate(value):
+            yield from tensors_in(part, f"{path}[{number}]")
+    elif isinstance(value, nn.Module) or is_dataclass(value) or type(value).__module__.startswith("bidnerf"):
+        parts = dict(getattr(value, "__dict__", {}))
+        if is_dataclass(value):
+            parts |= {part.name: getattr(value, part.name) for part in fields(value)}
+        for name, part in parts.items():
+            yield from tensors_in(part, f"{path}.{name}")
+
+
+def elsewhere_of(value: Any, device: torch.device) -> list[str]:
+    """Return the ways to the tensors that are not on ``device``."""
+    found = [(path, part.device) for path, part in tensors_in(value)]
+    assert found
+    return [path for path, where in found if where != device]
+
+
+@functools.cache
+def landmarks() -> LandmarkMap:
+    found = textured_field.textured_map().landmarks
+    assert found is not None
+    return found
+
+
+def whole_map(backend: str) -> Map:
+    """Return an untrained map of a backend with all that may be baked beside it."""
+    made = load_backend(backend)
+    config = tiny.config() if backend == "hashgrid" else made.config_type()
+    info = MapInfo(backend, to_plain(config), baked.BOUNDS, 0, True)
+    return Map(info, made.build(config, baked.BOUNDS), baked.toy(), landmarks())
+
+
+@pytest.mark.parametrize("backend", ["hashgrid", "vanilla", "adanerf"])
+def test_every_tensor_of_a_map_moves(backend: str) -> None:
+    stored = whole_map(backend)
+    with Elsewhere():
+        there = stored.to(DEVICE)
+        assert elsewhere_of(there, DEVICE) == []
+        assert elsewhere_of(Localizer(there, "bid").scene, DEVICE) == []  # what is cached lies there too
+        assert sum(1 for _ in tensors_in(there)) >= sum(1 for _ in tensors_in(stored))
+    assert elsewhere_of(stored, CPU) == []
+
+
+def test_what_moves_has_the_same_values() -> None:
+    stored = whole_map("hashgrid")
+    with Elsewhere():
+        there = stored.to(DEVICE)
+        found = {path: part.cpu() for path, part in tensors_in(there)}
+    compared = [torch.equal(found[path], part) for path, part in tensors_in(stored) if path in found]
+    assert len(compared) > 20
+    assert all(compared)
+
+
+def test_what_lies_there_already_is_not_copied() -> None:
+    stored = whole_map("hashgrid")
+    assert stored.to("cpu") is stored
+    assert stored.surface is not None
+    assert stored.surface.to(CPU) is stored.surface
+    assert landmarks().to("cpu") is landmarks()
+    assert Localizer(stored, "bid", device="cpu", warm_up=False).scene is stored
+
+
+def test_parts_may_be_missing_and_a_field_that_cannot_move_is_refused() -> None:
+    bare = FieldMap(module_fields.field(), baked.BOUNDS)
+    with Elsewhere():
+        assert elsewhere_of(Localizer(bare, "bid", device=DEVICE, warm_up=False).scene, DEVICE) == []
+    ball = FieldMap(HomogeneousBall(0.5, 10.0), baked.BOUNDS)
+    with pytest.raises(InputError, match=r"HomogeneousBall, expected an nn\.Module"):
+        Localizer(ball, "bid", device="cpu")
+
+
+@dataclass(frozen=True, eq=False)
+class Nested:
+    given: list[Tensor]
+    named: dict[str, tuple[Tensor, int]]
+    module: nn.Module
+    derived: Tensor = field(init=False)
+    nothing: None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "derived", 2 * self.given[0])
+
+
+def nested() -> Nested:
+    return Nested([torch.ones(2)], {"a": (torch.zeros(3), 5)}, nn.Linear(2, 2))
+
+
+def test_tensors_move_wherever_they_are_held() -> None:
+    here = nested()
+    with Elsewhere():
+        there = moved(here, DEVICE)
+        assert elsewhere_of(there, DEVICE) == []
+        assert sum(1 for _ in tensors_in(there)) == 5
+    assert elsewhere_of(here, CPU) == []
+    assert there.named["a"][1] == 5
+
+
+@pytest.mark.parametrize(
+    "part", ["surface.surfels.rgb", "landmarks.cones", "field.heads", "surface.index.level"]
+)
+def test_a_tensor_that_is_forgotten_is_named(part: str) -> None:
+    with Elsewhere():
+        there = whole_map("vanilla").to(DEVICE)
+        holder: Any = there
+        *way, name = part.split(".")
+        for step in way:
+            holder = getattr(holder, step)
+        object.__setattr__(holder, name, torch.zeros(3))
+        assert elsewhere_of(there, DEVICE) == [f"map.{part}"]
+
+
+@pytest.mark.parametrize("device", ["mars", "cuda:99", "cpu:5", "meta", ""])
+def test_a_device_that_does_not_work_is_named(device: str) -> None:
+    message = re.escape(f"device {str(device)!r} does not work here")
+    stored = whole_map("vanilla")
+    assert stored.surface is not None
+    for move in (stored.to, stored.surface.to, landmarks().to):
+        with pytest.raises(InputError, match=message):
+            move(device)

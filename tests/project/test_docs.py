@@ -1,0 +1,335 @@
+"""The documentation is true: its programs run, its commands parse, its tables are complete, and it builds without a warning."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.util
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+import tyro
+
+import bidnerf_core
+import docs_workspace
+import tiny
+from bidnerf_core import Localization, Localizer, Map, Outcome
+from bidnerf_core.cli import COMMANDS, main
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import residuals
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, ByColourConfig, Problem, settings_of
+from bidnerf_core.localization.auto import auto
+from bidnerf_core.localization.settings import ColourRefinementSettings
+from bidnerf_core.maps import MapInfo
+from bidnerf_core.registry import registered
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.training import Silent
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+NOT_RUN: dict[tuple[str, str], str] = {
+    (
+        "embedding.md",
+        "from bidnerf_core import ServiceClient",
+    ): "asks a running service; tests/service/test_service.py does",
+    ("maps.md", "from bidnerf_core import find_poses"): "needs photos that overlap, and seconds for each",
+}
+"""Python blocks that are not executed, by page and first line, each with the reason."""
+TOO_SLOW = {
+    "train",
+    "poses",
+    "demo",
+    "evaluate",
+    "compare",
+    "report",
+    "import",
+    "serve",
+    "view",
+    "extend",
+    "scale",
+}
+"""Commands that are only parsed: they take minutes, or the results of one that does, files of a plugin's, or run until stopped."""
+OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest", "curl"}
+"""Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""
+LANGUAGES = {"python", "sh", "toml", "bibtex", "text"}
+
+
+@dataclass(frozen=True)
+class Block:
+    language: str
+    text: str
+    line: int  # of its first line in the page
+
+
+def blocks(page: Path, language: str | None = None) -> list[Block]:
+    """Return the fenced blocks of a page."""
+    text = page.read_text(encoding="utf-8")
+    found = [Block(m[1], m[2], text[: m.start(2)].count("\n") + 1) for m in FENCE.finditer(text)]
+    return [block for block in found if language is None or block.language == language]
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """Yield the words of each command in the page's shell blocks, without comments."""
+    for block in blocks(page, "sh"):
+        for line in block.text.replace("\\\n", " ").splitlines():
+            for part in line.split("&&"):
+                if words := shlex.split(part, comments=True):
+                    yield words
+
+
+def each(pages: list[Path]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("page", pages, ids=[page.stem for page in pages])
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("docs")
+    docs_workspace.fill(folder)
+    return folder
+
+
+@pytest.fixture
+def inside(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the workspace as the current folder, so that no page depends on the files of another."""
+    copy = shutil.copytree(workspace, tmp_path / "workspace")
+    monkeypatch.chdir(copy)
+    return Path(copy)
+
+
+@pytest.fixture
+def quick_auto(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Method ``auto`` with few hypotheses and one round: that it finds poses is tested elsewhere."""
+    steps = ColourRefinementSettings(coarse_steps=1, coarse_rays=32, fine_steps=1, fine_rays=64)
+
+    def quick(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
+        few = dataclasses.replace(
+            config, points=200, hypotheses=8, rounds=1, refine_rays=64, by_colour=ByColourConfig(steps)
+        )
+        return auto(problem, few, seed)
+
+    monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(METHODS["auto"], solve=quick))
+    # Other processes take the real one.
+    monkeypatch.setattr("bidnerf_core.evaluation.trials.registered_names", tuple)
+
+
+def given(page: Path) -> dict[str, Any]:
+    """Return what a page says that its reader has: for the loop, a sensor and its camera."""
+    if page.stem != "embedding":
+        return {}
+    moments = [
+        (v.frame.rgb, (v.frame.depth * 1000).int().numpy().astype("uint16"), SE3.identity())
+        for v in tiny.views(2)
+    ]
+    return {"sensor": moments, "camera": tiny.CAMERA}
+
+
+def executed(page: Path) -> dict[str, Any]:
+    """Run the page's Python blocks one after the other in one namespace, and return it."""
+    module = ModuleType(f"docs_{page.stem.replace('-', '_')}")
+    sys.modules[module.__name__] = module  # where dataclasses look for the names of annotations
+    namespace = vars(module)
+    namespace.update(given(page))
+    for block in blocks(page, "python"):
+        if (page.name, block.text.splitlines()[0]) not in NOT_RUN:
+            padded = "\n" * (block.line - 1) + block.text  # errors then name the line of the page
+            exec(compile(padded, str(page), "exec"), namespace)
+    return namespace
+
+
+@pytest.mark.slow
+@each([page for page in PAGES if blocks(page, "python")])
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.usefixtures("quick_auto")
+def test_python_blocks_run(page: Path, inside: Path) -> None:
+    with patch.dict(residuals.DEPTH_RESIDUALS), patch.dict(registered):  # what a page registers ends with it
+        executed(page)
+
+
+def test_blocks_that_are_not_run_exist() -> None:
+    found = {(page.name, block.text.splitlines()[0]) for page in PAGES for block in blocks(page, "python")}
+    assert set(NOT_RUN) <= found
+
+
+def test_blocks_are_of_known_languages() -> None:
+    found = {page.name: {block.language for block in blocks(page)} - LANGUAGES for page in PAGES}
+    assert {name: unknown for name, unknown in found.items() if unknown} == {}
+    for page in PAGES:
+        for block in blocks(page, "toml"):
+            tomllib.loads(block.text)
+
+
+@pytest.mark.slow
+@each([page for page in PAGES if any(words[0] == "bidnerf" for words in commands(page))])
+@pytest.mark.usefixtures("quick_auto")
+def test_bidnerf_commands_work(page: Path, inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that are quick are run on tiny files; the others are parsed."""
+    parsers = {True: tyro.cli, False: parsed_only(tyro.cli)}
+    for program, *arguments in commands(page):
+        if program == "bidnerf":
+            monkeypatch.setattr(tyro, "cli", parsers[arguments[0] not in TOO_SLOW])
+            assert main(arguments) == 0, shlex.join([program, *arguments])
+
+
+def parsed_only(parser: Any) -> Any:
+    """Return tyro's parser such that it does not call what it parsed the arguments for."""
+
+    def cli(function: Any, *rest: Any, **options: Any) -> Any:
+        @functools.wraps(function)
+        def nothing(*_: Any, **__: Any) -> Callable[[], None]:
+            return lambda: None
+
+        return parser(nothing, *rest, **options)
+
+    return cli
+
+
+def test_other_commands_name_what_exists() -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    unknown = [
+        f"{page.name}: {shlex.join(c)}" for page in PAGES for c in commands(page) if not exists(c, targets)
+    ]
+    assert unknown == []
+
+
+def exists(command: list[str], targets: set[str]) -> bool:
+    """Return whether a command of the documentation names a target, an extra or a file that there is."""
+    program, *arguments = command
+    if program == "make":
+        return set(arguments) <= targets
+    if program == "pip":
+        return extras(arguments) <= {*PROJECT["optional-dependencies"], "test"}
+    if program == "cp":
+        return (ROOT / arguments[1]).exists()
+    if program == "python":
+        return (ROOT / arguments[0]).is_file()
+    return program in {"bidnerf", *OTHER_PROGRAMS}
+
+
+def extras(arguments: list[str]) -> set[str]:
+    return {name for word in arguments for name in re.findall(r"\[([\w,]+)\]", word)}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_auto")
+def test_the_backend_of_the_readme_trains_and_localizes(inside: Path) -> None:
+    namespace = executed(ROOT / "README.md")
+    backend, scene, views = namespace["backend"], demo_object(), tiny.views(16)
+    config = namespace["FogConfig"](cells=24, steps=120)
+    field = backend.build(config, scene.bounds)
+    backend.train(field, views, config, Silent())
+    stored = Map(MapInfo("fog", {}, scene.bounds, config.steps, complete=True), field.requires_grad_(False))
+    (unseen,) = tiny.views(1, seed=5)
+    start = perturb(unseen.T_ref_camera, 0.3, 8.0, seed=0)
+    settings = settings_of("bid", {"rays": 512, "max_steps": 80})
+    found = Localizer(stored, "bid", settings)(unseen.frame, start)
+    before, after = (
+        float(pose_error(T, unseen.T_ref_camera).translation) for T in (start, found.T_world_camera)
+    )
+    assert after < 0.5 * before
+
+
+def test_readme_is_short() -> None:
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 120
+    program = blocks(ROOT / "README.md", "python")[0].text
+    assert len(program.splitlines()) <= 8
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    targets = re.findall(r"\]\(([^)#]+)", (ROOT / "README.md").read_text())
+    assert targets
+    assert [target for target in targets if not (ROOT / target).exists()] == []
+
+
+def test_every_outcome_has_advice_in_the_words_of_the_code() -> None:
+    text = (ROOT / "docs" / "troubleshooting.md").read_text()
+    assert {*Outcome} - {Outcome.CONVERGED} == {*ADVICE}
+    for outcome, advice in ADVICE.items():
+        section = " ".join(text.partition(f"\n### {outcome}\n")[2].partition("\n##")[0].split())
+        assert advice.first in section, outcome
+        assert advice.meaning.rstrip(".") in section, outcome
+
+
+def test_commands_and_methods_are_documented() -> None:
+    table = set(re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "reference.md").read_text(), re.MULTILINE))
+    assert set(COMMANDS) <= table
+    methods = (ROOT / "docs" / "methods.md").read_text()
+    assert [name for name in METHODS if f"<!-- settings of {name} -->" not in methods] == []
+
+
+@pytest.fixture(scope="module")
+def tables() -> Any:
+    """The module that makes tables from records; the documentation's folder is no package."""
+    spec = importlib.util.spec_from_file_location("docs_tables", ROOT / "docs" / "tables.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_tables_are_those_of_the_records(tables: Any) -> None:
+    outdated = [page.name for page in PAGES if tables.rendered(page.read_text()) != page.read_text()]
+    assert outdated == [], "run python docs/tables.py"
+
+
+def test_every_table_is_on_a_page(tables: Any) -> None:
+    shown = {found[2] for page in PAGES for found in tables.BLOCK.finditer(page.read_text())}
+    assert shown == set(tables.TABLES)
+
+
+def test_tables_follow_their_records(tables: Any, tmp_path: Path) -> None:
+    record = json.loads((tables.RECORDS / "faults_foreign.json").read_text())
+    record["results"]["all"]["converged"] = 17
+    (tmp_path / "faults_foreign.json").write_text(json.dumps(record))
+    for other in tables.RECORDS.glob("*.json"):
+        if not (tmp_path / other.name).exists():
+            (tmp_path / other.name).symlink_to(other)
+    page = (ROOT / "docs" / "results.md").read_text()
+    (changed,) = set(tables.rendered(page, tmp_path).splitlines()) - set(page.splitlines())
+    assert "of another scene | 400 | 17 |" in changed
+
+
+@pytest.mark.slow
+def test_site_builds_strictly_and_needs_no_network(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="the documentation's tools are not installed")
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",  # not with --quiet, which drops the warnings before they are counted
+        "--site-dir",
+        str(tmp_path / "site"),
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) >= len(PAGES)
+    fetched = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=\"?(?:https?:)?//[^\s\">]+")
+    assert {hit for page in pages for hit in fetched.findall(page.read_text())} == set()
+    methods = (tmp_path / "site" / "methods.html").read_text()
+    assert "<!-- settings of" not in methods
+    assert "<code>surface_sigma</code>" in methods
+    reference = (tmp_path / "site" / "reference.html").read_text()
+    described = {
+        name for name, home in public_homes().items() if f'id="bidnerf_core.{home}.{name}"' in reference
+    }
+    assert sorted(set(bidnerf_core.__all__) - described) == []

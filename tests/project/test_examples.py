@@ -1,0 +1,47 @@
+"""Every example runs as its first lines say."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+from bidnerf_core import registry
+from bidnerf_core.fields import residuals
+
+pytestmark = pytest.mark.slow
+
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
+QUICK = {"--steps": "12", "--descent": "3", "--trials": "2"}
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+def test_example_runs(
+    example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In this process: each process of its own would import PyTorch and its compiler anew."""
+    text = example.read_text()
+    words = [word for option, value in QUICK.items() if f'"{option}"' in text for word in (option, value)]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(example), *words])
+    monkeypatch.setattr(registry, "registered", dict(registry.registered))
+    before = dict(residuals.DEPTH_RESIDUALS)
+    try:
+        runpy.run_path(str(example), run_name="__main__")
+    finally:
+        residuals.DEPTH_RESIDUALS.clear()
+        residuals.DEPTH_RESIDUALS.update(before)
+    printed = capsys.readouterr().out
+    assert "off by" in printed or "success" in printed
+
+
+def test_examples_are_short_and_import_the_door_alone() -> None:
+    texts = {example.name: example.read_text() for example in EXAMPLES}
+    assert {name: len(text.splitlines()) for name, text in texts.items() if len(text.splitlines()) > 40} == {}
+    assert [name for name, text in texts.items() if "import bidnerf_core as bn" not in text] == []
+    others = re.compile(r"from bidnerf_core|bidnerf_core\.")
+    assert [name for name, text in texts.items() if others.search(text)] == []

@@ -1,0 +1,90 @@
+"""Packages are imported by their faces: what each offers is named in the stub of its ``__init__``, the rest is its own affair."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CORE = ROOT / "bidnerf_core"
+PACKAGES = sorted(face.parent.name for face in CORE.glob("*/__init__.py"))
+OUTSIDE = ("backends", "plugins", "benchmarks", "examples", "docs", "tests")
+REASON = re.compile(r"^# Inside: .{10,}", re.MULTILINE)
+"""How a test file says why it needs parts that its package does not offer."""
+
+EXCEPTIONS = {
+    "benchmarks/paper_tables.py": "shows the progress of the command line",
+}
+"""Files that may import from within packages of which they are no part, with the reason."""
+
+
+def sources() -> Iterator[Path]:
+    for folder in ("bidnerf_core", *OUTSIDE):
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            if not any(part.startswith(".") for part in file.relative_to(ROOT).parts):
+                yield file
+
+
+def deep_imports(code: str) -> Iterator[tuple[str, str]]:
+    """Yield the package and the module of each import from within a package."""
+    for node in ast.walk(ast.parse(code)):
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        if isinstance(node, ast.ImportFrom) and (node.module or "").count(".") == 1:
+            names = [
+                f"{node.module}.{name.name}" for name in node.names if _is_module(node.module, name.name)
+            ]
+        if isinstance(node, ast.Import):
+            names = [name.name for name in node.names]
+        for name in names:
+            _, package, *inner = [*name.split("."), ""]
+            if name.startswith("bidnerf_core.") and package in PACKAGES and any(inner):
+                yield package, name
+
+
+def _is_module(package: str | None, name: str) -> bool:
+    place = ROOT.joinpath(*(package or "").split("."), name)
+    return name not in _offered(str(package)) and (place.with_suffix(".py").exists() or place.is_dir())
+
+
+def _offered(package: str) -> set[str]:
+    stub = ROOT.joinpath(*package.split("."), "__init__.pyi")
+    return set(re.findall(r" as (\w+)$", stub.read_text(), re.MULTILINE)) if stub.exists() else set()
+
+
+def test_other_packages_plugins_and_tests_import_from_faces() -> None:
+    """A package's own modules import each other, and its tests may, if they say why; nobody else does."""
+    found = {}
+    for file in sources():
+        name, code = file.relative_to(ROOT).as_posix(), file.read_text(encoding="utf-8")
+        own = name.split("/")[1] if name.startswith(("bidnerf_core/", "tests/")) else None
+        deep = sorted({module for package, module in deep_imports(code) if package != own})
+        if deep and name not in EXCEPTIONS:
+            found[name] = deep
+    assert found == {}
+
+
+def test_tests_say_why_they_need_parts_that_are_not_offered() -> None:
+    silent = [
+        file.relative_to(ROOT).as_posix()
+        for file in sorted((ROOT / "tests").rglob("*.py"))
+        if any(deep_imports(code := file.read_text(encoding="utf-8"))) and not REASON.search(code)
+    ]
+    assert silent == []
+
+
+def test_exceptions_are_needed() -> None:
+    assert [name for name in EXCEPTIONS if not any(deep_imports((ROOT / name).read_text()))] == []
+
+
+@pytest.mark.parametrize("package", [*(name for name in PACKAGES if name != "cli"), ""])
+def test_what_a_face_names_is_there(package: str) -> None:
+    face = importlib.import_module(".".join(filter(None, ["bidnerf_core", package])))
+    assert [name for name in face.__all__ if not hasattr(face, name)] == []
+    assert set(face.__all__) == _offered(face.__name__)
+    with pytest.raises(AttributeError, match="missing"):
+        _ = face.missing

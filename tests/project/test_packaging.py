@@ -1,0 +1,145 @@
+"""What is built and installed is what was meant: not the checkout, but the wheel."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+BACKENDS = PROJECT["entry-points"]["bidnerf.backends"]
+PACKAGES = ["bidnerf_core", *sorted({value.partition(":")[0] for value in BACKENDS.values()})]
+
+
+@dataclass(frozen=True)
+class Built:
+    sdist: Path
+    wheel: Path
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """A source archive, and the wheel that is built from that archive alone: by ``make wheels``, or now."""
+    made = os.environ.get("BIDNERF_WHEELS")
+    out = Path(made or tmp_path_factory.mktemp("dist"))
+    if not made:
+        _quietly([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)])
+    (sdist,), (wheel,) = out.glob("bidnerf-*.tar.gz"), out.glob("bidnerf-*.whl")
+    return Built(sdist, wheel)
+
+
+@pytest.fixture(scope="module")
+def installed(built: Built, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder into which the wheel was installed, not editable."""
+    target = tmp_path_factory.mktemp("installed")
+    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-compile"]
+    _quietly([*pip, "--target", str(target), str(built.wheel)])
+    return target
+
+
+def _quietly(command: list[str], **options: object) -> str:
+    """Standard output of a command; what it said, where it fails."""
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, **options)  # type: ignore[call-overload]
+    assert done.returncode == 0, done.stdout + done.stderr
+    return str(done.stdout)
+
+
+def _python(installed: Path, *arguments: str) -> str:
+    """Run Python with the installed wheel and the dependencies, but not the checkout.
+
+    ``-S`` leaves out the ``.pth`` file by which an editable install puts the checkout on the path.
+    """
+    dependencies = [entry for entry in sys.path if entry.endswith(("site-packages", "dist-packages"))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), *dependencies])}
+    return _quietly([sys.executable, "-S", *arguments], cwd=installed, env=environment)
+
+
+def _inside(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+def _sources(package: str) -> set[str]:
+    """Files of an import package as the wheel should hold them."""
+    folder = next(f for f in (ROOT / package, ROOT / "backends" / package) if f.is_dir())
+    files = (f for f in folder.rglob("*") if f.is_file() and "__pycache__" not in f.parts)
+    return {f.relative_to(folder.parent).as_posix() for f in files}
+
+
+def test_the_wheel_holds_the_import_packages_and_nothing_else(built: Built) -> None:
+    names = _inside(built.wheel)
+    code = {name for name in names if ".dist-info/" not in name}
+    assert {name.partition("/")[0] for name in code} == set(PACKAGES)
+    assert code == set().union(*map(_sources, PACKAGES))
+    assert any(name.endswith("/LICENSE") for name in names)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_type_checkers_are_told_that_there_are_types(built: Built, package: str) -> None:
+    assert f"{package}/py.typed" in _inside(built.wheel)
+
+
+def test_the_source_archive_can_be_worked_with(built: Built) -> None:
+    with tarfile.open(built.sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    expected = ["README.md", "LICENSE", "CHANGELOG.md", "Makefile", "constraints.txt", "tests/conftest.py"]
+    assert names.issuperset(expected)
+    assert names.issuperset(f"backends/{name}" for package in PACKAGES[1:] for name in _sources(package))
+
+
+def test_an_installed_wheel_offers_and_loads_its_backends(installed: Path) -> None:
+    program = (
+        "import json\n"
+        "from bidnerf_core import registry\n"
+        "from bidnerf_core.backend import load_backend\nfrom bidnerf_core.registry import list_plugins\n"
+        "mine = [i for i in list_plugins('backends') if i.distribution == 'bidnerf']\n"
+        "loaded = {i.name: type(load_backend(i.name)).__module__ for i in mine}\n"
+        "print(json.dumps([registry.__file__, [[i.name, i.value, i.fault] for i in mine], loaded]))"
+    )
+    place, listed, loaded = json.loads(_python(installed, "-c", program))
+    assert Path(place).is_relative_to(installed)
+    assert listed == [[name, value, None] for name, value in sorted(BACKENDS.items())]
+    assert set(loaded) == set(BACKENDS)
+
+
+def test_the_folder_of_the_backends_is_no_package(installed: Path) -> None:
+    assert not (installed / "backends").exists()
+    assert not (ROOT / "backends" / "__init__.py").exists()
+    program = (
+        "import importlib.util as u; print([n for n in ('backends', 'tests', 'plugins') if u.find_spec(n)])"
+    )
+    assert _python(installed, "-c", program).strip() == "[]"
+
+
+def test_the_command_is_installed(installed: Path) -> None:
+    listed = json.loads(_python(installed, str(installed / "bin" / "bidnerf"), "backends", "--json"))
+    assert set(BACKENDS) <= {entry["name"] for entry in listed}
+
+
+def test_every_bundled_backend_is_packaged_and_declared() -> None:
+    """A new folder under backends/ needs an entry point and a line under the wheel's packages; both are easily forgotten."""
+    folders = {f.parent.name for f in (ROOT / "backends").glob("*/__init__.py")}
+    assert folders == set(PACKAGES[1:])
+
+
+def test_what_is_required_is_pinned() -> None:
+    """``constraints.txt`` has an exact version of each requirement of the core, of the tests and of the demo."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines if "==" in line}
+    extras = PROJECT["optional-dependencies"]
+    required = [*PROJECT["dependencies"], *extras["dev"], *extras["plots"], *extras["cluster"]]
+    names = {re.split(r"[\[>=]", entry)[0] for entry in required}
+    assert {name.lower().replace("_", "-") for name in names} <= pinned

@@ -1,0 +1,120 @@
+"""The distributions under plugins/ are installed as a stranger's would be, and found. ``.ci/wheels`` runs their own tests."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+ROOT = Path(__file__).parents[2]
+PLUGINS = sorted(file.parent for file in (ROOT / "plugins").glob("*/pyproject.toml"))
+BUNDLED = {folder.name for folder in (ROOT / "backends").iterdir()}
+
+every_plugin = pytest.mark.parametrize("plugin", PLUGINS, ids=lambda plugin: plugin.name)
+
+
+def quietly(command: list[str], **options: object) -> str:
+    """Standard output of a command; what it said, where it fails."""
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, **options)  # type: ignore[call-overload]
+    assert done.returncode == 0, done.stdout + done.stderr
+    return str(done.stdout)
+
+
+def installed(sources: list[Path], target: Path) -> dict[str, str]:
+    """Install folders or wheels; the environment in which they are found."""
+    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index"]
+    quietly([*pip, "--target", str(target), *map(str, sources)])
+    path = os.pathsep.join(filter(None, [str(target), os.environ.get("PYTHONPATH")]))
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def copied(plugin: Path, folder: Path) -> Path:
+    junk = shutil.ignore_patterns("__pycache__", ".*", "build", "dist", "*.egg-info")
+    return Path(shutil.copytree(plugin, folder / plugin.name, ignore=junk))
+
+
+def run_tests(source: Path, environment: dict[str, str]) -> str:
+    """Run those of a distribution's own tests that train nothing; ``.ci/wheels`` runs all, beside the installed wheel."""
+    pytest_ = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(source)]
+    untrained = ["-k", "not training and not query and not samples and not renders"]
+    return quietly([*pytest_, *untrained, str(source / "tests")], cwd=source, env=environment)
+
+
+def declared(source: Path) -> set[tuple[str, str]]:
+    """Return the group and the name of each entry point."""
+    groups = tomllib.loads((source / "pyproject.toml").read_text())["project"]["entry-points"]
+    return {(group.removeprefix("bidnerf."), name) for group, names in groups.items() for name in names}
+
+
+def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
+    """Return the distribution of every plugin that is found and has no fault, by group and name."""
+    program = "from bidnerf_core.cli import main; main(['plugins', '--json'])"
+    listed = json.loads(quietly([sys.executable, "-c", program], env=environment))
+    return {(e["group"], e["name"]): e["distribution"] for e in listed if e["fault"] is None}
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], str]:
+    """What is offered where all plugins are installed: the wheels that ``make wheels`` made, or copies of their folders.
+
+    Copies, so that nothing is written into the checkout.
+    """
+    folder = tmp_path_factory.mktemp("plugins")
+    if wheels := os.environ.get("BIDNERF_WHEELS"):
+        sources = [*Path(wheels).glob("bidnerf_*.whl")]
+    else:
+        sources = [copied(plugin, folder) for plugin in PLUGINS]
+    return offered(installed(sources, folder / "site"))
+
+
+@every_plugin
+def test_a_plugin_is_found(plugin: Path, found: dict[tuple[str, str], str]) -> None:
+    points = declared(plugin)
+    assert {point: found.get(point) for point in points} == dict.fromkeys(points, plugin.name)
+
+
+@every_plugin
+def test_a_plugin_is_typed_and_knows_the_core_only(plugin: Path) -> None:
+    packages = [file.parent for file in plugin.glob("*/__init__.py")]
+    assert packages
+    for package in packages:
+        assert (package / "py.typed").is_file()
+        for file in package.rglob("*.py"):
+            assert not imported(file) & BUNDLED, file
+
+
+def imported(file: Path) -> set[str]:
+    """Top-level names of what a file imports."""
+    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    plain = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    return {
+        name.partition(".")[0]
+        for name in plain | {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}
+    }
+
+
+def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:
+    """The commands of its README, word for word."""
+    if shutil.which("perl") is None:
+        pytest.skip("perl is not installed")
+    checkout = tmp_path / "bidnerf"
+    template = copied(ROOT / "plugins" / "bidnerf-template", checkout / "plugins")
+    commands = re.findall(r"```sh\n(.*?)```", (template / "README.md").read_text(), re.DOTALL)[0]
+    quietly(["sh", "-e", "-c", commands], cwd=checkout)
+    mine = tmp_path / "bidnerf-mine"
+    text = "".join(file.read_text() for file in mine.rglob("*") if file.suffix in (".py", ".toml"))
+    assert "template" not in text.lower()
+    environment = installed([mine], tmp_path / "site")
+    assert offered(environment)["backends", "mine"] == "bidnerf-mine"
+    assert "passed" in run_tests(mine, environment)

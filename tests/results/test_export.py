@@ -1,0 +1,111 @@
+"""Maps for other software: what is written is what other readers and our own find again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import bidnerf_core as bn
+from bidnerf_core.captures import stored_cameras
+from bidnerf_core.datasets.transforms_json import read_frames
+from bidnerf_core.errors import InputError
+from bidnerf_core.io import read_record
+from bidnerf_core.maps import Map, MapInfo
+from bidnerf_core.registry import PluginError, registered
+from bidnerf_core.testing import BOUNDS, textured_map, training_views
+
+
+@pytest.fixture(scope="module")
+def scene() -> Map:
+    known = textured_map(surface=True)
+    info = MapInfo(
+        "ground", {}, BOUNDS, 1, True, "ground", weights="w", cameras=stored_cameras(training_views()), unit="metres"
+    )  # fmt: skip
+    return Map(info, known.field, known.surface, known.landmarks)
+
+
+def read_ply(file: Path) -> tuple[list[str], np.ndarray]:
+    head, _, body = file.read_bytes().partition(b"end_header\n")
+    lines = head.decode().splitlines()
+    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
+    kinds = {"float": "<f4", "uchar": "u1", "int": "<i4"}
+    end = next((n for n, line in enumerate(lines) if line.startswith("element face")), len(lines))
+    row = [(word[2], kinds[word[1]]) for word in map(str.split, lines[:end]) if word[0] == "property"]
+    return lines, np.frombuffer(body, np.dtype(row), count)
+
+
+def test_point_clouds(scene: Map, tmp_path: Path) -> None:
+    files = bn.export_map(scene, tmp_path / "out", "ply")
+    assert [file.name for file in files] == ["cameras.json", "cameras.ply", "landmarks.ply", "surface.ply"]
+    assert scene.surface is not None
+    assert scene.landmarks is not None
+    lines, surface = read_ply(files[3])
+    assert "comment lengths in metres" in lines
+    places = np.stack([surface[axis] for axis in "xyz"], axis=-1)
+    np.testing.assert_array_equal(places, scene.surface.surfels.positions.numpy())
+    assert np.abs(surface["red"] / 255 - scene.surface.surfels.rgb[:, 0].numpy()).max() < 0.01
+    _, landmarks = read_ply(files[2])
+    assert landmarks["photos"].tolist() == scene.landmarks.views.tolist()
+    _, cameras = read_ply(files[1])
+    centre = scene.info.cameras[1].pose.translation
+    np.testing.assert_allclose([cameras[axis][5] for axis in "xyz"], centre, atol=1e-6)
+
+
+def test_transforms_json_is_read_again(scene: Map, tmp_path: Path) -> None:
+    bn.export_map(scene, tmp_path / "out", "transforms.json")
+    frames = read_frames(read_record(tmp_path / "out" / "transforms.json"))
+    assert {frame.unit for frame in frames} == {scene.unit}
+    for frame, camera in zip(frames, scene.info.cameras, strict=True):
+        assert frame.stem == camera.name
+        torch.testing.assert_close(frame.T_world_camera.matrix(), camera.pose.matrix(), atol=1e-9, rtol=0)
+    content = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert content["unit"] == "metres"
+    assert (tmp_path / "out" / content["ply_file_path"]).exists()
+
+
+def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    bn.export_map(scene, tmp_path / "out", "colmap")
+    model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    assert scene.landmarks is not None
+    assert len(model.points3D) == len(scene.landmarks)
+    np.testing.assert_allclose(model.points3D[1].xyz, scene.landmarks.positions[0], atol=1e-6)
+    assert model.images[1].name == scene.info.cameras[0].name
+
+
+def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:
+    bare = replace(scene, info=replace(scene.info, cameras=()), surface=None, landmarks=None)
+    with pytest.raises(InputError, match=r"no cameras, but \w+ needs some"):
+        bn.export_map(bare, tmp_path / "out", "colmap")
+    with pytest.raises(InputError, match="no surface, landmarks or cameras"):
+        bn.export_map(bare, tmp_path / "out", "ply")
+    with pytest.raises(InputError, match="format 'obj', expected one of ply"):
+        bn.export_map(scene, tmp_path / "out", "obj")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        bn.export_map(scene, tmp_path / "full", "ply")
+
+
+def test_a_registered_exporter_gets_the_map(
+    scene: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(map_: Map, out: Path) -> list[Path]:
+        (out / "count.txt").write_text(str(len(map_.landmarks or ())))
+        return [out / "count.txt"]
+
+    monkeypatch.setitem(registered, ("exporters", "count"), write)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    (file,) = bn.export_map(scene, tmp_path / "out", "count", overwrite=True)
+    assert scene.landmarks is not None
+    assert file.read_text() == str(len(scene.landmarks))
+
+    monkeypatch.setitem(registered, ("exporters", "count"), lambda: None)
+    with pytest.raises(PluginError, match="not an exporter: it does not take"):
+        bn.export_map(scene, tmp_path / "out", "count", overwrite=True)

@@ -1,0 +1,171 @@
+"""Pictures: their sizes, what they show, and that odd input is drawn or refused but never garbled."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import convergence_plot
+from bidnerf_core.results import PoseError, as_picture, depth_to_rgb, save_gif, tile
+from bidnerf_core.results.overlays import NO_DEPTH, blend, chequered, comparison, edges
+
+
+def disc(column: float, size: int = 40) -> torch.Tensor:
+    """An orange disc on white (h w 3), its middle at ``column``."""
+    v, u = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    inside = ((u - column) ** 2 + (v - size / 2) ** 2 < 100)[..., None]
+    return torch.where(inside, torch.tensor([0.88, 0.52, 0.12]), torch.ones(3))
+
+
+def test_as_picture_takes_what_there_is() -> None:
+    image = disc(20)
+    expected = (image.numpy() * 255 + 0.5).astype(np.uint8)
+    for same in (image, image.double(), image.clone().requires_grad_(), image.numpy(), expected):
+        assert np.array_equal(as_picture(same), expected)
+    grey = as_picture(torch.tensor([[0.0, 0.5], [1.0, 2.0]]))
+    assert grey.shape == (2, 2, 3)
+    assert grey[..., 0].tolist() == [[0, 128], [255, 255]]
+
+
+def test_what_is_not_finite_is_clipped() -> None:
+    odd = torch.tensor([[[float("nan"), float("inf"), -float("inf")], [-1.0, 2.0, 0.5]]])
+    assert as_picture(odd).tolist() == [[[0, 255, 0], [0, 255, 128]]]
+    assert comparison(*[torch.full((8, 8, 3), float("nan"))] * 3).dtype == np.uint8
+
+
+@pytest.mark.parametrize("shape", [(0, 4, 3), (4, 0, 3), (4, 4, 4), (4,), (2, 4, 4, 3), (0, 0)])
+def test_what_is_no_image_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match="expected an image"):
+        as_picture(torch.zeros(shape))
+
+
+def test_a_comparison_is_six_tiles() -> None:
+    picture = comparison(disc(20), disc(10), disc(20))
+    one = tile(disc(20), "a")
+    assert picture.shape == (2 * one.shape[0], 3 * one.shape[1], 3)
+    assert np.array_equal(picture[: one.shape[0], : one.shape[1]][30:], one[30:])  # below the caption
+    left, right = np.split(picture[one.shape[0] + 30 :, one.shape[1] :], 2, axis=1)
+    assert not np.array_equal(left, right)
+
+
+def test_images_of_different_size_are_refused() -> None:
+    with pytest.raises(InputError, match="30x30"):
+        comparison(disc(20), disc(10, 30), disc(20))
+    with pytest.raises(InputError, match="expected the same"):
+        blend(disc(20), disc(20, 30))
+    with pytest.raises(InputError, match="frame 1"):
+        save_gif("never.gif", [disc(20), disc(20, 30)])
+
+
+def test_blend_shows_one_contour_at_the_truth_and_two_elsewhere() -> None:
+    def pink(image: np.ndarray) -> int:
+        red, green, _ = np.moveaxis(image.astype(int), -1, 0)
+        return int((red - green > 100).sum())
+
+    assert pink(blend(disc(20), disc(20))) == 0
+    assert pink(blend(disc(20), disc(12))) > 20
+
+
+def test_chequered_takes_every_pixel_from_one_of_the_two() -> None:
+    a, b = np.zeros((31, 50, 3), np.uint8), np.full((31, 50, 3), 255, np.uint8)
+    mixed = chequered(a, b)
+    assert set(np.unique(mixed)) == {0, 255}
+    assert 0.3 < mixed.mean() / 255 < 0.7
+    assert np.array_equal(chequered(a, a), a)
+    assert chequered(a[:1, :1], b[:1, :1]).shape == (1, 1, 3)
+
+
+def test_edges_are_where_the_image_changes() -> None:
+    strength = edges(disc(20))
+    assert strength.shape == (40, 40)
+    assert strength.max() == 1
+    assert strength[20, 20] == strength[0, 0] == 0
+    assert edges(np.full((5, 5, 3), 0.5)).max() == 0
+
+
+def test_small_images_are_enlarged_and_large_ones_are_not() -> None:
+    assert tile(disc(20), "small").shape[1] > 200
+    assert tile(np.zeros((300, 400, 3)), "large").shape[1] < 420
+
+
+def test_depth_goes_from_red_to_blue_and_marks_what_is_missing() -> None:
+    depth = torch.linspace(1, 4, 100).reshape(10, 10)
+    depth[0, 5], depth[1, 5], depth[2, 5], depth[3, 5] = 0, float("nan"), float("inf"), -1
+    picture = depth_to_rgb(depth)
+    assert picture.dtype == np.uint8
+    assert all(tuple(picture[row, 5]) == NO_DEPTH for row in range(4))
+    near, far = picture[0, 0].astype(int), picture[-1, -1].astype(int)
+    assert near[0] > near[2] + 50
+    assert far[2] > far[0] + 50
+    for nothing in (torch.zeros(3, 4), torch.full((3, 4), float("nan"))):
+        assert (depth_to_rgb(nothing) == NO_DEPTH).all()
+    flat = depth_to_rgb(torch.ones(3, 4))
+    assert (flat == flat[0, 0]).all()
+    for wrong in (torch.zeros(0, 4), torch.zeros(4), torch.zeros(2, 3, 3)):
+        with pytest.raises(InputError, match="depth"):
+            depth_to_rgb(wrong)
+
+
+def test_depth_of_one_scale_has_comparable_colours() -> None:
+    depth = torch.tensor([[1.0, 2.0, 3.0]])
+    wide = depth_to_rgb(torch.tensor([[2.0, 5.0, 9.0]]), near=1.0, far=9.0)
+    assert np.array_equal(depth_to_rgb(depth, near=1.0, far=9.0)[0, 1], wide[0, 0])
+
+
+def test_gif_keeps_frames_and_speed(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.gif"
+    save_gif(path, [disc(x) for x in (8, 14, 20)], fps=5)
+    frames = iio.imread(path)
+    assert frames.shape == (3, 40, 40, 3)
+    assert iio.immeta(path)["duration"] == pytest.approx(200)
+    assert iio.immeta(path)["loop"] == 0
+    assert np.abs(frames[2].astype(int) - as_picture(disc(20))).mean() < 3
+
+
+@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf")])
+def test_impossible_animations_are_refused(tmp_path: Path, fps: float) -> None:
+    with pytest.raises(InputError, match="frames a second"):
+        save_gif(tmp_path / "a.gif", [disc(20)], fps)
+    with pytest.raises(InputError, match="no frames"):
+        save_gif(tmp_path / "a.gif", [])
+    assert not (tmp_path / "a.gif").exists()
+
+
+def errors(*values: float) -> PoseError:
+    far = torch.tensor(values, dtype=torch.float64)
+    return PoseError(far, 10 * far)
+
+
+def test_convergence_plot_draws_without_a_window_or_global_state(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "new" / "plot.png"
+    convergence_plot(
+        path, {"0001": errors(1, 0.3, 0.1, 0.03), "0002": errors(1, float("nan"), 0, float("inf"))}
+    )
+    picture = iio.imread(path)
+    assert picture.shape[0] > 300
+    assert np.unique(picture.reshape(-1, picture.shape[-1]), axis=0).shape[0] > 20
+    if "matplotlib.pyplot" in sys.modules:
+        assert sys.modules["matplotlib.pyplot"].get_fignums() == []
+
+
+def test_convergence_plot_of_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    with pytest.raises(InputError, match="no traces"):
+        convergence_plot(tmp_path / "plot.png", {})
+    convergence_plot(tmp_path / "plot.png", {"empty": errors(), "zero": errors(0, 0)})
+    assert (tmp_path / "plot.png").exists()
+
+
+def test_convergence_plot_without_matplotlib_tells_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(InputError, match=r"pip install 'bidnerf\[plots\]'"):
+        convergence_plot(tmp_path / "plot.png", {"0001": errors(1, 0.1)})

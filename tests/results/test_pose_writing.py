@@ -1,0 +1,174 @@
+"""Files of poses: what is written is what the readers and scipy make of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import SE3
+from bidnerf_core.results import PosedImage, write_poses
+from bidnerf_core.results.pose_files import tum_trajectory, write_pose_transforms, write_tum
+from photo_files import noise, write_photo
+
+CAMERA = Intrinsics(20.0, 21.0, 7.0, 5.5, 16, 12, (0.01, -0.02, 0.003, 0.004))
+
+
+def poses(count: int) -> list[SE3]:
+    generator = torch.Generator().manual_seed(3)
+    tangents = torch.randn((count, 6), generator=generator, dtype=torch.float64)
+    half_turn = SE3.exp(torch.tensor([1.0, 2.0, 3.0, torch.pi, 0.0, 0.0], dtype=torch.float64))
+    return [SE3.identity().to("cpu", torch.float64), half_turn, *(SE3.exp(tangent) for tangent in tangents)]
+
+
+def images(names: list[str]) -> list[PosedImage]:
+    return [
+        PosedImage(name, number, CAMERA, pose)
+        for number, (name, pose) in enumerate(zip(names, poses(len(names) - 2), strict=True))
+    ]
+
+
+def test_a_tum_trajectory_is_what_scipy_reads(tmp_path: Path) -> None:
+    written = images([f"r_{i}" for i in range(12)])
+    write_tum(tmp_path / "poses.txt", written)
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    assert rows[:, 0].tolist() == list(range(12))
+    for row, image in zip(rows, written, strict=True):
+        np.testing.assert_allclose(row[1:4], image.T_world_camera.translation, atol=1e-10)
+        matrix = Rotation.from_quat(row[4:]).as_matrix()  # x y z w
+        np.testing.assert_allclose(matrix, image.T_world_camera.rotation, atol=1e-10)
+    assert np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1)
+
+
+def test_names_that_are_times_are_the_timestamps() -> None:
+    text = tum_trajectory(images(["1305031102.175304", "1305031102.211214"]))
+    assert [line.split()[0] for line in text.splitlines()[1:]] == ["1305031102.175304", "1305031102.211214"]
+    lines = tum_trajectory(images(["7", "x"])).splitlines()
+    assert lines[1] == "# 7"  # the name, where the time stamp is only a number
+    assert lines[2].startswith("0 ")
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_reader_finds_the_poses_and_cameras_again(orientation: int, tmp_path: Path) -> None:
+    """Photos are read upright, but ``transforms.json`` describes their files as stored: both see each point alike."""
+    stored = noise(12, 16)
+    file = write_photo(tmp_path / "photos" / "one.png", stored, orientation)
+    upright = Frame.open(file, camera=CAMERA)
+    T_world_camera = poses(1)[2]
+    (tmp_path / "out").mkdir()
+    write_pose_transforms(
+        tmp_path / "out" / "transforms.json",
+        [PosedImage("one", 0, upright.intrinsics, T_world_camera, file)],
+    )
+    (view,) = open_dataset(tmp_path / "out").views("test")
+    assert torch.equal(view.frame.rgb, torch.from_numpy(stored) / 255)
+    point = T_world_camera.apply(torch.tensor([0.2, -0.1, 1.5], dtype=torch.float64))
+    here, there = (
+        frame.intrinsics.project(pose.inverse().apply(point)).floor().long().tolist()
+        for frame, pose in ((upright, T_world_camera), (view.frame, view.T_ref_camera))
+    )
+    assert torch.equal(upright.rgb[here[1], here[0]], view.frame.rgb[there[1], there[0]])
+    assert view.frame.intrinsics.distortion == pytest.approx(CAMERA.distortion)
+
+
+def test_a_mirror_image_has_no_pose(tmp_path: Path) -> None:
+    file = write_photo(tmp_path / "one.png", noise(12, 16), 2)
+    mirrored = PosedImage("one", 0, CAMERA, SE3.identity(), file)
+    with pytest.raises(InputError, match="stored mirrored"):
+        write_pose_transforms(tmp_path / "transforms.json", [mirrored])
+    assert not (tmp_path / "transforms.json").exists()
+
+
+def timed_images(count: int) -> list[PosedImage]:
+    generator = torch.Generator().manual_seed(5)
+    roots = torch.randn((count, 6, 6), generator=generator, dtype=torch.float64)
+    return [
+        replace(image, time=104137.25 + number / 30, covariance=1e-4 * root @ root.mT)
+        for number, (image, root) in enumerate(
+            zip(images([f"f{n}" for n in range(count)]), roots, strict=True)
+        )
+    ]
+
+
+def test_a_trajectory_with_times_is_read_again(tmp_path: Path) -> None:
+    written = timed_images(8)
+    write_poses(tmp_path / "path.tum", written)
+    path = read_trajectory(tmp_path / "path.tum")
+    assert len(path) == 8
+    for place, image in enumerate(written):
+        assert float(path.times[place]) == pytest.approx(image.time, abs=1e-6)
+        found = SE3(path.rotations[place], path.translations[place]).matrix()
+        torch.testing.assert_close(found, image.T_world_camera.matrix(), atol=1e-9, rtol=0)
+
+
+def test_json_has_times_and_covariances(tmp_path: Path) -> None:
+    written = [*timed_images(4), replace(timed_images(2)[0], time=None, covariance=None)]
+    write_poses(tmp_path / "poses.json", written)
+    found = json.loads((tmp_path / "poses.json").read_text())
+    assert [entry["frame"] for entry in found] == [image.name for image in written]
+    for entry, image in zip(found, written, strict=True):
+        assert entry["time"] == image.time
+        np.testing.assert_allclose(entry["T_world_camera"], image.T_world_camera.matrix(), atol=0)
+        if image.covariance is not None:
+            np.testing.assert_allclose(entry["covariance"], image.covariance, atol=0)
+    assert found[-1]["covariance"] is None
+
+
+def test_transforms_with_times_are_a_sequence(tmp_path: Path) -> None:
+    written = timed_images(5)[::-1]
+    for image in written:
+        write_photo(tmp_path / f"{image.name}.png", noise(12, 16), 1)
+    write_poses(tmp_path / "transforms.json", [replace(i, file=tmp_path / f"{i.name}.png") for i in written])
+    sequence = open_sequence(tmp_path)
+    assert [timed.time for timed in sequence] == [image.time for image in written[::-1]]
+    for timed, image in zip(sequence, written[::-1], strict=True):
+        assert timed.truth is not None
+        torch.testing.assert_close(timed.truth.matrix(), image.T_world_camera.matrix(), atol=1e-9, rtol=0)
+
+
+def test_heads_state_the_direction_of_the_poses_and_no_unit_where_there_is_no_pose(tmp_path: Path) -> None:
+    write_poses(tmp_path / "none.tum", [])
+    assert (tmp_path / "none.tum").read_text().startswith("# timestamp tx ty tz qx qy qz qw (camera to world")
+    assert "lengths" not in (tmp_path / "none.tum").read_text()
+    image = PosedImage("a", 0, CAMERA, SE3.identity(), unit="metres")
+    write_poses(tmp_path / "images.txt", [image])
+    head = (tmp_path / "images.txt").read_text()
+    assert "world to camera" in head
+    assert "lengths in metres" in head
+    assert "camera to world" not in head
+
+
+@pytest.mark.parametrize(("unit", "written"), [("metres", "[m]"), ("units", "[units]")])
+def test_the_head_of_euroc_poses_names_the_unit_of_the_map(unit: Any, written: str, tmp_path: Path) -> None:
+    metric, asked = (
+        PosedImage(name, 0, CAMERA, SE3.identity(), unit=of) for name, of in (("a", "metres"), ("b", unit))
+    )
+    write_poses(tmp_path / "path.euroc.csv", [metric, asked])
+    head = (tmp_path / "path.euroc.csv").read_text().splitlines()[0]
+    assert head.split(",")[1:4] == [f"p_RS_R_{axis} {written}" for axis in "xyz"]
+
+
+def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError,
+        match=r"poses\.csv: expected a name that ends with transforms\.json, images\.txt, \.json, \.txt",
+    ):
+        write_poses(tmp_path / "poses.csv", images(["a", "b"]))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("given", [[SE3.identity()], SE3.identity(), images(["a", "b"])[0]])
+def test_what_is_no_list_of_posed_images_is_refused(given: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"got a \w+, expected a list of PosedImage\(name, number,"):
+        write_poses(tmp_path / "poses.txt", given)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,270 @@
+"""Results in Python: a sequence is tracked in a thread, cancelled, interrupted by its callback; poses are written and read."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+import bidnerf_core as bn
+from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome, TrackedPath
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import Photos, write_transforms
+from bidnerf_core.frames import View
+from bidnerf_core.progress import Progress
+from bidnerf_core.results import Answer, Answers, Failure, TrajectoryErrors, localize_each, within
+from bidnerf_core.testing import textured_map
+from flights import covered, flight
+
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five frames, of which the third was taken with the lens cap on."""
+    place = tmp_path_factory.mktemp("results") / "data"
+    frames = [(covered(f) if n == 2 else f, T) for n, (_, f, T) in enumerate(flight()[:FRAMES])]
+    write_transforms(place, {"test": [View(frame, T) for frame, T in frames]}, (0.0, 0.0, 0.0))
+    return place
+
+
+def scene() -> Any:
+    return textured_map(surface=True)
+
+
+def test_a_sequence_is_tracked_in_a_thread_of_any_kind(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reports, paths = list[Progress](), list[TrackedPath]()
+    with caplog.at_level(logging.INFO, "bidnerf"):
+        worker = threading.Thread(
+            target=lambda: paths.append(bn.track(scene(), folder, progress=reports.append))
+        )
+        worker.start()
+        worker.join()
+    (path,) = paths
+    assert [(report.done, report.total) for report in reports] == [(n + 1, FRAMES) for n in range(FRAMES)]
+    assert path.lost == [(2, 2)]
+    errors = path.errors()
+    assert isinstance(errors, TrajectoryErrors)
+    assert errors.poses == FRAMES - 1
+    assert errors.raw.translation_p95 < 0.02
+    assert [line for line in caplog.messages if "tracking again after 1 frame" in line]
+    path.save(folder.parent / "path.json")
+    assert [pose["converged"] for pose in json.loads((folder.parent / "path.json").read_text())] == [
+        n != 2 for n in range(FRAMES)
+    ]
+
+
+def test_a_cancelled_and_an_interrupted_tracking_leave_their_frames(folder: Path) -> None:
+    path, done = TrackedPath(), threading.Event()
+    with pytest.raises(bn.Cancelled):
+        bn.track(scene(), folder, path=path, each=lambda frame, answer: done.set(), cancel=done.is_set)
+    assert len(path) == 1
+
+    def broken(progress: Progress) -> None:
+        raise ZeroDivisionError("of the callback")
+
+    path = TrackedPath()
+    with pytest.raises(ZeroDivisionError, match="of the callback"):
+        bn.track(scene(), folder, path=path, progress=broken)
+    assert len(path) == 1
+
+
+def test_a_frame_that_cannot_be_read_is_left_out_with_a_warning(folder: Path, tmp_path: Path) -> None:
+    frames = bn.open_sequence(folder)
+
+    def damaged(place: int) -> Any:
+        raise InputError(f"{place}: damaged")
+
+    entries: Any = frames
+    entries._entries = [
+        replace(entry, read=lambda n=n: damaged(n)) if n in (1, 3) else entry
+        for n, entry in enumerate(entries._entries)
+    ]
+    with pytest.warns(InputWarning, match="left out") as caught:
+        path = bn.track(scene(), frames)
+    assert [str(each.message) for each in caught] == ["1: damaged; left out", "3: damaged; left out"]
+    assert (path.unread, [answer.number for answer in path.answers]) == (2, [0, 2, 4])
+    with pytest.raises(InputError, match="every is 0"):
+        bn.track(scene(), frames, every=0)
+
+
+def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
+    _, frame, T = flight()[0]
+    picture = bn.overlay(scene(), frame, T)
+    assert picture.dtype == np.uint8
+    assert picture.ndim == 3
+    assert picture.shape[1] > 2 * picture.shape[0]  # three tiles beside each other
+    off = bn.overlay(scene(), frame, T @ SE3.exp(torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]).double()))
+    third = picture.shape[1] // 3
+    assert np.array_equal(picture[:, :third], off[:, :third])  # the photo
+    assert not np.array_equal(picture[:, third:], off[:, third:])
+    with_start = bn.overlay(scene(), frame, T, start=T)
+    assert with_start.shape[0] > picture.shape[0]
+    assert np.array_equal(bn.overlay(scene(), frame, T.matrix().numpy()), picture)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_an_overlay_of_something_else_is_refused() -> None:
+    _, frame, T = flight()[0]
+    wrong: dict[str, tuple[Any, Any, Any]] = {
+        r"overlay: got a str, expected a Map; load_map\(folder\) gives one": ("map", frame, T),
+        "overlay: frame is a View, expected a Frame": (scene(), bn.View(frame, T), T),
+        "found is a str, expected an SE3 or a 4x4 matrix": (scene(), frame, "pose.json"),
+        r"found has shape \(3, 3\)": (scene(), frame, np.eye(3)),
+    }
+    for said, given in wrong.items():
+        with pytest.raises(InputError, match=said):
+            bn.overlay(*given)
+
+
+# Files of localizations.
+
+
+T = SE3.exp(torch.tensor([0.1, -2.0, 3.0, 0.4, -0.5, 0.6], dtype=torch.float64))
+CAMERA = bn.Intrinsics(width=4, height=3, fx=4.0, fy=4.0, cx=2.0, cy=1.5)
+FOUND = Localization(
+    T, Outcome.AMBIGUOUS, "two places fit", 2, 0.25, 0.125, "auto", SE3.stack([T, T, T]),
+    torch.tensor([0.5, 0.125]).double(), torch.eye(6).double(), 0.9, 0.25, None, CAMERA,
+)  # fmt: skip
+
+
+def test_a_localization_is_loaded_as_it_was_saved(tmp_path: Path) -> None:
+    FOUND.save(tmp_path / "found.json")
+    again = Localization.load(tmp_path / "found.json")
+    assert again.plain() | {"T_world_camera": None} == FOUND.plain() | {"T_world_camera": None}
+    torch.testing.assert_close(again.T_world_camera.matrix(), T.matrix(), rtol=0, atol=1e-12)
+    assert (again.outcome, again.intrinsics) == (Outcome.AMBIGUOUS, CAMERA)
+    torch.testing.assert_close(bn.read_pose(tmp_path / "found.json").matrix(), T.matrix(), rtol=0, atol=1e-12)
+    odd = replace(FOUND, covariance=None, loss=math.nan, confidence=None, intrinsics=None)
+    odd.save(tmp_path / "odd.json")
+    again = Localization.load(tmp_path / "odd.json")
+    assert (again.covariance, again.confidence, again.intrinsics, math.isnan(again.loss)) == (
+        None,
+        None,
+        None,
+        True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"T_world_camera": None}, "T_world_camera is null"),
+        ({"T_world_camera": [[1.0]]}, "expected 4 rows of 4 numbers"),
+        ({"T_world_camera": (2 * torch.eye(4)).tolist()}, "rigid|last row"),
+        ({"covariance": [[1.0]]}, "expected 6 rows of 6 numbers"),
+        ({"outcome": "fine"}, "no outcome 'fine'"),
+        ({"steps": "two"}, "steps: found 'two'"),
+        ({"more": 1}, "has no field 'more'"),
+    ],
+)
+def test_a_file_of_another_kind_is_no_localization(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    (tmp_path / "found.json").write_text(json.dumps(FOUND.plain() | change))
+    with pytest.raises(InputError, match=message):
+        Localization.load(tmp_path / "found.json")
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "transforms.json"])
+def test_a_pose_that_is_not_finite_is_refused_where_a_format_has_no_null(tmp_path: Path, name: str) -> None:
+    image = bn.PosedImage("a", 0, CAMERA, SE3(T.rotation, T.translation * math.nan))
+    with pytest.raises(InputError, match="the pose of a is not finite"):
+        bn.write_poses(tmp_path / name, [image])
+    bn.write_poses(tmp_path / "poses.json", [image])
+    assert json.loads((tmp_path / "poses.json").read_text())[0]["T_world_camera"] is None
+
+
+def test_errors_within_their_bound_are_as_frequent_as_the_covariance_says() -> None:
+    generator = torch.Generator().manual_seed(0)
+    root = torch.diag(torch.tensor([0.01, 0.02, 0.03, 0.001, 0.002, 0.003]).double())
+    tangents = torch.randn((4000, 6), generator=generator, dtype=torch.float64) @ root
+    true, found = SE3.exp(tangents), SE3.identity()
+    for probability in (0.5, 0.95):
+        share = float(within(found, true, root @ root, probability).double().mean())
+        assert share == pytest.approx(probability, abs=0.02)
+    assert not bool(within(T, T, torch.zeros(6, 6).double()))
+
+
+# Several queries.
+
+
+def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [tmp_path / f"{n}.png" for n in range(3)]
+    for file in (files[0], files[2]):
+        iio.imwrite(file, np.zeros((3, 4, 3), dtype=np.uint8))
+    monkeypatch.setattr(Localizer, "__call__", lambda self, *given: replace(FOUND, outcome=Outcome.CONVERGED))
+    source = Photos(files, CameraSource(CAMERA))
+    seen = list[str]()
+    answers = localize_each(
+        Localizer(scene(), warm_up=False), source, each=lambda query, answer: seen.append(answer.name)
+    )
+    assert seen == ["0", "1", "2"]
+    assert [isinstance(answer, Failure) for answer in answers.given] == [False, True, False]
+    assert len(answers.accepted) == 2
+    answers.save(tmp_path / "found.json")
+    keys = [set(found) for found in json.loads((tmp_path / "found.json").read_text())]
+    assert keys[0] == keys[1] == keys[2]
+    with pytest.raises(InputError, match="no such file"):
+        localize_each(Localizer(scene(), warm_up=False), Photos([files[1]], CameraSource(CAMERA)))
+
+
+def test_answers_in_a_format_of_poses_hold_the_accepted_ones(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    answers = Answers("hashgrid")
+    frame = Frame("a", torch.zeros((3, 4, 3)), CAMERA)
+    for found in (FOUND, replace(FOUND, outcome=Outcome.CONVERGED)):
+        answers.append(Answer.of(frame, len(answers), found))
+    with caplog.at_level(logging.INFO, "bidnerf"):
+        answers.save(tmp_path / "poses.tum")
+    assert len((tmp_path / "poses.tum").read_text().splitlines()) == 3  # a heading, a name and a pose
+    assert "1 without an accepted pose are left out" in caplog.text
+
+
+def answers_with(poses: list[SE3], truths: list[SE3]) -> Answers:
+    found, frame = replace(FOUND, outcome=Outcome.CONVERGED), Frame("a", torch.zeros((3, 4, 3)), CAMERA)
+    answers = Answers("hashgrid")
+    for pose, truth in zip(poses, truths, strict=True):
+        moved = replace(found, T_world_camera=pose)
+        answers.append(replace(Answer.of(frame, len(answers), moved), truth=truth))
+    return answers
+
+
+@pytest.mark.parametrize("line", [False, True])
+def test_errors_by_another_world_are_told_from_errors_of_poses(line: bool) -> None:
+    """Also where all cameras are on a line, about which positions alone do not determine the rotation."""
+    generator = torch.Generator().manual_seed(0)
+    tangents = torch.randn((6, 6), dtype=torch.float64, generator=generator)
+    truths = [SE3.exp(tangent) for tangent in tangents]
+    if line:
+        truths = [
+            SE3(truth.rotation, truth.translation * T.translation.new_tensor([1, 0, 0])) for truth in truths
+        ]
+    there = [SE3(T.rotation @ truth.rotation, T.apply(1.7 * truth.translation)) for truth in truths]
+    noise = 0.01 * torch.randn((6, 6), dtype=torch.float64, generator=generator)
+    noisy = [pose.retract(step) for pose, step in zip(there, noise, strict=True)]
+    remark = answers_with(noisy, truths).remark
+    assert remark is not None
+    assert remark.startswith("all 6 accepted poses differ from the dataset's by one transformation")
+    scale = float(remark.partition("a scale of ")[2].split()[0])
+    assert scale == pytest.approx(1.7, rel=0.02)
+    for others in (
+        truths,
+        [truth.retract(step) for truth, step in zip(truths, noise, strict=True)],
+        [*noisy[:5], noisy[5].retract(50 * noise[5])],
+        noisy[::-1],
+    ):
+        assert answers_with(others, truths).remark is None
+    assert answers_with(noisy[:2], truths[:2]).remark is None

@@ -1,0 +1,716 @@
+"""The HTTP service: its answers are those of the command line, its limits hold, and no request is lost or breaks it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import socket
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
+pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
+
+import tiny
+from bidnerf_core import (
+    InputError,
+    ServiceClient,
+    ServiceError,
+    ServiceLimits,
+    open_dataset,
+    serve,
+    service_app,
+    settings_of,
+)
+from bidnerf_core.cli import main
+from bidnerf_core.service import Access
+from bidnerf_core.service.description import description
+from bidnerf_core.service.pool import Pool
+from bidnerf_core.service.requests import PARAMETERS
+from bidnerf_core.service.server import named
+from commands import Run
+
+QUICK = {"max_steps": 3, "rays": 64}
+LIMITS = ServiceLimits(
+    workers=1, queue=3, timeout=120.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0
+)
+FORM = "multipart/form-data; boundary=xyz"
+
+
+@dataclass
+class Reply:
+    status: int = 0
+    headers: dict[str, str] = field(default_factory=dict)
+    body: bytes = b""
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class Service:
+    """An application in an event loop of its own, asked as a server would."""
+
+    def __init__(self, app: Any) -> None:
+        self.app, self.loop = app, asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever, daemon=True)
+        self._thread.start()
+        self._life = app.router.lifespan_context(app)
+        self.run(self._life.__aenter__())
+        self.pool: Pool = app.state.pool
+        self.said = description(list(self.pool.described), self.pool.limits)
+
+    def close(self) -> None:
+        self.run(self._life.__aexit__(None, None, None))
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join()
+
+    def run(self, work: Awaitable[Any]) -> Any:
+        async def waited() -> Any:
+            return await work
+
+        return asyncio.run_coroutine_threadsafe(waited(), self.loop).result(60)
+
+    def post(self, path: str, body: bytes = b"", kind: str = "image/png", **more: Any) -> Reply:
+        return self.run(self.ask("POST", path, [body], {"content-type": kind}, **more))
+
+    def get(self, path: str, method: str = "GET") -> Reply:
+        return self.run(self.ask(method, path, []))
+
+    async def ask(
+        self, method: str, path: str, chunks: list[bytes], headers: dict[str, str] | None = None,
+        leaving: asyncio.Event | None = None, stalls: bool = False,
+    ) -> Reply:  # fmt: skip
+        path, _, query = path.partition("?")
+        given = {"host": "localhost", **(headers or {})}
+        scope = {
+            "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": method, "path": path,
+            "raw_path": path.encode(), "query_string": query.encode(), "root_path": "", "scheme": "http",
+            "headers": [(k.encode(), v.encode("latin-1")) for k, v in given.items()], "client": ("127.0.0.1", 1),
+            "server": ("localhost", 80), "state": {},
+        }  # fmt: skip
+        reply, parts = Reply(), list(chunks)
+
+        async def receive() -> dict[str, Any]:
+            if parts:
+                part = parts.pop(0)
+                return {"type": "http.request", "body": part, "more_body": bool(parts) or stalls}
+            await (leaving or asyncio.Event()).wait()
+            return {"type": "http.disconnect"}
+
+        async def send(message: dict[str, Any]) -> None:
+            if message["type"] == "http.response.start":
+                reply.status = message["status"]
+                reply.headers = {k.decode().lower(): v.decode() for k, v in message["headers"]}
+            else:
+                reply.body += message.get("body", b"")
+
+        await self.app(scope, receive, send)
+        self._require_described(method, path, reply)
+        return reply
+
+    said: dict[str, Any] | None = None  # of an application that describes itself
+
+    def _require_described(self, method: str, path: str, reply: Reply) -> None:
+        """Every answer of every test has a status, a type and headers that the description promises."""
+        template = re.sub("^/maps/[^/]+", "/maps/{map}", path)
+        operation = (self.said or {"paths": {}})["paths"].get(template, {}).get(method.lower())
+        if operation is None or reply.status == 499:  # for which there is nobody to receive it
+            return
+        said = operation["responses"][str(reply.status)]
+        kinds = {kind.partition(";")[0] for kind in said["content"]}
+        assert reply.headers["content-type"].partition(";")[0] in kinds
+        framing = {"content-type", "content-length", "connection"}
+        assert set(reply.headers) - framing == {name.lower() for name in said["headers"]}
+
+
+@dataclass(frozen=True)
+class Place:
+    folder: Path
+    photo: bytes
+    start: str
+    answer: dict[str, Any]  # of the command line
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    folder = tmp_path_factory.mktemp("service")
+    tiny.write_dataset(folder / "data")
+    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+    shutil.copy(folder / "data/images/t_0000.png", folder / "photo.png")
+    pose = open_dataset(folder / "data").views("test")[0].T_ref_camera.matrix().tolist()
+    (folder / "start.json").write_text(json.dumps({"T_world_camera": pose}))
+    return Place(folder, (folder / "photo.png").read_bytes(), json.dumps(pose), {})
+
+
+@pytest.fixture(scope="module")
+def service(place: Place) -> Iterator[Service]:
+    shutil.copytree(place.folder / "map", place.folder / "hall")
+    anchor = {"latitude": 47.4, "longitude": 19.0, "height": 120.0, "position_sigma": 0.5}
+    (place.folder / "hall/anchor.json").write_text(json.dumps(anchor))
+    maps = [place.folder / "map", place.folder / "hall"]
+    running = Service(service_app(maps, limits=LIMITS, method="bid", config=QUICK))
+    yield running
+    running.close()
+
+
+def form(**parts: bytes | str) -> bytes:
+    """Return a form; bytes are files."""
+    text = b""
+    for name, value in parts.items():
+        file = f'; filename="{name}.bin"' if isinstance(value, bytes) else ""
+        content = value if isinstance(value, bytes) else value.encode()
+        text += (
+            f'--xyz\r\nContent-Disposition: form-data; name="{name}"{file}\r\n\r\n'.encode()
+            + content
+            + b"\r\n"
+        )
+    return text + b"--xyz--\r\n"
+
+
+def test_answers_are_those_of_the_command_line(service: Service, place: Place, bidnerf: Run) -> None:
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in QUICK.items()]
+    words = ["localize", place.folder / "map", place.folder / "photo.png", "--method=bid", *options]
+    depth = place.folder / "data/depth/t_0000.png"
+    given = [
+        "--start",
+        place.folder / "start.json",
+        "--focal=32",
+        "--depth",
+        depth,
+        "--depth-unit=0.001",
+        "--seed=7",
+    ]
+    expected = json.loads(bidnerf(*words, *given, "--json").out)
+    body = form(
+        photo=place.photo,
+        depth=depth.read_bytes(),
+        start=place.start,
+        focal="32",
+        depth_unit="0.001",
+        seed="7",
+    )
+    reply = service.post("/maps/map/localize", body, FORM)
+    assert reply.status == 200
+    assert list(reply.json) == list(expected)
+    for key in expected.keys() - {"seconds"}:
+        assert reply.json[key] == (
+            pytest.approx(expected[key], rel=1e-6) if key == "loss" else expected[key]
+        ), key
+
+
+def test_a_photo_may_be_the_body(service: Service, place: Place) -> None:
+    reply = service.post(
+        f"/localize?map=map&focal=32&name=%3Cscript%3E&start={place.start.replace(' ', '')}", place.photo
+    )
+    assert reply.status == 200
+    assert reply.json["frame"] == "<script>"
+    assert reply.headers["content-type"] == "application/json"
+    assert reply.headers["x-content-type-options"] == "nosniff"
+
+
+def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
+    part = b'--xyz\r\nContent-Disposition: form-data; name="photo"; filename="../../etc/pass wd.png"\r\n\r\n'
+    body = part + place.photo + b"\r\n" + form(start=place.start, focal="32", map="map")
+    assert service.post("/localize", body, FORM).json["frame"] == "pass wd"
+    named = form(photo=place.photo, start=place.start, focal="32", map="map", name="<script>")
+    assert service.post("/localize", named, FORM).json["frame"] == "<script>"
+    for path in (
+        "/maps/..%2f..%2fetc%2fpasswd",
+        "/maps/../map.json",
+        "/maps/map/map.json",
+        "/maps/.",
+        "/etc/passwd",
+    ):
+        assert service.get(path).status == 404, path
+    for text in ("../map", "/etc/passwd", "map\0", "x" * 5000):
+        reply = service.post("/localize", form(photo=place.photo, map=text), FORM)
+        assert reply.status in (400, 404), text
+    assert service.post("/localize?map=map&camera=/etc/passwd", place.photo).status == 422
+    assert "passwd" not in service.get("/metrics").body.decode()
+    folder = service.pool._folder
+    assert folder is not None
+    assert list(Path(folder.name).iterdir()) == []
+
+
+def png(width: int, height: int) -> bytes:
+    """Return a small file that describes a large image of one colour."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    rows = zlib.compress(bytes((width + 7) // 8 + 1) * min(height, 1000), 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_limits_hold_before_anything_is_decoded(service: Service, place: Place) -> None:
+    bomb = service.post("/localize?map=map&focal=32", png(9000, 9000))
+    assert bomb.status == 422
+    assert "9000x9000, expected at most 1 megapixels" in bomb.json["detail"]
+    assert (
+        service.post("/localize?map=map", form(photo=place.photo, depth=png(60000, 60000)), FORM).status
+        == 422
+    )
+    large = service.run(service.ask("POST", "/localize", [b"x"], {"content-length": str(2 * 10**9)}))
+    assert large.status == 413
+    assert large.headers["connection"] == "close"
+    chunks = [bytes(2**18)] * 1000  # no length is announced
+    endless = service.run(service.ask("POST", "/localize", chunks))
+    assert endless.status == 413
+    slow = service.run(service.ask("POST", "/localize?map=map", [b"x"], stalls=True))
+    assert slow.status == 408
+
+
+def test_malformed_requests_are_refused_with_a_reason(service: Service, place: Place) -> None:
+    drawn = random.Random(0)
+    kinds = [
+        FORM,
+        "multipart/form-data",
+        "image/png",
+        "text/html",
+        "application/json",
+        "multipart/form-data; boundary=",
+        "",
+    ]
+    seeds = [
+        place.photo,
+        form(photo=place.photo, focal="32"),
+        b'{"sensorReadings": {"cameraReadings": [{}]}}',
+        b"",
+        png(9, 9),
+    ]
+    paths = [
+        "/localize",
+        "/maps/map/localize",
+        "/maps/hall/geopose",
+        "/geopose?map=hall",
+        "/maps/\xff/localize",
+    ]
+    found = set()
+    for _ in range(250):
+        body = bytearray(drawn.choice(seeds))
+        for _ in range(drawn.randrange(8)):
+            at = drawn.randrange(len(body) + 1)
+            body[at : at + drawn.randrange(9)] = drawn.randbytes(drawn.randrange(9))
+        values = ["", "nan", "-1", "1e999", "\0", "map", "32", "[[]]", "{", "9" * 400]
+        query = "&".join(
+            f"{drawn.choice([*PARAMETERS, 'x'])}={drawn.choice(values)}" for _ in range(drawn.randrange(4))
+        )
+        path = drawn.choice(paths)
+        reply = service.post(f"{path}{'&' if '?' in path else '?'}{query}", bytes(body), drawn.choice(kinds))
+        assert reply.status < 500, (path, query, bytes(body), reply.body)
+        assert reply.json["detail"] if reply.status != 200 else reply.json["outcome"]
+        found.add(reply.status)
+    for length in ("one", "\xb2", "9" * 5000, ""):  # other servers may let them through
+        headers = {"content-length": length}
+        assert service.run(service.ask("POST", "/localize", [b"x"], headers)).status == 400
+    assert found >= {400, 404, 422}
+    assert service.pool.metrics.restarts["died"] == 0
+
+
+def test_what_is_missing_is_named(service: Service, place: Place) -> None:
+    for path, part in (
+        (
+            f"/localize?focal=32&start={place.start.replace(' ', '')}",
+            "start was given without map, expected map as one of",
+        ),
+        ("/localize?focal=32", "needs a start"),
+        ("/localize?map=map&fcal=3", "did you mean 'focal'?"),
+        ("/localize?map=map&focal=x", 'focal is "x", expected a number'),
+        ("/localize?map=map&focal=1&focal=2", "focal is given twice"),
+        ("/localize?map=map&depth_unit=1", "depth_unit was given without depth"),
+        ("/localize?map=map&focal=32", "needs a start"),
+    ):
+        assert part in service.post(path, place.photo).json["detail"]
+    assert service.post("/localize?map=map").json["detail"].startswith("no photo, expected")
+    body = b'{"type": "geopose"}'
+    assert (
+        "expected map as one of map, hall"
+        in service.post("/geopose", body, "application/json").json["detail"]
+    )
+    refused = service.get("/localize")
+    assert (refused.status, refused.headers["allow"]) == (405, "POST")
+    for path in ("/nothing", "/maps/", "/maps/nothing", "/maps/nothing/geopose"):
+        assert service.get(path).json["status"] == 404, path
+    for number in ("1_0", "\u0663", " 5", "infinity", "0x10"):
+        assert (
+            "expected a number"
+            in service.post(f"/localize?map=map&focal={number}", place.photo).json["detail"]
+        )
+
+
+def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
+    with contextlib.ExitStack() as taken:
+        for _ in range(LIMITS.places):
+            taken.enter_context(service.pool.place())
+        reply = service.post("/localize?map=map", place.photo)
+        assert reply.status == 429
+        assert int(reply.headers["retry-after"]) >= 1
+        assert service.get("/health").status == 200
+    assert service.post("/localize?map=map", place.photo).status == 422
+
+
+def quickly(condition: Callable[[], bool]) -> None:
+    until = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def stopped(service: Service) -> Iterator[int]:
+    """Let the only worker stand still, as one does that computes for long."""
+    quickly(lambda: len(service.pool.alive) == 1)
+    process = service.pool.alive[0].pid
+    os.kill(process, signal.SIGSTOP)
+    yield process
+    quickly(lambda: [worker.pid for worker in service.pool.alive] not in ([], [process]))
+
+
+def request(service: Service, place: Place, leaving: asyncio.Event | None = None) -> Any:
+    path = f"/localize?map=map&focal=32&start={place.start.replace(' ', '')}"
+    return asyncio.run_coroutine_threadsafe(
+        service.ask("POST", path, [place.photo], leaving=leaving), service.loop
+    )
+
+
+def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place) -> None:
+    before = service.pool.metrics.restarts["died"]
+    with stopped(service) as process:
+        waiting = [request(service, place) for _ in range(3)]
+        quickly(lambda: len(service.pool._waiting) == 2)
+        os.kill(process, signal.SIGKILL)
+        assert [reply.result(60).status for reply in waiting] == [200] * 3
+    assert service.pool.metrics.restarts["died"] == before + 1
+
+
+@pytest.mark.slow
+def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, place: Place) -> None:
+    nursery = service.pool._nursery
+    assert nursery is not None
+    with stopped(service) as process:
+        waiting = request(service, place)
+        quickly(lambda: service.pool._taken == 1)
+        nursery.kill()
+        os.kill(process, signal.SIGKILL)
+        assert waiting.result(150).status == 200
+
+
+def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -> None:
+    leaving = asyncio.Event()
+    with stopped(service):
+        waiting = request(service, place, leaving)
+        quickly(lambda: service.pool._taken == 1 and not service.pool._waiting)
+        service.loop.call_soon_threadsafe(leaving.set)
+        assert waiting.result(20).status == 499
+    assert service.pool.metrics.restarts["cancelled"] == 1
+    assert service.pool._taken == 0
+
+
+def test_work_that_takes_too_long_is_stopped(service: Service, place: Place) -> None:
+    service.pool.limits = replace(LIMITS, timeout=0.2)
+    try:
+        with stopped(service):
+            first, second = request(service, place), request(service, place)
+            assert (first.result(20).status, second.result(20).status) == (504, 504)
+    finally:
+        service.pool.limits = LIMITS
+    assert service.pool.metrics.restarts["timeout"] == 1
+    assert request(service, place).result(60).status == 200
+
+
+def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b""})
+
+    refused: list[tuple[str, int]] = []
+
+    def status(token: str | None, path: str = "/localize", **headers: str) -> int:
+        service = Service.__new__(Service)
+        service.app = Access(app, token, lambda scope, status: refused.append((scope["path"], status)))
+        return asyncio.run(service.ask("POST", path, [], headers)).status
+
+    for host in ("localhost:8000", "127.0.0.1", "[::1]:8000", "127.8.8.8"):
+        assert status(None, host=host) == 200, host
+    for host in ("example.org", "192.168.1.5:8000", "localhost.example.org", "", "[", "127.0.0.1.nip.io"):
+        assert status(None, host=host) == 403, host
+    assert status(None, origin="https://example.org") == 403
+    assert status(None, origin="null") == 403
+    assert status(None, origin="http://localhost:8000") == 200
+    token = "0123456789abcdef"
+    assert status(token, host="example.org") == 401
+    assert status(token, host="localhost") == 401
+    for wrong in (
+        "Bearer",
+        "Bearer x",
+        f"Basic {token}",
+        f"bearer{token}",
+        f"Bearer {token}x",
+        "Bearer \xe9",
+    ):
+        assert status(token, authorization=wrong) == 401, wrong
+    assert status(token, host="example.org", authorization=f"Bearer {token}") == 200
+    assert status(token, "/health", host="example.org") == 200
+    assert refused == [("/localize", 403)] * 8 + [("/localize", 401)] * 8
+
+
+def test_refusals_are_counted(service: Service) -> None:
+    before = service.pool.metrics.requests["refused", 403]
+    assert asyncio.run(service.ask("GET", "/maps", [], {"host": "example.org"})).status == 403
+    assert service.pool.metrics.requests["refused", 403] == before + 1
+
+
+def test_geopose_answers_with_an_honest_accuracy(service: Service, place: Place) -> None:
+    import base64
+
+    def body(**more: Any) -> bytes:
+        reading = {
+            "imageBytes": base64.b64encode(place.photo).decode(), "imageFormat": "PNG", "size": [24, 24],
+            "params": {"model": "PINHOLE", "modelParams": [32, 32, 12, 12]}, "sensorId": "phone", **more,
+        }  # fmt: skip
+        return json.dumps({"id": "7", "sensorReadings": {"cameraReadings": [reading]}}).encode()
+
+    assert service.get("/geopose").json == {"status": "running"}
+    reply = service.post("/maps/hall/geopose", body(), "application/json")
+    assert reply.status == 422  # this method needs a start, and no prior pose is given
+    assert "needs a start" in reply.json["detail"]
+    for more, part in (
+        ({"imageBytes": "?"}, "not base64"),
+        ({"imageFormat": "DEPTH"}, "expected a colour image"),
+        ({"params": {"model": "KODAK", "modelParams": [1]}}, "model is 'KODAK'"),
+        ({"imageOrientation": {"mirrored": True}}, "imageOrientation"),
+        ({"size": [2]}, "expected width and height"),
+    ):
+        assert part in service.post("/maps/hall/geopose", body(**more), "application/json").json["detail"]
+    assert service.post("/maps/hall/geopose", b"[]", "application/json").status == 400
+    for wrong in (
+        {"timestamp": "now"}, {"type": 1}, {"sensors": [1]}, {"sensors": [{"id": 1}]}, {"priorPoses": {}},
+        {"priorPoses": [{"geopose": {"position": {"lat": 1, "lon": "2", "h": 3}}}]},
+    ):  # fmt: skip
+        for name in ("map", "hall"):
+            content = json.dumps({**json.loads(body()), **wrong}).encode()
+            detail = service.post(f"/maps/{name}/geopose", content, "application/json").json["detail"]
+            assert any(word in detail for word in (*wrong, "position")), detail
+
+
+def test_every_path_is_described(service: Service) -> None:
+    said = service.get("/openapi.json").json
+    assert said == json.loads(json.dumps(description(["map", "hall"], LIMITS)))
+    assert set(said["paths"]) == {route.path for route in service.app.routes}
+    protected = description(["map"], LIMITS, protected=True)
+    assert (protected["security"], said["security"]) == ([{"token": []}], [])
+    for path, operations in protected["paths"].items():
+        for method in operations.keys() - {"parameters"}:
+            statuses = operations[method]["responses"]
+            assert ("401" in statuses, "403" in statuses) == (path != "/health", False)
+            assert "403" in said["paths"][path][method]["responses"]
+    queried = {p["name"] for p in said["paths"]["/localize"]["post"]["parameters"]}
+    assert queried == set(PARAMETERS)
+    text = service.get("/metrics").body.decode()
+    assert 'bidnerf_requests_total{path="/localize",status="200"}' in text
+    assert "bidnerf_workers 1" in text
+    assert set(service.get("/maps").json) == {"map", "hall"}
+    assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
+
+
+@pytest.fixture(scope="module")
+def address(place: Place) -> Iterator[tuple[str, int]]:
+    """A service on a port of its own."""
+    ready, stop, told = threading.Event(), threading.Event(), []
+
+    def tell(url: str, token: str | None) -> None:
+        told.extend([url, token])
+        ready.set()
+
+    options: Any = {
+        "port": 0,
+        "limits": LIMITS,
+        "method": "bid",
+        "config": QUICK,
+        "ready": tell,
+        "stop": stop,
+    }
+    running = threading.Thread(target=serve, args=[place.folder / "map"], kwargs=options)
+    running.start()
+    try:
+        assert ready.wait(60)
+        assert told[1] is None  # this machine only needs no token
+        parts = urlsplit(told[0])
+        yield str(parts.hostname), int(parts.port or 0)
+    finally:
+        stop.set()
+        running.join(30)
+    with pytest.raises(ServiceError, match="refused"):
+        ServiceClient(told[0]).ask("/maps")
+
+
+def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> None:
+    client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
+    found = client.localize(place.folder / "photo.png", focal=32, start=json.loads(place.start))
+    assert (found["frame"], found["method"]) == ("photo", "bid")
+    with pytest.raises(ServiceError, match="no map with that name") as refused:
+        client.localize(place.photo, map="other")
+    assert refused.value.status == 404
+
+
+def spoken(address: tuple[str, int], content: bytes) -> bytes:
+    """Send bytes over a connection, and return what comes back until it ends."""
+    with socket.create_connection(address, timeout=20) as connection:
+        found = b""
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(content)
+            connection.shutdown(socket.SHUT_WR)
+            while part := connection.recv(65536):
+                found += part
+        return found
+
+
+def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, int]) -> None:
+    drawn, body = random.Random(1), form(photo=place.photo, focal="32", start=place.start)
+    head = f"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: {FORM}\r\nConnection: close\r\n"
+    statuses = set()
+    for number in range(150):
+        length = drawn.choice([len(body)] * 4 + [len(body) // 2, -1, 10**12])
+        content = bytearray(f"{head}Content-Length: {length}\r\n\r\n".encode() + body)
+        for _ in range(drawn.randrange(1, 9)):
+            at = drawn.randrange(len(head) + 20 if number % 2 else len(content))
+            content[at : at + drawn.randrange(5)] = drawn.randbytes(drawn.randrange(5))
+        answer = spoken(address, bytes(content))
+        statuses.add(answer[9:10] if answer.startswith(b"HTTP/1.1 ") else b"closed")
+    assert statuses <= {b"2", b"4", b"closed"}
+    for content in (
+        b"\x00\x01\r\n\r\n",
+        b"GET / HTTP/9\r\n\r\n",
+        b"GET " + b"x" * 100_000 + b" HTTP/1.1\r\n\r\n",
+    ):
+        head, _, body = spoken(address, content).partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 400")
+        assert b"application/problem+json" in head
+        assert json.loads(body)["status"] == 400
+    for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
+        answer = spoken(
+            address, f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode()
+        )
+        assert answer.startswith(b"HTTP/1.1 404"), path
+    assert spoken(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
+
+
+def test_a_body_without_end_and_a_client_without_haste_are_cut_off(
+    place: Place, address: tuple[str, int]
+) -> None:
+    head = b"POST /localize HTTP/1.1\r\nHost: localhost\r\n"
+    for length in (b"Content-Length: 2000000000", b"Transfer-Encoding: chunked"):
+        sent, block = 0, bytes(2**16)
+        with (
+            socket.create_connection(address, timeout=20) as connection,
+            contextlib.suppress(ConnectionError),
+        ):
+            connection.sendall(head + length + b"\r\n\r\n")
+            while sent < 2 * 10**9:
+                connection.sendall(b"%x\r\n%s\r\n" % (len(block), block) if b"chunked" in length else block)
+                sent += len(block)
+        assert sent < 3 * 10**7, (
+            length
+        )  # what the buffers of the system take, beside the megabyte that is allowed
+    began = time.monotonic()
+    with socket.create_connection(address, timeout=20) as connection:
+        connection.sendall(head + b"Content-Length: 1000\r\n\r\nx")
+        assert connection.recv(100).startswith(b"HTTP/1.1 408")
+    assert time.monotonic() - began < 10
+    for _ in range(5):  # clients that leave before the answer
+        with socket.create_connection(address, timeout=20) as connection:
+            body = form(photo=place.photo, focal="32", start=place.start)
+            kind = f"Content-Type: {FORM}\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+            connection.sendall(head + kind + body)
+    client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
+    assert client.localize(place.photo, focal=32, start=json.loads(place.start))["method"] == "bid"
+    quickly(lambda: client.ask("/health")["waiting"] == 0)
+
+
+def test_a_connection_that_only_dribbles_after_an_answer_is_closed(
+    address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_core.service.server.IDLE_SECONDS", 0.1)
+    monkeypatch.setattr("bidnerf_core.service.server.HEAD_SECONDS", 0.2)
+    with socket.create_connection(address, timeout=20) as connection:
+        connection.sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
+        began = time.monotonic()
+        with contextlib.suppress(ConnectionError):
+            while time.monotonic() - began < 10:
+                connection.sendall(b"G")
+                connection.settimeout(0.1)
+                with contextlib.suppress(TimeoutError):
+                    if not connection.recv(1):
+                        break
+        assert time.monotonic() - began < 5
+
+
+@pytest.mark.slow
+def test_strangers_who_read_the_description_find_it_true(
+    place: Place, address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("schemathesis", reason="Schemathesis is not installed")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    openapi = importlib.import_module("_openapi")
+    found = openapi.tried(f"http://{address[0]}:{address[1]}", "map", [place.photo], 1)
+    assert (found["failures"], found["errors"]) == ({}, {}), found["output"]
+    assert found["operations"] == 11
+    assert found["requests"] > 100
+
+
+def test_a_token_that_is_given_is_not_shown(
+    tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def announced(maps: Any, *, token: str | None, ready: Any, **more: Any) -> None:
+        ready("http://localhost:1", token or "made-up-0123456789")
+
+    monkeypatch.setattr("bidnerf_core.service.server.serve", announced)
+    (tmp_path / "token").write_text("secret-0123456789")
+    given = bidnerf("serve", tmp_path, "--token-file", tmp_path / "token")
+    assert "Bearer" in given.out + given.err
+    assert "secret" not in given.out + given.err
+    made_up = bidnerf("serve", tmp_path)
+    assert "Bearer made-up-0123456789" in made_up.out + made_up.err
+
+
+def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidnerf: Run) -> None:
+    assert named({"a": "x"}) == {"a": Path("x")}
+    for maps, part in (
+        ([], "no map"),
+        ({"a/b": "x"}, "its name is 'a/b'"),
+        (["x/a", "y/a"], "another map is also named 'a'"),
+    ):
+        with pytest.raises(InputError, match=part):
+            named(maps)
+    with pytest.raises(InputError, match="expected at least 16"):
+        service_app("MAP", token="short")
+    assert service_app("MAP", method="bid", config=settings_of("bid", QUICK)) is not None
+    with pytest.raises(InputError, match="config is a int, expected settings of bid"):
+        service_app("MAP", method="bid", config=5)
+    with pytest.raises(InputError, match="timeout is 0"):
+        ServiceLimits(timeout=0)
+    assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
+    status, _, err = bidnerf("serve", place.folder / "data")
+    assert status == 1
+    assert "no map.json found" in err

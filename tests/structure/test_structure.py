@@ -1,0 +1,473 @@
+"""Poses of photos that have none: truth, what is left out and why, interruptions, and photos that show too little."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core.camera.orientation import CODES
+from bidnerf_core.datasets import all_views
+from bidnerf_core.geometry import fit_similarity
+from bidnerf_core.maps.photos import posed_images, poses_folder
+from bidnerf_core.results import pose_error
+from bidnerf_core.structure import lacks_poses
+from bidnerf_core.structure.agreement import Agreement, agreement
+from bidnerf_core.structure.keypoints import described
+from bidnerf_core.structure.library import from_colmap, to_colmap
+from bidnerf_core.structure.pairs import ALL_OF_FRAMES, ALL_OF_PHOTOS, NEIGHBOURS, chosen_pairs, few
+from bidnerf_core.structure.poses import found_before
+from bidnerf_core.structure.record import begin, clear, stored_rows
+from bidnerf_core.structure.sources import SourceImage, photos_of
+from bidnerf_core.structure.video_frames import MOST, STEP, FrameMeasure, chosen, measured, write_frames
+from commands import Run
+from photo_files import write_photo
+from photo_room import CAMERA, looking, photograph, walk, write_photos
+
+pytestmark = pytest.mark.slow
+
+
+pytest.importorskip("pycolmap")
+
+PLACED, OTHERS = 9, 4
+
+
+@dataclass
+class Search:
+    """A search for poses that was cancelled and went on."""
+
+    photos: Path
+    out: Path
+    found: bn.FoundPoses
+    cancelled: str
+    stages: list[list[str]]  # of each run
+
+
+@pytest.fixture(scope="module")
+def search(tmp_path_factory: pytest.TempPathFactory) -> Search:
+    """Nine photos of a room and four of another, with a plain photo and two broken files among them."""
+    place = tmp_path_factory.mktemp("structure")
+    photos, out = place / "my photos", place / "poses"
+    write_photos(photos, walk(PLACED))
+    write_photos(photos, walk(PLACED)[2 : 2 + OTHERS], seed=1, first=100)
+    Image.new("RGB", (CAMERA.width, CAMERA.height), (90, 90, 90)).save(photos / "200.png")
+    (photos / "201.png").write_bytes((photos / "000.png").read_bytes()[:3000])
+    (photos / "202.jpg").write_bytes(b"no image")
+    stages: list[list[str]] = [[], []]
+    with pytest.raises(bn.Cancelled) as stopped:
+        bn.find_poses(
+            photos,
+            out,
+            progress=lambda now: stages[0].append(now.stage),
+            cancel=lambda: "matching photos" in stages[0],
+        )
+    found = bn.find_poses(photos, out, progress=lambda now: stages[1].append(now.stage))
+    return Search(photos, out, found, str(stopped.value), stages)
+
+
+def errors(views: dict[str, bn.View], truth: dict[str, bn.SE3]) -> tuple[float, float]:
+    """Return the largest errors (metres, degrees) of poses after their frame is aligned with the true one."""
+    names = sorted(views)
+    align = fit_similarity(
+        torch.stack([views[name].T_ref_camera.translation for name in names]),
+        torch.stack([truth[name].translation for name in names]),
+    )
+    found = [
+        pose_error(
+            bn.SE3(
+                align.T_target_source.rotation @ views[name].T_ref_camera.rotation,
+                align.apply(views[name].T_ref_camera.translation),
+            ),
+            truth[name],
+        )
+        for name in names
+    ]
+    return max(float(e.translation) for e in found), max(float(e.rotation_deg) for e in found)
+
+
+def test_photos_without_poses_get_the_true_ones(search: Search) -> None:
+    views = {view.frame.name: view for view in all_views(bn.open_dataset(search.out))}
+    assert sorted(views) == [f"{number:03d}" for number in range(PLACED)]
+    truth = {f"{number:03d}": pose for number, pose in enumerate(walk(PLACED))}
+    metres, degrees = errors(views, truth)
+    assert metres < 0.01
+    assert degrees < 0.2
+    camera = views["000"].frame.intrinsics
+    assert camera.fx == pytest.approx(CAMERA.fx, rel=0.02)
+    assert (camera.width, camera.height) == (CAMERA.width, CAMERA.height)
+
+
+def test_the_largest_of_several_models_is_kept_and_every_photo_accounted_for(search: Search) -> None:
+    found = search.found
+    assert (found.photos, found.placed, found.models) == (PLACED + OTHERS + 3, PLACED, (PLACED, OTHERS))
+    reasons = {left.photo: left.reason for left in found.left_out}
+    assert sorted(reasons) == ["100", "101", "102", "103", "200", "201", "202"]
+    assert all("another model, with 4 photos" in reasons[name] for name in ("100", "101", "102", "103"))
+    assert "keypoint" in reasons["200"]
+    assert "not readable as an image" in reasons["202"]
+    assert "not readable as an image" in reasons["201"]
+    assert "2 unconnected models of 9, 4 photos" in str(found)
+    assert json.loads((search.out / "poses.json").read_text())["placed"] == PLACED
+
+
+def test_interrupted_work_goes_on(search: Search) -> None:
+    assert "the same command resumes" in search.cancelled
+    assert "finding keypoints" in search.stages[0]
+    assert "finding keypoints" in search.stages[1]  # of the file that cannot be decoded, which is tried again
+    assert search.stages[1].count("finding keypoints") == 1
+    assert not (search.out / "work").exists()
+
+
+def test_the_world_is_upright(search: Search) -> None:
+    views = sorted(all_views(bn.open_dataset(search.out)), key=lambda view: view.frame.name)
+    up = torch.stack([-view.T_ref_camera.rotation[:, 1] for view in views])
+    true = torch.stack([-pose.rotation[:, 1] for pose in walk(PLACED)])
+    torch.testing.assert_close(up[:, 2], true[:, 2], atol=0.01, rtol=0)
+
+
+def test_the_model_is_beside_the_dataset(search: Search) -> None:
+    from bidnerf_core.datasets.colmap_files import read_model
+
+    images, points = read_model(search.out / "sparse" / "0")
+    assert sorted(image.name for image in images) == [f"{number:03d}.png" for number in range(PLACED)]
+    assert len(points.ids) == search.found.points
+
+
+def test_poses_that_were_found_are_not_sought_again(search: Search, tmp_path: Path) -> None:
+    stages = list[str]()
+    again = bn.find_poses(search.photos, search.out, progress=lambda now: stages.append(now.stage))
+    assert again == search.found
+    assert stages == []
+    fewer = tmp_path / "fewer"
+    write_photos(fewer, walk(3))
+    with pytest.raises(bn.InputError, match="holds the poses of other photos"):
+        bn.find_poses(fewer, search.out)
+
+
+def test_train_takes_photos_without_poses(
+    search: Search, bidnerf: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Poses that were found before are in the folder beside the map."""
+    out, beside = search.out.with_name("room"), search.out.with_name("room-poses")
+    search.out.rename(beside)
+    try:
+        ran = bidnerf("train", search.photos, "--out", out, "--split", "all", *tiny.options())
+        assert ran.status == 0, ran.err
+        assert "already has the poses of these photos" in ran.err
+        assert len(bn.load_map(out).info.cameras) == PLACED
+        with caplog.at_level("INFO", "bidnerf"), posed_images(search.photos, "train", out) as (data, _):
+            assert data == str(beside)
+        assert "2 photos of 9 are held out" in caplog.text
+    finally:
+        beside.rename(search.out)
+
+
+def test_photos_inside_the_folder_of_the_poses_are_never_removed(tmp_path: Path) -> None:
+    """Nor are those that are called as the frames of a video are."""
+    photos = tmp_path / "capture" / "images"
+    photos.mkdir(parents=True)
+    for number in range(2):
+        Image.new("RGB", (64, 48)).save(photos / f"{number:06d}.jpg")
+    with pytest.raises(bn.InputError, match="2 photos, expected at least 3"):
+        bn.find_poses(photos, tmp_path / "capture", overwrite=True)
+    with pytest.raises(bn.InputError, match="exists already, and the video's frames"):
+        begin(tmp_path / "capture", "a video", video=True)
+    assert len(list(photos.iterdir())) == 2
+    begin(tmp_path / "other", "a video", video=True)
+    photos.rename(tmp_path / "other" / "images")
+    clear(tmp_path / "other")
+    assert list((tmp_path / "other").iterdir()) == []
+
+
+def test_the_poses_are_beside_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert poses_folder(Path("maps/room")) == Path("maps/room-poses")
+    monkeypatch.chdir(tmp_path)
+    assert poses_folder(Path(".")) == tmp_path.with_name(f"{tmp_path.name}-poses")
+
+
+def test_a_folder_inside_and_names_that_occur_twice(tmp_path: Path) -> None:
+    for folder in ("cam0", "cam1", "depth", ".hidden"):
+        write_photos(tmp_path / "capture" / folder, walk(2))
+    assert lacks_poses(tmp_path / "capture")
+    images = photos_of(tmp_path / "capture")
+    assert [image.name for image in images] == ["cam0_000", "cam0_001", "cam1_000", "cam1_001"]
+
+
+def test_what_has_no_photos_or_has_poses(search: Search, tmp_path: Path, bidnerf: Run) -> None:
+    (tmp_path / "empty").mkdir()
+    cases = [
+        (tmp_path / "nothing", "no such file or folder"),
+        (tmp_path / "empty", "the folder is empty"),
+        (search.out, "dataset whose poses are known"),
+        (search.photos / "000.png", "expected a folder of photos or a video"),
+        (tmp_path / "clip.mp4", "no such file"),
+    ]
+    for given, message in cases:
+        ran = bidnerf("poses", given, "--out", tmp_path / "out")
+        assert ran.status == 1
+        assert message in ran.err
+        assert len(ran.err.splitlines()) == 1
+        assert not (tmp_path / "out").exists()
+
+
+def test_too_few_photos_and_photos_without_overlap(tmp_path: Path) -> None:
+    one, apart = tmp_path / "one", tmp_path / "apart"
+    write_photos(one, walk(1))
+    with pytest.raises(bn.InputError, match="1 photo, expected at least 3"):
+        bn.find_poses(one, tmp_path / "out")
+    for seed in range(3):
+        write_photos(apart, walk(1), seed, first=seed)
+    assert not (tmp_path / "out").exists()
+    for found_again in (3, 0, 3):
+        stages = list[bn.Progress]()
+        with pytest.raises(bn.InputError, match="no two of them overlap enough"):
+            bn.find_poses(apart, tmp_path / "out", progress=stages.append)
+        assert sum(now.stage == "finding keypoints" for now in stages) == found_again
+        if found_again == 0:  # half of the keypoints are lost
+            database = tmp_path / "out" / "work" / "database.db"
+            database.write_bytes(database.read_bytes()[: database.stat().st_size // 2])
+    with pytest.raises(bn.InputError, match="1 photo, expected at least 3"):
+        bn.find_poses(one, tmp_path / "out")  # other photos take its place
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_damaged_files_of_earlier_work_are_made_anew(search: Search, tmp_path: Path) -> None:
+    rows, file = [(0, 1), (1, 2)], tmp_path / "pairs.json"
+    assert stored_rows(file, tuple[int, int]) is None
+    for content, expected in (
+        (json.dumps(rows), rows),
+        ("[[0, 1], [1", None),
+        ('[[0, "a"]]', None),
+        ("{}", None),
+    ):
+        file.write_text(content)
+        assert stored_rows(file, tuple[int, int]) == expected
+    record = search.out / "poses.json"
+    whole = record.read_bytes()
+    record.write_bytes(whole[:20])
+    try:
+        with pytest.raises(bn.InputError, match=r"poses\.json"):
+            bn.find_poses(search.photos, search.out)
+        assert found_before(search.out, search.found.inputs, overwrite=True) is None
+    finally:
+        record.write_bytes(whole)
+
+
+def test_photos_from_one_place_are_refused(tmp_path: Path) -> None:
+    write_photos(tmp_path / "turned", [looking((0, 0, 0), (1.7, 0.5 + 0.25 * n, 0.1)) for n in range(4)])
+    with pytest.raises(bn.InputError, match=r"no three of 4 photos could be placed.*(one place|overlap)"):
+        bn.find_poses(tmp_path / "turned", tmp_path / "out")
+
+
+def test_three_photos_of_one_wall_by_a_known_camera(tmp_path: Path) -> None:
+    """A plane determines poses if the camera is known; the camera that was given is kept.
+
+    EXIF turns one photo: the dataset has the camera of the image as stored, and a remark says so.
+    """
+    poses = [looking((0.2, -0.9 + 0.8 * n, 0.3 * (n % 2) - 0.2), (2, 0.1 * n, 0.1)) for n in range(4)]
+    files = write_photos(tmp_path / "wall", poses, walls=1)
+    write_photo(files[2], np.asarray(Image.open(files[2])), 6)
+    found = bn.find_poses(tmp_path / "wall", tmp_path / "out", camera=CAMERA)
+    assert (found.placed, found.turned) == (4, 1)
+    assert "1 photo turned by EXIF: the dataset has the cameras of the images as stored" in str(found)
+    views = {view.frame.name: view for view in all_views(bn.open_dataset(tmp_path / "out"))}
+    metres, degrees = errors(views, {f"{number:03d}": pose for number, pose in enumerate(poses)})
+    assert metres < 0.02
+    assert degrees < 0.5
+    assert views["000"].frame.intrinsics.fx == CAMERA.fx
+
+
+def test_without_the_extra_one_line_says_what_to_install(
+    search: Search, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    for command in ("poses", "train"):
+        ran = bidnerf(command, search.photos, "--out", tmp_path / "out")
+        assert ran.status == 1
+        assert "pip install 'bidnerf[sfm]'" in ran.err
+        assert len(ran.err.splitlines()) == 1
+
+
+def test_photos_of_one_lens_share_a_camera_however_they_are_turned(tmp_path: Path) -> None:
+    pixels = photograph(walk(1)[0])
+    files = [
+        write_photo(tmp_path / "a.jpg", pixels, FocalLengthIn35mmFilm=26),
+        write_photo(tmp_path / "b.jpg", pixels, 6, FocalLengthIn35mmFilm=26),
+        write_photo(tmp_path / "c.jpg", pixels, FocalLengthIn35mmFilm=52),
+        write_photo(tmp_path / "d.jpg", pixels[:100]),
+    ]
+    found = described([SourceImage(file.stem, file) for file in files], None)
+    assert [photo.camera for photo in found.photos] == [1, 1, 2, 3]
+    assert found.known_focal == {1: True, 2: True, 3: False}
+    assert found.cameras[2].fx == pytest.approx(2 * found.cameras[1].fx)
+
+
+def test_lenses_go_to_colmap_and_back() -> None:
+    import pycolmap
+
+    for lens in ((), (0.1, -0.02, 0.001, 0.002), (0.1, 0.02, 0.0, 0.0, 0.003, 0.1, 0.2, 0.3)):
+        camera = bn.Intrinsics(300, 310, 161, 118, 320, 240, lens)
+        there = from_colmap(to_colmap(camera, 1, pycolmap))
+        assert there.distortion[: len(lens)] == pytest.approx(lens)
+        assert (there.fx, there.fy, there.cx, there.cy) == (300, 310, 161, 118)
+
+
+def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
+    """The brightest corner of the upright image lies where its axes say, for all eight orientations."""
+    from bidnerf_core.structure.mapping import _upright_axes
+
+    stored = torch.zeros(4, 6)
+    for code in CODES:
+        orientation = bn_photo(tmp_path, code).orientation
+        for axis, pixel in zip(_upright_axes(bn_photo(tmp_path, code)), ((0, -1), (0, 0)), strict=True):
+            image = stored.clone()
+            v, u = (
+                int(size - 1 if part > 0 else 0)
+                for size, part in zip((4, 6), (axis[1], axis[0]), strict=True)
+            )
+            if axis[0]:
+                image[:, u] = 1
+            else:
+                image[v] = 1
+            upright = orientation.upright(image)
+            line = upright[:, pixel[1]] if pixel == (0, -1) else upright[0]
+            assert bool((line == 1).all()), code
+
+
+def bn_photo(folder: Path, code: int):  # type: ignore[no-untyped-def]
+    file = write_photo(folder / f"{code}.jpg", np.zeros((4, 6, 3), np.uint8), code)
+    return described([SourceImage("a", file)], None).photos[0]
+
+
+def test_few_photos_are_matched_with_all_and_many_with_neighbours_and_those_that_look_alike() -> None:
+    assert few(ALL_OF_PHOTOS, False)
+    assert not few(ALL_OF_PHOTOS, True)
+    assert few(ALL_OF_FRAMES, True)
+    generator = np.random.default_rng(0)
+    count = 60
+    places = [generator.integers(0, 256, (40, 128)) for _ in range(count // 2)]  # each is visited twice
+    seen = [
+        np.clip(places[n % (count // 2)] + generator.integers(-9, 10, (40, 128)), 0, 255).astype(np.uint8)
+        for n in range(count)
+    ]
+    seen[7] = np.zeros((0, 128), np.uint8)  # a plain photo
+    pairs = chosen_pairs(seen)
+    assert pairs == sorted(set(pairs))
+    assert all(0 <= i < j < count for i, j in pairs)
+    assert {(i, i + d) for i in range(count - NEIGHBOURS) for d in range(1, NEIGHBOURS + 1)} <= set(pairs)
+    again = [(i, i + count // 2) for i in range(count // 2) if i != 7]
+    assert sum(pair in pairs for pair in again) == len(again)
+    assert len(pairs) < count * (count - 1) / 2
+
+
+def test_frames_are_chosen_at_equal_steps_of_motion_the_sharpest_near_each() -> None:
+    still = [FrameMeasure(n / 30, 0.0, 0.0) for n in range(20)]
+    assert chosen(still) == [0]
+    moving = [FrameMeasure(n / 30, 0.1 * STEP * n, -float(n % 10 != 1)) for n in range(101)]
+    assert chosen(moving) == [1, 11, 21, 31, 41, 51, 61, 71, 81, 91, 98]
+    long = [FrameMeasure(float(n), STEP * n, 0.0) for n in range(3 * MOST)]
+    assert MOST / 2 < len(chosen(long)) <= MOST
+
+
+def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path) -> None:
+    """The camera moves, rests with trembling hands, and moves again; one frame in three is blurred."""
+    generator = np.random.default_rng(0)
+    moves = walk(31)
+    poses = [*moves[:16], *[moves[15]] * 20, *moves[16:]]
+    with av.open(str(tmp_path / "clip.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "15"})
+        stream.width, stream.height, stream.pix_fmt = CAMERA.width, CAMERA.height, "yuv420p"
+        for number, pose in enumerate(poses):
+            image = photograph(pose)
+            if 16 <= number < 36:
+                image = np.roll(image, generator.integers(-1, 2, 2), (0, 1))
+            if number % 3 == 1:
+                image = cv2.blur(image, (9, 1))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    measures = measured(tmp_path / "clip.mp4", lambda done, total: None)
+    assert len(measures) == len(poses)
+    rest = measures[35].motion - measures[16].motion
+    assert rest < 0.2 * measures[-1].motion
+    frames = chosen(measures)
+    assert sum(16 <= number < 36 for number in frames) <= 2
+    assert sum(number % 3 == 1 for number in frames) <= len(frames) / 6
+    written = write_frames(tmp_path / "clip.mp4", tmp_path / "images", frames, lambda done, total: None)
+    assert [int(image.name) for image in written] == frames
+    assert written[-1].time == pytest.approx(frames[-1] / 30, abs=1e-3)
+    assert lacks_poses(tmp_path / "clip.mp4")
+
+
+def test_split_all_reads_every_view_once(tmp_path: Path) -> None:
+    frames = {
+        split: [
+            bn.View(bn.Frame("a", torch.full((4, 5, 3), value), bn.Intrinsics(5, 5, 2.5, 2, 5, 4)), pose),
+            bn.View(bn.Frame(split, torch.full((4, 5, 3), value), bn.Intrinsics(5, 5, 2.5, 2, 5, 4)), pose),
+        ]
+        for split, value, pose in zip(("train", "test"), (0.2, 0.8), walk(2), strict=True)
+    }
+    bn.write_transforms(tmp_path, frames)
+    read = all_views(bn.open_dataset(tmp_path))
+    assert [view.frame.name for view in read] == ["train_a", "train", "test_a", "test"]
+    single = tmp_path / "single"
+    write_single(single, frames["train"][0])
+    assert len(all_views(bn.open_dataset(single))) == 1  # in both splits
+
+
+def write_single(folder: Path, view: bn.View) -> None:
+    bn.write_transforms(folder, {"train": [view]})
+    (folder / "transforms_train.json").rename(folder / "transforms.json")
+
+
+def test_pairs_with_many_matches_tell_a_folded_model() -> None:
+    """Three photos of a cloud of points; that of the third place was put elsewhere, so two pairs contradict it."""
+    pycolmap = pytest.importorskip("pycolmap")
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[500.0, 320.0, 240.0, 0.02])
+    points = np.random.default_rng(0).uniform([-2, -1.5, 4], [2, 1.5, 8], (400, 3))
+    true = {
+        n: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.05 * n, 0])), [0.4 * n, 0, 0])
+        for n in (1, 2, 3)
+    }
+    seen = {n: camera.img_from_cam(T * points) for n, T in true.items()}
+    every = np.column_stack([np.arange(400)] * 2)
+    pairs = {(1, 2): every, (2, 3): every, (1, 3): every[:50]}
+    database = SimpleNamespace(
+        read_two_view_geometries=lambda: (
+            [pycolmap.image_pair_to_pair_id(*pair) for pair in pairs],
+            [SimpleNamespace(inlier_matches=matches) for matches in pairs.values()],
+        ),
+        read_keypoints=lambda number: seen[number],
+    )
+
+    def model(poses: dict[int, Any]) -> Any:
+        return SimpleNamespace(
+            reg_image_ids=lambda: list(poses),
+            image=lambda number: SimpleNamespace(camera_id=1, cam_from_world=lambda: poses[number]),
+            camera=lambda number: camera,
+        )
+
+    assert agreement(model(true), database, pycolmap) == Agreement(2, 0)
+    folded = true | {3: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.6, 0])), [-1.5, 0.5, 0])}
+    assert agreement(model(folded), database, pycolmap) == Agreement(2, 1)
+    assert agreement(model({1: true[1], 3: folded[3]}), database, pycolmap) == Agreement(0, 0)
+
+
+def test_poses_that_many_pairs_contradict_are_doubted(search: Search) -> None:
+    assert search.found.doubt is None
+    assert search.found.sure_pairs > 0
+    doubt = replace(search.found, sure_pairs=400, contradicting=3).doubt
+    assert doubt is not None
+    assert doubt.startswith("3 of 400 pairs")
+    assert replace(search.found, sure_pairs=400, contradicting=2).doubt is None

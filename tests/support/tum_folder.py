@@ -1,0 +1,64 @@
+"""Folders in the layout of the TUM RGB-D benchmark, written from frames whose poses are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bidnerf_core.frames import View
+
+HEAD = "# {}\n# file: 'rgbd_dataset.bag'\n# timestamp {}\n"
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A frame of the recording: times in seconds, pixels of 8 and 16 bits as they are stored."""
+
+    time: float
+    view: View  # whose pose is the truth at ``time``
+    depth_late: float = 0.004  # seconds by which the depth image is later than the colour image
+
+
+def write_recording(folder: Path, frames: Sequence[Recorded], seed: int = 0) -> Path:
+    """Write images, lists, and a ground truth that passes through the poses of the frames at constant velocities.
+
+    No sample of the ground truth is at the time of an image: each frame has one 3 ms before and one 6 ms after.
+    """
+    generator = np.random.default_rng(seed)
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    rows: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for frame in frames:
+        rgb = (frame.view.frame.rgb.numpy() * 255).round().astype(np.uint8)
+        rows["rgb"].append(_write(folder, "rgb", frame.time, rgb))
+        if frame.view.frame.depth is not None:
+            steps = (frame.view.frame.depth.double().numpy() * 5000).round().astype(np.uint16)
+            rows["depth"].append(_write(folder, "depth", frame.time + frame.depth_late, steps))
+        turn, shift = generator.normal(size=(2, 3))
+        for after in (-0.003, 0.006):
+            rows["groundtruth"].append(_pose_row(frame, turn * after, shift * after, after))
+    for name, columns in (
+        ("rgb", "filename"),
+        ("depth", "filename"),
+        ("groundtruth", "tx ty tz qx qy qz qw"),
+    ):
+        (folder / f"{name}.txt").write_text(HEAD.format(name, columns) + "".join(rows[name]))
+    return folder
+
+
+def _write(folder: Path, kind: str, time: float, pixels: np.ndarray) -> str:
+    name = f"{kind}/{time:.6f}.png"
+    iio.imwrite(folder / name, pixels)
+    return f"{time:.6f} {name}\n"
+
+
+def _pose_row(frame: Recorded, turn: np.ndarray, shift: np.ndarray, after: float) -> str:
+    T = frame.view.T_ref_camera
+    rotation = Rotation.from_matrix(T.rotation.numpy()) * Rotation.from_rotvec(turn)
+    numbers = [*(T.translation.numpy() + shift), *rotation.as_quat()]
+    return " ".join([f"{frame.time + after:.6f}", *(f"{number:.12f}" for number in numbers)]) + "\n"

@@ -1,0 +1,67 @@
+"""What tests of the viewer share: a map of a room with patterned walls, and a photo of it that is localized by landmarks."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from bidnerf_core import SE3, BakeConfig, Frame, Map, View, train
+from bidnerf_core.datasets import Query
+from photo_room import CAMERA, HALF, photograph
+from photo_room import walk as walk
+from tiny import config
+
+HOSTILE = "<script>document.title = 'run'</script>"
+_KEPT: list[TemporaryDirectory[str]] = []  # until the process ends
+
+
+def posed(T: SE3, name: str, seed: int = 0) -> View:
+    """Return a photo of the room with exact depth."""
+    rays = T.rotate(CAMERA.unproject(CAMERA.pixel_centres(torch.float64))).numpy()
+    with np.errstate(divide="ignore"):
+        depth = ((np.sign(rays) * HALF - T.translation.numpy()) / rays).min(-1)
+    return View(Frame.from_numpy(photograph(T, seed), CAMERA, depth=depth, depth_unit=1.0, name=name), T)
+
+
+@cache
+def room() -> Map:
+    """Return a map in a folder: its field is hardly trained, its surface and landmarks are exact."""
+    folder = TemporaryDirectory()
+    _KEPT.append(folder)
+    views = [posed(T, f"view {number}") for number, T in enumerate(walk(8))]
+    return train(
+        views,
+        backend="hashgrid",
+        out=Path(folder.name) / "room",
+        config=config(2),
+        bake=BakeConfig(cells=20_000),
+        refine_poses="never",
+    )
+
+
+def query(name: str = "unseen", seed: int = 0) -> Query:
+    """Return a photo from between two of those of the map; another ``seed`` is another room."""
+    view = posed(walk(15)[7], name, seed)
+    return Query(name, (view,), view.T_ref_camera)
+
+
+def photo_file(folder: Path, name: str = "photo.png") -> Path:
+    """Write a photo of the room to a file without a focal length."""
+    file = folder / name
+    Image.fromarray(photograph(walk(15)[5])).save(file)
+    return file
+
+
+def state_of(page: str) -> Any:
+    """Return the state that a page holds."""
+    found = re.search(r'<script type="application/json" id="state">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])

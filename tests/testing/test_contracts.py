@@ -1,0 +1,210 @@
+"""The bundled readers, methods, detectors and faults fulfil the contracts, and the contracts refuse what breaks them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.datasets import READERS, Dataset, Reader, ReadOptions, write_transforms
+from bidnerf_core.evaluation import FAULTS, find_fault
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import AutoConfig, Localization, Problem, find_method, settings_of
+from bidnerf_core.mapping import SIFT, Keypoints
+from bidnerf_core.registry import registered
+from bidnerf_core.testing import (
+    BOUNDS,
+    FaultContract,
+    FeaturesContract,
+    MethodContract,
+    ReaderContract,
+    training_views,
+)
+
+QUICK = AutoConfig(points=1000, hypotheses=64, rounds=1, refine_steps=0, fused_rays=128)
+
+
+class TestSift(FeaturesContract):
+    name = "sift"
+
+
+class TestAuto(MethodContract):
+    name, config = "auto", QUICK
+
+
+class TestBidLm(MethodContract):
+    name, config = "bid-lm", settings_of("bid-lm", {"poses": 8})
+    largest_error = 0.05
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a ``transforms.json``."""
+    folder = tmp_path_factory.mktemp("capture")
+    write_transforms(folder, {"train": list(training_views())}, BOUNDS.background)
+    return folder
+
+
+class TestTransforms(ReaderContract):
+    name = "transforms"
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, capture: Path) -> None:
+        type(self).folder = capture
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_bundled_fault_fulfils_the_contract(name: str) -> None:
+    assert_fulfilled(FaultContract, name=name)
+
+
+def laws_of(contract: type) -> list[str]:
+    return [name for name in dir(contract) if name.startswith("test_")]
+
+
+def assert_fulfilled(contract: type, **attributes: Any) -> None:
+    subject = type("Subject", (contract,), attributes)()
+    for name in laws_of(contract):
+        getattr(subject, name)()
+
+
+def failing(contract: type, **attributes: Any) -> dict[str, str]:
+    """Return the sentences of the tests that fail, by name."""
+    subject, found = type("Subject", (contract,), attributes)(), {}
+    for name in laws_of(contract):
+        try:
+            getattr(subject, name)()
+        except AssertionError as error:
+            found[name] = str(error)
+    return found
+
+
+class Converting(Reader):
+    """The reader of ``transforms.json`` with a mistake in its conversions."""
+
+    expected = "transforms.json"
+
+    def __init__(self, mistake: Any) -> None:
+        self.mistake = mistake
+
+    def recognises(self, path: Path) -> bool:
+        return READERS["transforms"].recognises(path)
+
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        dataset = READERS["transforms"].open(path, options)
+        views = dataset.views
+        dataset.views = lambda *a, **k: [self.mistake(view) for view in views(*a, **k)]  # type: ignore[method-assign]
+        return dataset
+
+
+def reversed_axes(view: View) -> View:
+    turned = SE3(torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)), torch.zeros(3).double())
+    return replace(view, T_ref_camera=view.T_ref_camera @ turned)
+
+
+def millimetres(view: View) -> View:
+    assert view.frame.depth is not None
+    return replace(view, frame=replace(view.frame, depth=1000 * view.frame.depth))
+
+
+def stretched(view: View) -> View:
+    T = view.T_ref_camera
+    return replace(view, T_ref_camera=SE3(1.1 * T.rotation, T.translation))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "test", "says"),
+    [
+        (reversed_axes, "test_axes_are_those_of_opencv", "x right, y down and z forward"),
+        (millimetres, "test_depth_has_the_unit_of_the_poses", "times the depth that the poses"),
+        (stretched, "test_poses_are_rigid", "not a rigid transform"),
+    ],
+)
+def test_a_mistake_of_a_reader_is_named(
+    capture: Path, monkeypatch: pytest.MonkeyPatch, mistake: Any, test: str, says: str
+) -> None:
+    monkeypatch.setitem(registered, ("readers", "mistaken"), Converting(mistake))
+    assert says in failing(ReaderContract, name="mistaken", folder=capture).get(test, "passed")
+
+
+class Deaf(Converting):
+    """A reader that ignores its options."""
+
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        return super().open(path, ReadOptions())
+
+
+def test_a_reader_that_ignores_its_options_is_named(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registered, ("readers", "mistaken"), Deaf(lambda view: view))
+    subject = type("Subject", (ReaderContract,), {"name": "mistaken", "folder": capture})()
+    with pytest.raises(AssertionError, match="the background is"):
+        subject.test_background_is_the_one_that_is_asked_for()
+
+
+def shifted(rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+    """Keypoints at places that do not depend on what the image shows."""
+    found = SIFT(rgb)
+    return replace(found, pixels=found.pixels[torch.randperm(len(found))])
+
+
+def everywhere(rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+    rows = torch.arange(20.0)
+    return Keypoints(torch.stack([rows, rows], -1), rows + 1, torch.zeros((20, 8), dtype=torch.uint8))
+
+
+@pytest.mark.parametrize(
+    ("detector", "test"),
+    [
+        (shifted, "test_keypoints_move_with_the_image"),
+        (shifted, "test_same_image_gives_the_same_keypoints"),
+        (everywhere, "test_blank_image_has_no_keypoints"),
+    ],
+)
+def test_a_mistake_of_a_detector_is_named(monkeypatch: pytest.MonkeyPatch, detector: Any, test: str) -> None:
+    monkeypatch.setitem(registered, ("features", "mistaken"), detector)
+    assert test in failing(FeaturesContract, name="mistaken")
+
+
+def credulous(problem: Problem, config: AutoConfig, seed: int) -> Localization:
+    found = find_method("auto").solve(problem, config, seed)
+    return replace(found, outcome=type(found.outcome).CONVERGED)
+
+
+def fickle(problem: Problem, config: AutoConfig, seed: int) -> Localization:
+    found = find_method("auto").solve(problem, config, seed)
+    return replace(found, T_world_camera=found.T_world_camera.retract(1e-3 * torch.randn(6).double()))
+
+
+@pytest.mark.parametrize(
+    ("solve", "test"),
+    [(credulous, "test_image_of_another_scene_is_rejected"), (fickle, "test_same_seed_gives_the_same_pose")],
+)
+def test_a_mistake_of_a_method_is_named(monkeypatch: pytest.MonkeyPatch, solve: Any, test: str) -> None:
+    monkeypatch.setitem(registered, ("methods", "mistaken"), replace(find_method("auto"), solve=solve))
+    subject = type("Subject", (MethodContract,), {"name": "mistaken", "config": QUICK})()
+    with pytest.raises(AssertionError):
+        getattr(subject, test)()
+
+
+def in_place(frame: Frame, size: float, generator: Generator) -> Frame:
+    frame.rgb.mul_(size)
+    return frame
+
+
+def unseeded(frame: Frame, size: float, generator: Generator) -> Frame:
+    return replace(frame, rgb=(frame.rgb + (size - 1) * torch.rand(1)).clamp(0, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "test"),
+    [(in_place, "test_given_image_is_left_alone"), (unseeded, "test_same_seed_gives_the_same_image")],
+)
+def test_a_mistake_of_a_fault_is_named(monkeypatch: pytest.MonkeyPatch, change: Any, test: str) -> None:
+    monkeypatch.setitem(registered, ("faults", "mistaken"), replace(find_fault("exposure"), change=change))
+    assert test in failing(FaultContract, name="mistaken")

@@ -1,0 +1,194 @@
+"""What only a GPU can show: skipped where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import baked
+import module_fields
+import tiny
+from bidnerf_core import Localizer, devices
+from bidnerf_core.backend import load_backend, quick_config
+from bidnerf_core.cli import main
+from bidnerf_core.devices import constant
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, render_image
+from bidnerf_core.localization import captured, settings_of
+from bidnerf_core.localization.solvers import adam
+from bidnerf_core.maps import load_map
+from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing import rgbd_views
+from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
+from problems import FieldMap
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
+
+BUNDLED = ("hashgrid", "vanilla", "adanerf")
+
+
+class Synchronizing(torch.nn.Module):
+    """A field that reads a number from the device in each query, as no step may."""
+
+    def __init__(self, field: torch.nn.Module) -> None:
+        super().__init__()
+        self.field: Any = field
+
+    @property
+    def sampler(self) -> Any:
+        return self.field.sampler
+
+    def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
+        assert float(positions.detach().abs().amax()) < 1e6
+        return self.field.query(positions, directions)  # type: ignore[no-any-return]
+
+
+def descent(field: Any, bounds: SceneBounds, method: str = "bid", steps: int = 50) -> Tensor:
+    """Return the poses (s 4 4) of a short descent on the GPU."""
+    view = rgbd_views(coverage=False)[0]
+    config = settings_of(method, {"max_steps": steps, "rays": 256})
+    localizer = Localizer(FieldMap(field, bounds, None), method, config, device="cuda")
+    return localizer(view.frame, perturb(view.T_ref_camera, 0.1, 3.0, seed=0)).poses.matrix()
+
+
+@pytest.fixture
+def captures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Whether each step that was to be captured could be."""
+    found: list[bool] = []
+
+    def noted(step: Any, *rest: Any) -> Any:
+        replay = captured(step, *rest)
+        found.append(replay is not step)
+        return replay
+
+    monkeypatch.setattr(adam, "captured", noted)
+    return found
+
+
+@pytest.mark.parametrize("method", ["bid", "inerf"])
+@pytest.mark.parametrize("name", BUNDLED)
+def test_replayed_steps_are_those_that_are_launched(
+    name: str, method: str, captures: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = load_backend(name)
+    field = backend.build(backend.config_type(), BOUNDS)
+    replayed = descent(field, BOUNDS, method)
+    assert captures == [True]
+    monkeypatch.setattr(adam, "captured", lambda step, *_: step)
+    launched = descent(field, BOUNDS, method)
+    assert len(replayed) == len(launched) == 51
+    torch.testing.assert_close(replayed, launched, rtol=0, atol=1e-4)
+
+
+def test_a_captured_step_keeps_the_constants_that_it_reads(captures: list[bool]) -> None:
+    field, device = module_fields.field().to("cuda"), torch.device("cuda")
+    expected, start = descent(field, baked.BOUNDS), torch.zeros(3, device=device)
+    step_result = torch.zeros(3, device=device)
+
+    def step() -> None:
+        step_result.copy_(start + constant((1.25, -2.5, 3.75), start))
+
+    step()
+    replay = captured(step, device, torch.Generator(device))
+    devices.forget()
+    _ = [torch.full((3,), -1.0, device=device) for _ in range(1000)]  # would take its place
+    step_result.zero_()
+    replay()
+    assert step_result.tolist() == [1.25, -2.5, 3.75]
+    torch.testing.assert_close(descent(field, baked.BOUNDS), expected, rtol=0, atol=1e-4)
+
+
+def test_steps_of_a_field_that_reads_from_the_device_are_launched(captures: list[bool]) -> None:
+    field = module_fields.field()
+    plain = descent(field, baked.BOUNDS)
+    with pytest.warns(UserWarning, match="cannot be captured"):
+        reading = descent(Synchronizing(field), baked.BOUNDS)
+    again = descent(field, baked.BOUNDS)
+    assert captures == [True, False, True]
+    assert torch.cuda.current_stream() == torch.cuda.default_stream()
+    for found in (reading, again):
+        torch.testing.assert_close(found, plain, rtol=0, atol=1e-4)
+
+
+class LossRecorder(Silent):
+    """A report that keeps the losses."""
+
+    def __init__(self) -> None:
+        self.losses: list[float] = []
+
+    def step(self, progress: TrainingStep) -> None:
+        self.losses.append(progress.loss)
+
+
+class Interrupted(Silent):
+    """A report that stops a training at a step and keeps its state, or begins with such a state."""
+
+    def __init__(self, stop: int = 0, begin: TrainingState | None = None) -> None:
+        self.stop, self.begin, self.stopping = stop, begin, False
+        self.saved: TrainingState | None = None
+
+    def resume(self) -> TrainingState | None:
+        return self.begin
+
+    def step(self, progress: TrainingStep) -> None:
+        self.stopping = progress.step == self.stop
+
+    def save(self, state: TrainingState) -> None:
+        parts = (
+            {name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer)
+        )
+        self.saved = TrainingState(state.step, *parts)
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_training_on_a_gpu_learns_what_it_learns_on_a_cpu(name: str) -> None:
+    backend, losses = load_backend(name), []
+    config = replace(quick_config(backend), steps=60)
+    for device in ("cpu", "cuda"):
+        field: Any = backend.build(config, BOUNDS)
+        report = LossRecorder()
+        backend.train(field.to(device), rgbd_views(), config, report)
+        losses.append(torch.tensor(report.losses))
+    on_cpu, on_gpu = losses
+    torch.testing.assert_close(on_gpu[:5], on_cpu[:5], rtol=1e-3, atol=1e-5)
+    assert float(on_gpu[-5:].mean()) < 1.1 * float(on_cpu[-5:].mean())
+
+
+def test_a_training_goes_on_on_another_device() -> None:
+    backend = load_backend("hashgrid")
+    config, views = replace(quick_config(backend), steps=12), rgbd_views()
+    finished = []
+    for second in ("cpu", "cuda"):
+        half = Interrupted(stop=6)
+        with pytest.raises(TrainingStopped):
+            backend.train(backend.build(config, BOUNDS), views, config, half)  # on the CPU
+        field: Any = backend.build(config, BOUNDS)
+        backend.train(field.to(second), views, config, Interrupted(begin=half.saved))
+        finished.append(field.cpu().state_dict())
+    for name, value in finished[0].items():
+        if value.is_floating_point() and not name.endswith(("peak", "density")):
+            torch.testing.assert_close(finished[1][name], value, rtol=0, atol=2e-3)
+
+
+def test_a_map_that_was_made_on_a_gpu_serves_on_a_cpu(tmp_path: Path) -> None:
+    data, map = tiny.write_dataset(tmp_path / "data"), tmp_path / "map"
+    assert main(["train", str(data), "--out", str(map), "--device", "cuda", *tiny.options()]) == 0
+    assert main(["bake", str(map), "--device", "cuda", "--opacity", "0.01", "--agreement", "0"]) == 0
+    made = load_map(map)
+    assert made.surface is not None
+    assert device_of(made.field).type == made.surface.surfels.positions.device.type == "cpu"
+
+
+def test_levels_lie_where_their_field_does() -> None:
+    backend = load_backend("hashgrid")
+    field: Any = backend.build(backend.config_type(), BOUNDS)
+    view = rgbd_views()[0]
+    there = field.to("cuda")
+    for level in levels(there):
+        assert device_of(level).type == "cuda"
+        assert render_image(level, view.frame.intrinsics, view.T_ref_camera, BOUNDS).rgb.device.type == "cpu"

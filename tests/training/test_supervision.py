@@ -1,0 +1,258 @@
+"""Depth supervision: what the term asks for, and that every backend's recipe heeds it, however few pixels were measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_adanerf import AdaNerfConfig
+from bidnerf_adanerf import backend as adanerf
+from bidnerf_core.fields import Rays, RaySamples, Rendering, render, rendering_weights
+from bidnerf_core.frames import SeenLandmarks, View
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination, supervised_loss
+from bidnerf_core.training.loss import distortion, expected_distance
+from bidnerf_core.training.ray_bank import LANDMARK_SHARE
+from bidnerf_hashgrid import backend as hashgrid
+from bidnerf_vanilla import VanillaConfig
+from bidnerf_vanilla import backend as vanilla
+
+BOUNDS = demo_object().bounds
+VANILLA = VanillaConfig(
+    layers=2, width=32, skip=1, position_frequencies=4, direction_frequencies=1, coarse_samples=16, fine_samples=8,
+    room_resolution=16, samples_per_step=2048, rays_at_most=256, learning_rate=0.01,
+)  # fmt: skip
+ADANERF = AdaNerfConfig(
+    width=32, layers=2, position_frequencies=4, oracle_width=32, oracle_layers=2, ray_points=4, ray_frequencies=2,
+    bins=16, max_samples=5, samples_per_step=4096, rays_at_most=256, learning_rate=0.02, room_resolution=16,
+)  # fmt: skip
+BACKENDS = {
+    "hashgrid": (hashgrid, tiny.config()),
+    "vanilla": (vanilla, VANILLA),
+    "adanerf": (adanerf, ADANERF),
+}
+
+
+def ray(density: torch.Tensor, measured: float) -> tuple[Rendering, TrainingBatch]:
+    """One ray through ten cells of half a metre, and what was measured along it."""
+    borders = torch.linspace(0, 5, 11, dtype=density.dtype)[None]
+    samples = RaySamples(borders[:, :-1], borders[:, 1:], torch.ones(1, 10, dtype=torch.bool))
+    weights = rendering_weights(density[None], samples)
+    distance = (weights * samples.middles).sum(-1)
+    rgb = torch.zeros(1, 3, dtype=density.dtype)
+    zero = density.new_zeros(1, 3)
+    batch = tiny.black_batch(Rays(zero, zero, zero[:, 0], zero[:, 0] + 5), density.new_tensor([measured]))
+    return Rendering(rgb, distance, weights.sum(-1), weights, samples), batch
+
+
+def by_density(density: torch.Tensor, measured: float) -> torch.Tensor:
+    density = density.clone().requires_grad_()
+    return torch.autograd.grad(ray_termination(*ray(density, measured)), density)[0]
+
+
+def test_the_derivative_is_the_numerical_one() -> None:
+    density = torch.rand(10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda d: ray_termination(*ray(d, 3.25)), density.requires_grad_(), eps=1e-6, atol=1e-8
+    )
+
+
+def test_weight_is_pulled_to_where_depth_was_measured() -> None:
+    """Matter at the measured place lowers the term most in thin fog, and the farther from it, the less it does."""
+    slope = by_density(torch.full((10,), 0.01, dtype=torch.float64), 3.25)  # the middle of cell 6
+    assert int(slope.argmin()) == 6
+    assert bool((slope < 0).all())  # any matter beats none: what a ray lacks counts as at the camera
+    assert bool((slope[:7].diff() < 0).all())
+    assert bool((slope[6:].diff() > 0).all())
+
+
+def test_matter_in_front_of_a_surface_is_removed() -> None:
+    density = torch.full((10,), 0.01, dtype=torch.float64)
+    density[6] = 50.0
+    slope = by_density(density, 3.25)
+    assert bool((slope[:6] > 0).all())
+    assert float(slope[7:].abs().max()) < 1e-9  # nobody sees what is behind it
+
+
+def test_a_wall_behind_the_measured_surface_is_moved_forward() -> None:
+    density = torch.full((10,), 0.01, dtype=torch.float64)
+    density[9] = 50.0
+    slope = by_density(density, 3.25)
+    assert int(slope.argmin()) == 6
+    assert float(slope[6]) < 0
+
+
+def test_rays_without_depth_do_not_count() -> None:
+    density = torch.full((10,), 0.3, dtype=torch.float64)
+    assert float(ray_termination(*ray(density, 0.0))) == 0
+    assert float(by_density(density, 0.0).abs().max()) == 0
+    rendering, batch = ray(density, 3.25)
+    assert supervised_loss(rendering, batch, 2.0, 0.0)[0] == 0
+
+
+def test_the_loss_is_the_mean_over_measured_rays() -> None:
+    densities = torch.rand(3, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    parts = [ray(density, measured) for density, measured in zip(densities, (3.25, 0.0, 1.5), strict=True)]
+    first, none, last = (float(ray_termination(*part)) for part in parts)
+    assert none == 0
+    renderings, batches = zip(*parts, strict=True)
+    samples = RaySamples(*map(torch.cat, zip(*(r.samples.parts for r in renderings), strict=True)))
+    weights, distance = (
+        torch.cat([getattr(r, name) for r in renderings]) for name in ("weights", "distance")
+    )
+    together = Rendering(torch.zeros(3, 3), distance, weights.sum(-1), weights, samples)
+    measured = torch.cat([batch.observed.distance for batch in batches])
+    zero = measured.new_zeros(3, 3)
+    rays = Rays(zero, zero, zero[:, 0], zero[:, 0] + 5)
+    found = ray_termination(together, tiny.black_batch(rays, measured))
+    assert float(found) == pytest.approx((first + last) / 2)
+
+
+@dataclass(frozen=True)
+class Few:
+    """How much of a depth image is kept."""
+
+    every: int
+
+    def of(self, view: View) -> View:
+        assert view.frame.depth is not None
+        kept = torch.zeros_like(view.frame.depth).reshape(-1)
+        index = view.frame.depth.reshape(-1).nonzero()[:: self.every, 0]
+        kept[index] = view.frame.depth.reshape(-1)[index]
+        return replace(view, frame=replace(view.frame, depth=kept.reshape(view.frame.depth.shape)))
+
+
+def trained(name: str, views: Sequence[View], **changes: Any) -> Any:
+    backend, config = BACKENDS[name]
+    config = replace(config, **({"steps": 40, "carve": False} | changes))  # type: ignore[type-var]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        field = backend.build(config, BOUNDS)
+        backend.train(field, views, config, Silent())
+    return field
+
+
+def misplaced(field: Any, views: Sequence[View]) -> float:
+    """The depth term where depth was measured: mean distance of the weight from there, metres."""
+    batch = RayBank(views, BOUNDS).draw(3000, torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        return float(ray_termination(render(field, batch.rays, batch.background), batch))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_every_backend_heeds_sparse_depth(name: str) -> None:
+    """One pixel in ten with depth brings the matter of all pixels nearer to where it is."""
+    dense = tiny.views()
+    sparse = [Few(10).of(view) for view in dense]
+    assert 0 < sum(int((v.frame.depth > 0).sum()) for v in sparse) < 400  # type: ignore[operator]
+    with_depth, without = (trained(name, sparse, depth_weight=weight) for weight in (1.0, 0.0))
+    assert misplaced(with_depth, dense) < 0.9 * misplaced(without, dense)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_single_measured_pixel_and_none_are_fine(name: str) -> None:
+    one = [Few(10**6).of(view) for view in tiny.views()]
+    none = [replace(v, frame=replace(v.frame, depth=None)) for v in one]
+    for views in (one, none, [one[0], *none[1:]]):
+        for carve in (True, False):
+            field = trained(name, views, steps=4, depth_weight=1.0, carve=carve)
+            assert all(bool(p.isfinite().all()) for p in field.parameters())
+
+
+# Landmarks.
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.4, 2.0])
+def test_the_expected_distance_is_the_mean_of_draws(sigma: float) -> None:
+    offset = torch.tensor([-3.0, -0.5, 0.0, 0.2, 1.7], dtype=torch.float64)
+    errors = sigma * torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = (offset + errors).abs().mean(0)
+    found = expected_distance(offset, torch.tensor(sigma, dtype=torch.float64).expand(5))
+    torch.testing.assert_close(found, expected, rtol=0, atol=4 * sigma / 200_000**0.5)
+
+
+def test_without_deviation_the_expected_distance_is_the_distance() -> None:
+    offset = torch.linspace(-4, 4, 41, dtype=torch.float64)
+    assert torch.equal(expected_distance(offset, torch.zeros(41, dtype=torch.float64)), offset.abs())
+    barely = expected_distance(offset, torch.full((41,), 1e-9, dtype=torch.float64))
+    torch.testing.assert_close(barely, offset.abs(), rtol=0, atol=1e-8)
+
+
+def test_the_expected_distance_has_the_derivative_that_differences_show() -> None:
+    offset = torch.tensor([-2.0, -0.3, 0.1, 0.9], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda o: expected_distance(o, torch.full_like(o, 0.5)), offset)
+
+
+def test_a_landmark_pulls_weight_to_itself_and_less_the_less_certain_it_is() -> None:
+    def slope(deviation: float) -> torch.Tensor:
+        density = torch.full((10,), 0.01, dtype=torch.float64, requires_grad=True)
+        rendering, batch = ray(density, 3.25)
+        batch = replace(batch, deviation=torch.full_like(batch.deviation, deviation))
+        return torch.autograd.grad(ray_termination(rendering, batch), density)[0]
+
+    sharp, vague = slope(0.1), slope(2.0)
+    assert int(sharp.argmin()) == int(vague.argmin()) == 6
+    assert float(vague[6] - vague[4]) > float(sharp[6] - sharp[4])  # both negative
+
+
+def seen(view: View, every: int) -> View:
+    """The view with the depth of some pixels as landmarks, and no depth."""
+    assert view.frame.depth is not None
+    rows, columns = (index[::every] for index in (view.frame.depth > 0).nonzero(as_tuple=True))
+    pixels = torch.stack([columns, rows], dim=-1) + 0.5
+    ray = view.frame.intrinsics.unproject(pixels)
+    distance = view.frame.depth[rows, columns] * torch.linalg.vector_norm(ray, dim=-1)
+    landmarks = SeenLandmarks(pixels, distance, torch.full_like(distance, 0.01))
+    return replace(view, frame=replace(view.frame, depth=None), landmarks=landmarks)
+
+
+def test_a_share_of_the_rays_ends_at_landmarks_where_they_are() -> None:
+    views = tiny.views()
+    batch = RayBank([seen(view, 7) for view in views], BOUNDS).draw(800, torch.Generator().manual_seed(1))
+    known = batch.observed.measured
+    assert int(known.sum()) == round(LANDMARK_SHARE * 800)
+    assert torch.equal(known, batch.deviation > 0)
+    exact = RayBank(views, BOUNDS)
+    points = batch.observed[known].points
+    surface = exact.draw(20_000, torch.Generator().manual_seed(2)).observed
+    off = torch.cdist(points, surface[surface.measured].points).amin(1)
+    assert (
+        float((off < 1e-3).float().mean()) > 0.95
+    )  # each is a pixel's point, and nearly all pixels were drawn
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_every_backend_heeds_landmarks(name: str) -> None:
+    dense = tiny.views()
+    with_them, without = (
+        trained(name, [seen(view, 10) for view in dense], depth_weight=weight) for weight in (1.0, 0.0)
+    )
+    assert misplaced(with_them, dense) < 0.9 * misplaced(without, dense)
+
+
+# Distortion.
+
+
+def random_rendering() -> Rendering:
+    density = torch.rand(10, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    return ray(density, 0.0)[0]
+
+
+def test_distortion_is_the_double_sum_of_its_definition() -> None:
+    rendering = random_rendering()
+    weights, middles = rendering.weights[0], rendering.samples.middles[0] / 2.5
+    width = (rendering.samples.ends - rendering.samples.starts)[0] / 2.5
+    pairs = (weights[:, None] * weights * (middles[:, None] - middles).abs()).sum()
+    expected = pairs + (weights**2 * width).sum() / 3
+    torch.testing.assert_close(distortion(rendering, 2.5), expected)
+
+
+def test_weight_in_one_place_has_the_least_distortion() -> None:
+    wall = torch.zeros(10, dtype=torch.float64)
+    wall[4] = 100.0
+    assert float(distortion(ray(wall, 0.0)[0], 5.0)) < 0.2 * float(distortion(random_rendering(), 5.0))

@@ -1,0 +1,391 @@
+"""The viewer's page: what it says of a localization, and that it is whole, closed and safe."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import viewed
+from bidnerf_core import SE3, InputError, Intrinsics, Localizer, view
+from bidnerf_core.cli.report import link_to
+from bidnerf_core.errors import Cancelled
+from bidnerf_core.evaluation import ResultTable
+from bidnerf_core.evaluation.report import doubtful
+from bidnerf_core.evaluation.report import page as report_page
+from bidnerf_core.evaluation.summary import usual_criterion
+from bidnerf_core.evaluation.trial import ScalarPoseError
+from bidnerf_core.fields import render_image
+from bidnerf_core.localization import (
+    ADVICE,
+    METHODS,
+    ComparedExplanation,
+    DescentDiagnostics,
+    LandmarkThresholds,
+    Outcome,
+    SearchRecord,
+    Support,
+    recorded,
+)
+from bidnerf_core.localization.recording import current_record
+from bidnerf_core.progress import stopped_by
+from bidnerf_core.results import PosedImage, write_poses
+from bidnerf_core.viewer import ShownAnswer, shown_trajectory
+from bidnerf_core.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
+from bidnerf_core.viewer.explanations import EARLIER, HERE, KEPT, contests
+from bidnerf_core.viewer.figures import Bar, acceptance_figures
+from bidnerf_core.viewer.packing import packed_points
+from bidnerf_core.viewer.page_state import PageState
+from bidnerf_core.viewer.rendering import field_image, quick_image
+from bidnerf_core.viewer.saving import MODULES, page_html
+from bidnerf_core.viewer.scene import shown_map, towards
+from bidnerf_core.viewer.view import localized
+from commands import Run
+
+
+@pytest.fixture(scope="module")
+def localizer() -> Localizer:
+    return Localizer(viewed.room())
+
+
+@pytest.fixture(scope="module")
+def found(localizer: Localizer) -> ShownAnswer:
+    return localized(localizer, viewed.query())
+
+
+def test_a_trajectory_in_another_unit_than_the_map_is_remarked(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "bidnerf")
+    image = PosedImage("a", 0, Intrinsics(50, 50, 32, 24, 64, 48), SE3.identity(), time=1.0, unit="units")
+    for ending in ("json", "tum"):
+        write_poses(tmp_path / f"path.{ending}", [image])
+        for unit in ("units", None):
+            shown_trajectory(tmp_path / f"path.{ending}", unit)
+        assert not caplog.text
+        shown_trajectory(tmp_path / f"path.{ending}", "metres")
+        assert f"path.{ending}: is in units, but the map is in metres" in caplog.text
+        caplog.clear()
+
+
+@pytest.fixture(scope="module")
+def refused(localizer: Localizer) -> ShownAnswer:
+    return localized(localizer, viewed.query(viewed.HOSTILE, seed=5))
+
+
+def test_an_accepted_pose_passes_its_figures(found: ShownAnswer) -> None:
+    assert found.accepted
+    assert found.error is not None
+    assert found.error[0] < 0.02
+    assert all(figure.passed is not False for figure in found.figures)
+    assert found.matches is not None
+    assert found.matches.agreeing >= LandmarkThresholds().inliers
+    assert [step.caption for step in found.steps][-1] == "the pose found"
+    assert found.ellipsoid is not None
+    assert found.observed is not None
+    assert found.rendered is not None
+    assert found.depth is not None
+
+
+def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: ShownAnswer) -> None:
+    assert not refused.accepted
+    assert any(figure.passed is False for figure in refused.figures)
+    assert max(len(step.scores) for step in refused.steps) > 50  # the hypotheses of the search on the surface
+    assert refused.runner_up is not None
+
+
+def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(found: ShownAnswer, refused: ShownAnswer) -> None:
+    figures = [figure for answer in (found, refused) for figure in answer.figures if figure.bar]
+    assert {figure.passed for figure in figures} == {True, False}
+    for figure in figures:
+        assert figure.bar is not None
+        value, at_least = figure.bar.value, figure.bar.at_least
+        assert figure.passed is (value >= 0.5 if at_least else value <= 0.5), figure
+        assert 0 <= value <= 1
+        assert at_least is figure.threshold.startswith("at least")
+    bar, far = Bar.of(3.22, 3.0, at_least=False), Bar.of(1.47, 0.25, at_least=False)
+    assert bar is not None
+    assert math.isclose(bar.value / 0.5, 3.22 / 3.0)
+    assert far == Bar(1.0, False)
+    assert Bar.of(math.nan, 3.0, True) is None
+
+
+def test_a_refusal_says_what_to_try_and_a_method_what_it_is(found: ShownAnswer, refused: ShownAnswer) -> None:
+    assert found.advice == ""
+    assert refused.advice == ADVICE[Outcome(refused.outcome)].first
+    assert found.method_summary == METHODS["auto"].summary
+
+
+def test_probabilities_of_the_answers_to_a_question_add_up(found: ShownAnswer, refused: ShownAnswer) -> None:
+    shown = [contest for answer in (found, refused) for contest in answer.contests]
+    assert shown
+    for contest in shown:
+        assert math.isclose(sum(each.probability for each in contest.answers), 1, abs_tol=0.02), contest
+
+
+def test_each_comparison_is_a_contest_of_its_own(localizer: Localizer) -> None:
+    answer = localizer(viewed.query().views)
+    there = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 2.0)
+    mirror, twin = ComparedExplanation("mirrored", 90.0, None), ComparedExplanation("a twin", -1.0, there)
+    record = SearchRecord(explanations=[mirror, twin])
+    questions = [contest.question for contest in contests(answer, record)]
+    assert questions[:2] == ["Pose or mirror image?", "This pose or another?"]
+    refused = replace(answer, outcome=Outcome.AMBIGUOUS)
+    assert (
+        contests(refused, record)[0].question == "This pose or another?"
+    )  # a beaten mirror image is no news
+    doubtful = SearchRecord(explanations=[replace(mirror, log_odds=1.0)])
+    assert contests(refused, doubtful)[0].question == "Pose or mirror image?"
+    pose, other = contests(refused, record)[0].answers
+    assert other.name == f"a pose {2 * math.sqrt(3):.3g} m away"
+    assert other.probability > pose.probability
+
+
+def test_the_loss_of_a_descent_is_the_first_figure(localizer: Localizer) -> None:
+    said, answer = Support(0.9, 5.0, -3.0, 9.0), localizer(viewed.query().views)
+    lost = replace(answer, confidence=said.confidence, diagnostics=DescentDiagnostics(0.036, 0.02, said))
+    first = acceptance_figures(lost, None)[0]
+    assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "below 0.02", False)  # fmt: skip
+    assert "not even a local optimum" in contests(lost, None)[0].remark
+
+
+def test_a_descent_is_shown_step_by_step_with_its_loss(localizer: Localizer) -> None:
+    answer = localizer(viewed.query().views)
+    T, losses = SE3.stack([*viewed.walk(500), answer.T_world_camera]), torch.linspace(0.5, 0.1, 500)
+    steps = shown_answer(viewed.room(), "descent", replace(answer, poses=T, losses=losses)).steps
+    assert len(steps) <= MOST_STEPS + 1
+    assert [steps[0].caption, steps[-1].caption] == ["step 0 of 500", HERE]
+    assert [step.loss for step in steps] == sorted((step.loss for step in steps if step.loss), reverse=True)
+    assert steps[0].loss == 0.5
+
+
+def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(localizer: Localizer) -> None:
+    query = viewed.query()
+    with recorded() as record:
+        answer = localizer(query.views)
+    here = shown_answer(viewed.room(), "here", answer, query.frame, record)
+    assert {figure.pose for figure in here.figures} == {here.matches.pose if here.matches else None} == {""}
+    away = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 1.0)
+    given_up = replace(answer, T_world_camera=away, diagnostics=None, confidence=None)
+    there = shown_answer(viewed.room(), "there", given_up, query.frame, record)
+    assert (
+        {figure.pose for figure in there.figures}
+        == {there.matches.pose if there.matches else None}
+        == {EARLIER}
+    )
+    assert EARLIER in next(each.remark for each in there.contests if not each.of_pose)
+
+
+def test_a_likelier_pose_is_shown_as_such_also_once_it_was_taken(localizer: Localizer) -> None:
+    query = viewed.query()
+    with recorded() as record:
+        answer = localizer(query.views)
+    T = answer.T_world_camera
+    there = replace(T, translation=T.translation + 1.0)
+    compared = SearchRecord(record.steps, record.landmarks, [ComparedExplanation("two places", -2.0, there)])
+    kept = shown_answer(viewed.room(), "a", replace(answer, outcome=Outcome.AMBIGUOUS), record=compared)
+    assert kept.runner_up is not None
+    assert kept.runner_up.probability == pytest.approx(1 / (1 + math.exp(-2)))
+    assert kept.contests[0].remark == KEPT
+    assert kept.steps[-2].caption == "two places"  # both poses, the likelier first
+    assert kept.steps[-2].scores == (-2.0, 0.0)
+    taken = shown_answer(viewed.room(), "b", replace(answer, T_world_camera=there), record=compared)
+    assert taken.runner_up is not None
+    assert taken.runner_up.probability == pytest.approx(1 / (1 + math.exp(2)))
+    assert taken.runner_up.pose == pytest.approx(
+        record.landmarks[-1].T_world_camera.matrix().flatten().tolist()
+    )
+    assert taken.contests[0].answers[0].probability > 0.8
+
+
+def test_a_localization_is_not_recorded_unless_asked_for(localizer: Localizer) -> None:
+    query = viewed.query()
+    with recorded() as record:
+        with_record = localizer(query.views)
+    steps = len(record.steps)
+    without = localizer(query.views)
+    assert current_record() is None
+    assert len(record.steps) == steps > 0
+    assert torch.equal(with_record.T_world_camera.matrix(), without.T_world_camera.matrix())
+
+
+def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator: torch.Generator) -> None:
+    root = torch.randn((6, 6), generator=generator, dtype=torch.float64)
+    covariance = root @ root.mT
+    T = SE3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
+    found = ellipsoid(T, covariance)
+    assert found is not None
+    axes = torch.tensor(found.axes, dtype=torch.float64).reshape(3, 3)
+    world = T.rotation @ covariance[:3, :3] @ T.rotation.mT
+    torch.testing.assert_close(axes.mT @ axes, 4 * world)
+    assert found.lengths == tuple(sorted(found.lengths, reverse=True))
+    assert ellipsoid(T, torch.full((6, 6), torch.nan)) is None
+    assert ellipsoid(T, None) is None
+
+
+def test_depth_difference_is_the_offset_of_a_shifted_measurement(localizer: Localizer) -> None:
+    image = localizer.scene.render(viewed.query().views[0])
+    frame = viewed.query().frame
+    shifted = depth_difference(
+        image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0))
+    )
+    assert shifted is not None
+    assert math.isclose(shifted.median, 0.25, rel_tol=1e-4)
+    assert depth_difference(image, replace(frame, depth=None)) is None
+
+
+def test_normals_point_to_the_side_of_the_cameras(generator: torch.Generator) -> None:
+    places = torch.nn.functional.normalize(torch.randn((200, 3), generator=generator), dim=-1)
+    signs = torch.randn((200, 1), generator=generator).sign()
+    inside, outside = (
+        torch.zeros((1, 3)),
+        5 * torch.eye(3).repeat(2, 1) * torch.tensor([[1.0]] * 3 + [[-1.0]] * 3),
+    )
+    torch.testing.assert_close(towards(places, signs * places, inside), -places)
+    torch.testing.assert_close(towards(places, signs * places, outside), places)
+    torch.testing.assert_close(towards(places, places, places[:0]), places)
+
+
+def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) -> None:
+    points = 1000 + 7 * torch.randn((50, 3), generator=generator, dtype=torch.float64)
+    found = packed_points(points)
+    from base64 import b64decode
+
+    places = np.frombuffer(b64decode(found.places.base64), "<u2").reshape(-1, 3)
+    back = np.array(found.lower) + places / 65535 * found.size
+    assert np.abs(back - points.numpy()).max() <= found.size / 65535
+    assert packed_points(points[:0]).places.shape == (0, 3)
+
+
+def test_the_page_holds_its_state_and_hostile_names_stay_text(
+    found: ShownAnswer, refused: ShownAnswer
+) -> None:
+    state = PageState(shown_map(viewed.room(), 2), (found, refused), title=viewed.HOSTILE)
+    page = page_html(state)
+    assert viewed.HOSTILE not in page
+    assert page.count("</script>") == 3  # of the state, of three.js and of the modules
+    held = viewed.state_of(page)
+    assert [answer["name"] for answer in held["answers"]] == ["unseen", viewed.HOSTILE]
+    assert len(held["map"]["cameras"]) == 8
+    assert held["map"]["unit"] == "m"
+
+
+def test_the_page_asks_nobody_for_anything(found: ShownAnswer) -> None:
+    page = page_html(PageState(shown_map(viewed.room(), 0), (found,)))
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    assert "connect-src 'none'" in policy[1]
+    script = re.search(r"script-src ([^;]*);", policy[1])
+    assert script is not None
+    assert "unsafe" not in script[1]
+    assert not re.search(r'(?:src|href)="(?!data:)[^"]', page.partition("<script>")[0])
+    modules = page.rpartition('<script type="module">')[2]
+    assert "import " not in re.sub(r"//.*", "", modules)
+    assert len(MODULES) == len(set(MODULES))
+
+
+def test_names_of_the_pages_modules_are_defined_once() -> None:
+    page = page_html(PageState(shown_map(viewed.room(), 0)))
+    modules = page.rpartition('<script type="module">')[2]
+    names = re.findall(r"^(?:async )?(?:function|class|const|let) (\w+)", modules, re.MULTILINE)
+    assert len(names) == len(set(names))
+
+
+def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(found: ShownAnswer) -> None:
+    query = viewed.query()
+    shown = view(viewed.room(), frame=query.frame)
+    markup = shown._repr_html_()
+    assert 'sandbox="allow-scripts"' in markup
+    source = re.search(r'srcdoc="([^"]*)"', markup)
+    assert source is not None
+    assert viewed.state_of(html.unescape(source[1]))["answers"][0]["outcome"] == "converged"
+    assert "1 localization" in repr(shown)
+
+
+def test_another_explanation_that_fits_as_well_is_the_first_figure(localizer: Localizer) -> None:
+    answer = localizer(viewed.query().views)
+    twin, mirror = (
+        ComparedExplanation("a twin", 0.0, answer.T_world_camera),
+        ComparedExplanation("mirrored", 90.0, None),
+    )
+    first = acceptance_figures(answer, SearchRecord(explanations=[mirror, twin]))[0]
+    assert (first.passed, first.value) == (False, "50.0%")
+    assert acceptance_figures(answer, SearchRecord(explanations=[mirror]))[0].passed
+
+
+def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(
+    localizer: Localizer, tmp_path: Path
+) -> None:
+    localizer(viewed.query().views).save(tmp_path / "pose.json")
+    from bidnerf_core import Localization
+
+    answer = shown_answer(viewed.room(), "earlier", Localization.load(tmp_path / "pose.json"))
+    assert answer.accepted
+    assert answer.rendered is None
+    assert answer.figures[0].name == "confidence"
+
+
+def test_what_is_no_map_is_refused() -> None:
+    with pytest.raises(InputError, match="expected a Map"):
+        view("room")  # type: ignore[arg-type]
+
+
+def test_view_saves_a_page_of_photos(bidnerf: Run, tmp_path: Path) -> None:
+    photo, page = viewed.photo_file(tmp_path), tmp_path / "page.html"
+    folder = viewed.room().folder
+    done = bidnerf("view", folder, photo, "--save", page)
+    assert done.status == 0, done.err
+    (answer,) = viewed.state_of(page.read_text())["answers"]
+    assert answer["name"] == "photo"
+    assert answer["accepted"], answer["reason"]
+    assert bidnerf("view", folder, photo, "--save", tmp_path / "page.txt").status != 0
+    assert bidnerf("view", folder, photo, "--save", photo).status != 0
+    nothing = bidnerf("view", folder, tmp_path / "none.png", "--save", page)
+    assert nothing.status == 1
+    assert "none.png" in nothing.err
+    some = bidnerf("view", folder, photo, tmp_path / "none.png", "--save", page)
+    assert some.status == 0
+    assert "none.png" in some.err
+    (_, answer) = viewed.state_of(page.read_text())["answers"]  # the page says what is wrong, too
+    assert not answer["accepted"]
+    assert "none.png" in answer["reason"]
+
+
+def test_a_report_links_to_the_frames_that_are_wrong_or_refused() -> None:
+    table = ResultTable.load(Path(__file__).parents[1] / "evaluation" / "earlier_results.jsonl")
+    first = table.rows[0]
+    wrong = replace(first, converged=True, error=ScalarPoseError(0.3, 1.0), frame="wrong #1")
+    right = replace(first, converged=True, error=ScalarPoseError(0.01, 1.0), frame="right")
+    refused = replace(first, converged=False, error=ScalarPoseError(0.01, 1.0), frame=viewed.HOSTILE)
+    rows = (refused, right, wrong)
+    assert [row.frame for row in doubtful(rows)] == ["wrong #1", viewed.HOSTILE]
+    html_text = report_page("t", ResultTable(rows), [], [], usual_criterion(rows), "view.html")
+    assert 'href="view.html#frame=wrong%20%231"' in html_text
+    assert viewed.HOSTILE not in html_text
+    assert 'href="view.html' not in report_page("t", ResultTable(rows), [], [], usual_criterion(rows))
+    assert link_to(Path("/a/pages/my map.html"), Path("/a/report")) == "../pages/my%20map.html"
+
+
+def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted() -> None:
+    scene, pose = viewed.room(), viewed.walk(3)[1]
+    camera = Intrinsics.from_hfov(60, 160, 90)
+    whole = render_image(scene.field, camera, pose, scene.bounds).rgb
+    asked = list[bool]()
+
+    def wanted_twice() -> bool:
+        asked.append(True)
+        return len(asked) > 2
+
+    torch.testing.assert_close(field_image(scene, camera, pose), whole, atol=1e-5, rtol=0)
+    with pytest.raises(Cancelled), stopped_by(wanted_twice):
+        field_image(scene, camera, pose)
+    assert len(asked) == 3
+    assert quick_image(scene, camera, pose).shape == whole.shape
+    assert quick_image(replace(scene, surface=None), camera, pose).equal(whole)

@@ -1,0 +1,177 @@
+"""The live viewer: photos in, answers out, and nothing else that can be asked for."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import quote
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra 'viewer' is not installed")
+pytest.importorskip("uvicorn", reason="the extra 'viewer' is not installed")
+
+from PIL import Image
+
+import viewed
+from bidnerf_core import Localizer, settings_of
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.viewer.jobs import Jobs
+from photo_room import CAMERA
+from viewer_client import Client, serving
+
+LONG = {"bid": {"max_steps": 100_000}, "bid-lm": {"fine_steps": 100_000, "stop_step": 0.0}}
+"""Methods, by Adam and by Newton's steps, with settings that make them take hours."""
+
+TOKEN = "a-token-of-enough-characters"
+VIEW = {"pose": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "width": 32, "height": 24}
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with serving() as found:
+        yield found
+
+
+def answer_of(client: Client, reply: Any) -> Any:
+    """Wait for the answer that a reply promises."""
+    assert reply.status_code == 202, reply.text
+    until = time.monotonic() + 120
+    while time.monotonic() < until:
+        said = client.get(f"/api/job/{reply.json()['job']}").json()
+        if said["state"] == "done":
+            return said["answer"]
+        time.sleep(0.02)
+    raise AssertionError("no answer")
+
+
+def test_a_photo_that_is_uploaded_is_localized_in_the_background(client: Client, tmp_path: Path) -> None:
+    before = set(Path(tempfile.gettempdir()).glob("bidnerf-view-*"))
+    content = viewed.photo_file(tmp_path).read_bytes()
+    began = time.perf_counter()
+    reply = client.post(f"/api/photo?name={quote(viewed.HOSTILE)}", content)
+    assert time.perf_counter() - began < 1
+    answer = answer_of(client, reply)
+    assert answer["accepted"], answer["reason"]
+    assert answer["name"] == viewed.HOSTILE
+    assert answer["rendered"]["url"].startswith("data:image/jpeg")
+    assert set(Path(tempfile.gettempdir()).glob("bidnerf-view-*")) == before
+
+
+def test_the_camera_that_the_viewer_was_started_with_is_that_of_photos_without_another(
+    tmp_path: Path,
+) -> None:
+    content = viewed.photo_file(tmp_path).read_bytes()
+    with serving(camera=CameraSource(focal=CAMERA.fx)) as client:
+        assert b'"hfov":null,"camera_given":true' in client.get("/").content
+        said = answer_of(client, client.post("/api/photo", content))
+        assert said["camera"].startswith(f"focal length {CAMERA.fx:g} px, as given")
+        said = answer_of(client, client.post("/api/photo?hfov=58.19", content))
+        assert said["camera"].startswith("horizontal field of view 58.19 deg")
+
+
+def bomb(side: int) -> bytes:
+    """Return a small PNG file of a very large image."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        check = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    rows = zlib.compress(bytes(1000))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_bad_uploads_are_refused_with_the_reason(client: Client) -> None:
+    assert client.post("/api/photo", headers={"Content-Length": str(2 * 2**20)}).status_code == 413
+    assert client.post("/api/photo").status_code == 400
+    for side, most in ((1500, "1 megapixels"), (20_000, "178 megapixels")):
+        answer = answer_of(client, client.post("/api/photo", bomb(side)))
+        assert answer["outcome"] == "bad input"
+        assert f"expected at most {most}" in answer["reason"]
+        assert tempfile.gettempdir() not in answer["reason"]
+    answer = answer_of(client, client.post("/api/photo", b"no image"))
+    assert answer["outcome"] == "bad input"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/map.json", "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/api/thumbnail/..%2f..%2fetc%2fpasswd",
+        "/api/thumbnail/-1", "/api/thumbnail/8", "/api/thumbnail/../../map.json", "/api/job/..%2f..%2fetc%2fpasswd",
+        "/api/query/0/..%2f..", "//etc/passwd", "/api/thumbnail/1e1",
+    ],
+)  # fmt: skip
+def test_no_file_can_be_asked_for(client: Client, path: str) -> None:
+    for method in ("GET", "POST"):
+        assert client.request(method, path).status_code in (404, 405)
+
+
+def test_images_are_chosen_by_number_among_those_given(client: Client) -> None:
+    assert client.post("/api/query/1").status_code == 404
+    answer = answer_of(client, client.post("/api/query/0"))
+    assert answer["name"] == "photo"
+    assert answer["accepted"]
+
+
+@pytest.mark.parametrize("method", LONG)
+def test_closing_ends_the_localization_at_work(method: str) -> None:
+    localizer = Localizer(viewed.room(), method, settings_of(method, LONG[method]), warm_up=False)
+    start = viewed.walk(15)[6]
+    jobs = Jobs(cast(Localizer, lambda views, depth_rays: localizer(views, start)))
+    running, waiting = (jobs.begin(name, partial(viewed.query, name)) for name in ("a", "b"))
+    time.sleep(1)
+    assert running.state == "searching"
+    began = time.monotonic()
+    jobs.close()
+    jobs._thread.shutdown(wait=True)
+    assert time.monotonic() - began < 2
+    assert running.answer is not None
+    assert (running.state, running.answer.outcome, waiting.state) == ("done", "stopped", "waiting")
+
+
+def test_thumbnails_and_renderings_are_images_of_the_size_asked_for(client: Client) -> None:
+    reply = client.get("/api/thumbnail/3")
+    assert max(Image.open(io.BytesIO(reply.content)).size) == 80
+    for quick in (True, False):
+        reply = client.post("/api/view", json.dumps(VIEW | {"quick": quick}).encode())
+        assert Image.open(io.BytesIO(reply.content)).size == (32, 24)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"width": 100_000}, {"height": 0}, {"fov": 1e9}, {"pose": [1, 2]}, {"pose": ["x"] * 16}, {"quick": None, "pose": None},
+        {"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"width": "1e400"},
+    ],
+)  # fmt: skip
+def test_cameras_that_are_none_are_refused(client: Client, wrong: dict[str, Any]) -> None:
+    assert client.post("/api/view", json.dumps(VIEW | {"quick": True} | wrong).encode()).status_code == 400
+
+
+def test_without_a_token_only_pages_of_this_machine_are_answered(client: Client) -> None:
+    assert client.get("/", Host="evil.example").status_code == 403
+    assert client.post("/api/query/0", headers={"Origin": "https://evil.example"}).status_code == 403
+    assert client.get("/").status_code == 200
+
+
+def test_a_token_in_the_address_becomes_a_cookie_that_scripts_cannot_read() -> None:
+    with serving(TOKEN) as client:
+        for path in ("/", "/?token=wrong", "/api/thumbnail/0", f"/api/thumbnail/0?token={TOKEN}"):
+            assert client.get(path).status_code == 401
+        reply = client.get(f"/?token={TOKEN}")
+        assert reply.status_code == 303
+        assert reply.headers["location"] == "/"
+        cookie = reply.headers["set-cookie"]
+        assert "httponly" in cookie.lower()
+        assert "samesite=strict" in cookie.lower()
+        assert client.get("/", Cookie=cookie.partition(";")[0]).status_code == 200
+        assert client.get("/", Cookie="bidnerf_token=other").status_code == 401
