@@ -421,6 +421,7 @@ WRONG_USAGE = """
     compare {map} {data} --size 0.5:10
     compare {map} {data} --protocol guess
     report --out {out}
+    serve {map} --timeout 0
 """
 
 
