@@ -30,6 +30,7 @@ from bidnerf_core.cli.progress import Display
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localizer
+from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.map import load_map
@@ -755,9 +756,14 @@ def whole(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(bidnerf: Run, tmp_path: Path) -> None:
+def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
+    bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, less in (("TRAINING_VIEWS", 12), ("ANIMATED", 3), ("DESCENT", {"rays": 64, "max_steps": 5})):
+        monkeypatch.setattr(f"bidnerf_core.cli.demo.{name}", less)
+    monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))
     out = tmp_path / "out"
-    assert bidnerf("demo", "--steps", 20, "--frames", 1, "--out", out).status == 0
+    assert bidnerf("demo", "--steps", 5, "--frames", 1, "--out", out).status == 0
     data = open_dataset(out / "data")
     assert len(data.views("train")) == len(load_map(out / "map").info.cameras)
     [view] = data.views("test")
