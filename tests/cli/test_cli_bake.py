@@ -16,8 +16,7 @@ import torch
 import tiny
 from bidnerf_core import train
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import CaptureReport, training_views
-from bidnerf_core.captures.report import CoverageRecord
+from bidnerf_core.captures import training_views
 from bidnerf_core.cli import bake as command
 from bidnerf_core.cli import main
 from bidnerf_core.cli.output import read_views
@@ -25,11 +24,10 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
 from bidnerf_core.maps import Map, baking, load_info, load_map
-from bidnerf_core.maps.files import save_capture
 from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
-from commands import Run
+from commands import Run, assert_refused
 
 pytestmark = pytest.mark.slow
 
@@ -38,8 +36,8 @@ COARSE = ["--cells", "30000"]
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Images large enough to recognise something in, and a map that was trained for a moment only."""
+def sharp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images large enough to recognise something in, ``data``, and a ``map`` that was trained for a moment only."""
     folder = tmp_path_factory.mktemp("bake")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tiny, "SIZE", 64)
@@ -50,51 +48,22 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(shared: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(shared / "map", tmp_path / "map"))
+def folder(sharp: Path, tmp_path: Path) -> Path:
+    """A copy of the map, which is not baked."""
+    return Path(shutil.copytree(sharp / "map", tmp_path / "map"))
 
 
-def test_a_baked_map_needs_no_start(shared: Path, folder: Path, bidnerf: Run) -> None:
-    data = shared / "data"
-    status, out, err = bidnerf("bake", folder, "--data", data, *COARSE)
-    assert (status, out) == (0, "")
-    assert "from 24 measured views" in err
-    facts = json.loads(bidnerf("info", folder, "--json")[1])
-    assert facts["surfels"] > 1000
-    surface = load_map(folder).surface
-    assert surface is not None
-    assert facts["surface"] == {
-        "cell": surface.cell,
-        "cells": len(surface.index.entries),
-        "MiB": round(surface.bytes / 2**20, 1),
-    }
-    for said in (
-        f"{facts['surface']['cells']} cells",
-        f"{facts['surface']['MiB']} MiB",
-        f"side of {surface.cell:.3g}",
-    ):
-        assert said in err
-    status, out, _ = bidnerf("localize", folder, data, "--frame", "t_0000", "--no-start", "--json")
-    found = json.loads(out)
-    assert (status, found["method"]) == (0, "auto")
-    assert found["error"]["translation"] < 0.1
-    assert found["error"]["rotation_deg"] < 2
-    assert len(found["covariance"]) == len(found["covariance"][0]) == 6
-    points = folder / "points.txt"
-    points.write_text("0 0 3\n0.1 0 3\n")
-    place = ["localize", folder, data, "--frame", "t_0000", "--no-start"]
-    with_points = json.loads(bidnerf(*place, "--depth-points", points, "--json")[1])
-    assert with_points["loss"] != found["loss"]  # they are used beside the image's own depth
-    shown = bidnerf("localize", folder, data, "--frame", "t_0000", "--no-start")[1]
-    assert "start error  no start" in shown
-    assert "one standard deviation" in shown
+@pytest.fixture(scope="module")
+def once(sharp: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map once it is baked from the images."""
+    out = shutil.copytree(sharp / "map", tmp_path_factory.mktemp("baked") / "map")
+    assert main(["bake", str(out), "--data", str(sharp / "data"), *COARSE]) == 0
+    return Path(out)
 
 
-def test_without_a_surface_no_start_is_refused_in_a_line(shared: Path, folder: Path, bidnerf: Run) -> None:
-    status, out, err = bidnerf("localize", folder, shared / "data", "--frame", "t_0000", "--no-start")
-    assert (status, out, err.count("\n")) == (1, "", 1)
-    assert "'bidnerf bake'" in err
-    assert "needs a start" in err
+@pytest.fixture
+def baked(once: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(once, tmp_path / "baked"))
 
 
 @pytest.fixture
@@ -107,6 +76,55 @@ def _ball(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "load_map", ball)
 
 
+@pytest.fixture
+def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The surface is left alone, and what the map renders is as sharp as photos."""
+    photos = read_views(open_dataset(sharp / "data", tiny.BACKGROUND), "train")
+    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
+    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
+    monkeypatch.setattr(baking, "rendered_views", lambda *_: photos[:12])
+
+
+def test_a_baked_map_needs_no_start(sharp: Path, folder: Path, bidnerf: Run) -> None:
+    data = sharp / "data"
+    unbaked = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert_refused(unbaked, 1, "no record of its photos")
+    status, out, err = bidnerf("bake", folder, "--data", data, *COARSE)
+    assert (status, out) == (0, "")
+    assert "from 24 measured views" in err
+    facts = json.loads(bidnerf("info", folder, "--json").out)
+    assert facts["surfels"] > 1000
+    stored = load_map(folder)
+    surface = stored.surface
+    assert surface is not None
+    cells, size = len(surface.index.entries), round(surface.bytes / 2**20, 1)
+    assert facts["surface"] == {"cell": surface.cell, "cells": cells, "MiB": size}
+    assert all(said in err for said in (f"{cells} cells", f"{size} MiB", f"side of {surface.cell:.3g}"))
+    assert stored.colour_noise is not None
+    assert stored.colour_noise > 0.05  # a field of four steps is not what the photos show
+    place = ["localize", folder, data, "--frame", "t_0000", "--no-start"]
+    status, out, _ = bidnerf(*place, "--json")
+    found = json.loads(out)
+    assert (status, found["method"]) == (0, "auto")
+    assert found["error"]["translation"] < 0.1
+    assert found["error"]["rotation_deg"] < 2
+    assert len(found["covariance"]) == len(found["covariance"][0]) == 6
+    points = folder / "points.txt"
+    points.write_text("0 0 3\n0.1 0 3\n")
+    shown = bidnerf(*place).out
+    assert "start error  no start" in shown
+    assert "one standard deviation" in shown
+    with_points = json.loads(bidnerf(*place, "--depth-points", points, "--json").out)
+    assert with_points["loss"] != found["loss"]  # they are used beside the image's own depth
+    # Baking the photos has left a record of them.
+    (line,) = [line for line in err.splitlines() if "24 photos, " in line and "horizon" in line]
+    assert len(facts["capture"]["photos"]) == 24
+    status, out, _ = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert (status, line in out) == (0, True)
+    assert (folder / "capture.png").read_bytes().startswith(b"\x89PNG")
+    assert_refused(bidnerf("info", folder, "--draw", folder / "capture.jpg"), 1, "PNG")
+
+
 @pytest.mark.usefixtures("_ball")
 def test_a_map_that_was_imported_is_baked_from_where_a_dataset_was_seen(
     folder: Path, tmp_path: Path, bidnerf: Run
@@ -114,9 +132,7 @@ def test_a_map_that_was_imported_is_baked_from_where_a_dataset_was_seen(
     described = json.loads((folder / "map.json").read_text())
     (folder / "map.json").write_text(json.dumps(described | {"cameras": []}))
     bake = ["bake", folder, "--rays", "20000", "--cells", "20000"]
-    status, _, err = bidnerf(*bake)
-    assert (status, err.count("\n")) == (1, 1)
-    assert "--data" in err
+    assert_refused(bidnerf(*bake), 1, "--data")
     tiny.write_dataset(tmp_path / "data", train=9, depth=False)
     status, _, err = bidnerf(*bake, "--data", tmp_path / "data")
     assert status == 0
@@ -127,132 +143,103 @@ def test_a_map_that_was_imported_is_baked_from_where_a_dataset_was_seen(
 
 
 @pytest.mark.usefixtures("_ball")
-def test_a_map_is_baked_from_what_it_renders(folder: Path, bidnerf: Run) -> None:
-    status, out, err = bidnerf("bake", folder, "--rays", "20000", "--cells", "20000")
-    assert (status, out) == (0, "")
-    assert "from 24 rendered views" in err
-    surface = load_map(folder).surface
-    assert surface is not None
-    height = torch.linalg.vector_norm(surface.surfels.positions, dim=-1) - 0.5
-    assert height.abs().max() < surface.cell
-    assert len(surface.keyframes) == 24
-
-
-def test_a_damaged_surface_is_baked_anew(shared: Path, folder: Path, bidnerf: Run) -> None:
-    bake = ["bake", folder, "--data", shared / "data", *COARSE]
-    assert bidnerf(*bake)[0] == 0
-    (folder / str(load_info(folder).surface)).write_bytes(b"")
-    status, _, err = bidnerf("info", folder)
-    assert (status, err.count("\n")) == (1, 1)
-    assert bidnerf(*bake)[0] == 0
-    assert load_map(folder).surface is not None
+def test_a_map_is_baked_from_what_it_renders_and_anew_if_its_surface_is_damaged(
+    folder: Path, bidnerf: Run
+) -> None:
+    bake = ["bake", folder, "--rays", "20000", "--cells", "20000"]
+    for again in (False, True):
+        status, out, err = bidnerf(*bake)
+        assert (status, out) == (0, "")
+        assert "from 24 rendered views" in err
+        surface = load_map(folder).surface
+        assert surface is not None
+        height = torch.linalg.vector_norm(surface.surfels.positions, dim=-1) - 0.5
+        assert height.abs().max() < surface.cell
+        assert len(surface.keyframes) == 24
+        if not again:
+            damaged = folder / str(load_info(folder).surface)
+            damaged.write_bytes(b"")
+            assert_refused(bidnerf("info", folder), 1, damaged)
 
 
 def test_training_bakes_unless_told_otherwise(
     shared: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))
-    train = ["train", shared / "data", *tiny.options(2)]
-    assert train.pop() == "--no-bake"
-    status, out, err = bidnerf(*train, "--out", tmp_path / "map")
+    monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(rays=1000, cells=5000))
+    *options, last = tiny.options(1)
+    assert last == "--no-bake"
+    status, out, err = bidnerf("train", shared / "data", *options, "--out", tmp_path / "map")
     assert (status, out) == (0, "")
     assert "surface of" in err
     assert load_map(tmp_path / "map").surface is not None
     assert load_map(shared / "map").surface is None
-
-
-def test_a_map_without_a_surface_to_bake_is_a_map(
-    tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    # A map in which nothing is opaque has no surface to bake, and is a map.
     tiny.write_dataset(tmp_path / "data", depth=False)
-    monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(rays=1000, cells=1000))
-    train = ["train", tmp_path / "data", *tiny.options(1)[:-1]]
-    status, _, err = bidnerf(*train, "--out", tmp_path / "map")
+    status, _, err = bidnerf("train", tmp_path / "data", *options, "--out", tmp_path / "empty")
     assert status == 0
     assert "no surface baked: no surface to bake" in err
-    assert load_map(tmp_path / "map").info.complete
+    assert load_map(tmp_path / "empty").info.complete
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "said"),
+    ("line", "status", "named"),
     [
-        (["{none}"], 1, "no such folder"),
-        (["{map}", "--cells", "3"], 2, "cells is 3"),
-        (["{map}", "--data", "{none}"], 1, "none"),
-        (["{map}", "--split", "x", "--data", "{data}"], 1, "no split 'x'"),
-        (["{map}", "--frobnicate"], 2, "--frobnicate"),
-        (["{map}", "--rendered-landmarks", "--data", "{data}"], 2, "--rendered-landmarks uses no photos"),
+        ("{none}", 1, "no such folder"),
+        ("{map} --cells 3", 2, "cells is 3"),
+        ("{map} --data {none}", 1, "none"),
+        ("{map} --split x --data {data}", 1, "no split 'x'"),
+        ("{map} --frobnicate", 2, "--frobnicate"),
+        ("{map} --rendered-landmarks --data {data}", 2, "--rendered-landmarks"),
     ],
 )
 def test_mistakes_are_told(
-    words: list[str], status: int, said: str, shared: Path, tmp_path: Path, bidnerf: Run
+    line: str, status: int, named: str, shared: Path, tmp_path: Path, bidnerf: Run
 ) -> None:
     places = {"none": tmp_path / "none", "map": shared / "map", "data": shared / "data"}
-    found, out, err = bidnerf("bake", *(word.format(**places) for word in words))
-    assert (found, out, "Traceback" in err) == (status, "", False), err
-    assert status == 2 or err.count("\n") == 1
-    assert said in err
+    assert_refused(bidnerf("bake", *(word.format(**places) for word in line.split())), status, named)
 
 
-@pytest.mark.usefixtures("_ball")
-def test_how_well_a_field_renders_is_measured_on_photos_alone(
-    shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+# Landmarks.
+
+
+@pytest.mark.usefixtures("_landmarks_only")
+def test_how_well_a_field_renders_is_not_measured_on_what_it_renders(folder: Path, bidnerf: Run) -> None:
     """Against images that it renders itself any field is perfect."""
-    photos = read_views(open_dataset(shared / "data", tiny.BACKGROUND), "train")
-    monkeypatch.setattr(baking, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
-    bidnerf("bake", folder, *COARSE)
+    assert bidnerf("bake", folder).status == 0
     assert load_map(folder).landmarks is not None
     assert load_map(folder).colour_noise is None
-    bidnerf("bake", folder, "--data", shared / "data", *COARSE)
-    noise = load_map(folder).colour_noise
-    assert noise is not None
-    assert noise > 0.05  # a ball is not what the photos show
-    bidnerf("bake", folder, "--rendered-landmarks", *COARSE)
-    assert load_map(folder).landmarks is not None
-    assert load_map(folder).colour_noise == noise
 
 
-@pytest.fixture
-def with_photo_landmarks(shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The map with landmarks of its photos. Its surface is left alone, and what it renders is like photos."""
-    photos = read_views(open_dataset(shared / "data", tiny.BACKGROUND), "train")
-    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
-    monkeypatch.setattr(baking, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
-    assert bidnerf("bake", folder, "--data", shared / "data").status == 0
-    assert load_info(folder).landmark_source == "photos"
-    return folder
-
-
-def test_landmarks_of_photos_are_kept(with_photo_landmarks: Path, bidnerf: Run) -> None:
-    before = load_info(with_photo_landmarks)
-    status, out, err = bidnerf("bake", with_photo_landmarks)
+@pytest.mark.usefixtures("_landmarks_only")
+def test_landmarks_of_photos_are_kept(baked: Path, bidnerf: Run) -> None:
+    before = load_info(baked)
+    status, out, err = bidnerf("bake", baked)
     assert (status, out, err.count("\n")) == (0, "", 1)
-    assert "its landmarks from photos are kept; --rendered-landmarks" in err
-    assert load_info(with_photo_landmarks) == before
+    assert "landmarks from photos are kept; --rendered-landmarks" in err
+    assert load_info(baked) == before
 
 
-def test_landmarks_of_rendered_images_are_replaced_each_time(
-    with_photo_landmarks: Path, bidnerf: Run
-) -> None:
-    photos = load_info(with_photo_landmarks)
-    assert "rendered images" in bidnerf("bake", with_photo_landmarks, "--rendered-landmarks").err
-    first = load_info(with_photo_landmarks)
+@pytest.mark.usefixtures("_landmarks_only")
+def test_landmarks_of_rendered_images_are_replaced_each_time(baked: Path, bidnerf: Run) -> None:
+    photos = load_info(baked)
+    assert photos.landmark_source == "photos"
+    assert "rendered images" in bidnerf("bake", baked, "--rendered-landmarks").err
+    first = load_info(baked)
     assert (first.landmark_source, first.colour_noise) == ("rendered images", photos.colour_noise)
     assert first.landmarks != photos.landmarks
-    assert "kept" not in bidnerf("bake", with_photo_landmarks).err
-    assert load_info(with_photo_landmarks).landmarks != first.landmarks
+    assert "kept" not in bidnerf("bake", baked).err
+    assert load_info(baked).landmarks != first.landmarks
 
 
-def test_damaged_landmarks_of_photos_are_replaced(with_photo_landmarks: Path, bidnerf: Run) -> None:
-    damaged = with_photo_landmarks / str(load_info(with_photo_landmarks).landmarks)
+@pytest.mark.usefixtures("_landmarks_only")
+def test_damaged_landmarks_of_photos_are_replaced(baked: Path, bidnerf: Run) -> None:
+    damaged = baked / str(load_info(baked).landmarks)
     damaged.write_bytes(b"")
-    status, _, err = bidnerf("bake", with_photo_landmarks)
+    status, _, err = bidnerf("bake", baked)
     assert status == 0
     assert str(damaged) in err
-    assert load_info(with_photo_landmarks).landmark_source == "rendered images"
-    assert load_map(with_photo_landmarks).landmarks is not None
+    assert load_info(baked).landmark_source == "rendered images"
+    assert load_map(baked).landmarks is not None
 
 
 def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,64 +277,35 @@ def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
     assert all(view.landmarks is None for view in views)
 
 
-def test_photos_leave_a_record_that_info_shows_and_draws(
-    shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
-    assert json.loads(bidnerf("info", folder, "--json")[1])["capture"] is None
-    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.png")
-    assert (status, err.count("\n")) == (1, 1)
-    assert "no record of its photos" in err
-    status, _, err = bidnerf("bake", folder, "--data", shared / "data")
-    assert status == 0
-    lines = [line for line in err.splitlines() if "24 photos, " in line and "horizon" in line]
-    assert len(lines) == 1
-    facts = json.loads(bidnerf("info", folder, "--json")[1])
-    assert len(facts["capture"]["photos"]) == 24
-    status, out, _ = bidnerf("info", folder, "--draw", folder / "capture.png")
-    assert (status, lines[0] in out) == (0, True)
-    assert (folder / "capture.png").read_bytes().startswith(b"\x89PNG")
-    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.jpg")
-    assert (status, err.count("\n")) == (1, 1)
-    assert "PNG" in err
+# Photos.
 
 
-@pytest.mark.parametrize("content", ["", "{}", '{"photos": 3}'])
-def test_a_damaged_record_of_photos_is_named_in_a_line(folder: Path, content: str, bidnerf: Run) -> None:
-    save_capture(folder, load_info(folder), CaptureReport((), CoverageRecord()))
-    assert bidnerf("info", folder).status == 0
-    file = folder / str(load_info(folder).capture)
-    file.write_text(content)
-    status, _, err = bidnerf("info", folder)
-    assert (status, err.count("\n")) == (1, 1)
-    assert file.name in err
+def test_a_damaged_record_of_photos_is_named_in_a_line(baked: Path, bidnerf: Run) -> None:
+    file = baked / str(load_info(baked).capture)
+    for content in ("", "{}", '{"photos": 3}'):
+        file.write_text(content)
+        assert_refused(bidnerf("info", baked), 1, file.name)
     file.unlink()
-    assert "no such file" in bidnerf("info", folder).err
+    assert_refused(bidnerf("info", baked), 1, file.name, "no such file")
 
 
+@pytest.mark.usefixtures("_landmarks_only")
 def test_photos_of_another_scene_are_not_baked_into_a_map(
-    shared: Path, folder: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+    folder: Path, baked: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tiny.write_dataset(tmp_path / "other", train=9)
-    for file in (tmp_path / "other").glob("transforms*.json"):  # photos from elsewhere, as of another scene
-        described = json.loads(file.read_text())
-        for number, frame in enumerate(described["frames"]):
-            frame["transform_matrix"][0][3] += 0.01 * (1 + number)
-        file.write_text(json.dumps(described))
-    never_baked = ["bake", shutil.copytree(folder, tmp_path / "fresh"), "--data", tmp_path / "other", *COARSE]
+    file = tmp_path / "other" / "transforms.json"  # photos from elsewhere, as of another scene
+    described = json.loads(file.read_text())
+    for number, frame in enumerate(described["frames"]):
+        frame["transform_matrix"][0][3] += 0.01 * (1 + number)
+    file.write_text(json.dumps(described))
+    known = json.loads((baked / "map.json").read_text())
+    (baked / "map.json").write_text(json.dumps(known | {"colour_noise": 0.1}))
+    before = {file.name: file.read_bytes() for file in baked.iterdir()}
     monkeypatch.setattr("bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.31)
-    assert bidnerf(*never_baked).status == 1
-    monkeypatch.setattr(baking, "colour_noise", lambda *_: 0.1)
-    assert bidnerf("bake", folder, "--data", shared / "data", *COARSE).status == 0
-    before = {file.name: file.read_bytes() for file in folder.iterdir()}
-    monkeypatch.setattr("bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.31)
-    status, _, err = bidnerf("bake", folder, "--data", tmp_path / "other", *COARSE)
-    assert (status, err.count("\n")) == (1, 1)
-    assert "differ from the photos" in err
-    assert "by 31%" in err
-    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
-    monkeypatch.setattr(
-        "bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.15
-    )  # new photos of the same scene
-    assert bidnerf("bake", folder, "--data", tmp_path / "other", *COARSE).status == 0
+    for never_baked_or_baked in (folder, baked):
+        refused = bidnerf("bake", never_baked_or_baked, "--data", tmp_path / "other")
+        assert_refused(refused, 1, "differ from the photos", "by 31%")
+    assert {file.name: file.read_bytes() for file in baked.iterdir()} == before
+    monkeypatch.setattr("bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.15)  # of the same scene
+    assert bidnerf("bake", baked, "--data", tmp_path / "other").status == 0

@@ -1,57 +1,53 @@
-"""``bidnerf localize`` with photos, folders and whole splits; lazy imports, help pages, locks and names on the terminal."""
+"""``bidnerf localize`` with photos, folders and whole splits; lazy imports and names on the terminal."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 
+import bidnerf_core
 import tiny
-from bidnerf_core.cli import main
-from bidnerf_core.cli.help_page import without_expert_settings
-from bidnerf_core.cli.options import parse
+from bidnerf_core import Localizer
 from bidnerf_core.datasets import Photos, Query, open_dataset
 from bidnerf_core.errors import printable
-from bidnerf_core.io import output_folder
-from bidnerf_core.localization import Outcome, Verdict
+from bidnerf_core.localization import Outcome
+from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import load_info
-from bidnerf_core.settings import EXPERT, Settings
-from commands import Run
+from commands import Run, assert_refused
 
 FOCAL = ["--focal", tiny.CAMERA.fx]
 QUICK = ["--method", "bid", "--max-steps", "2", "--rays", "64"]
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset, a map of it, its test images as photos in a folder with other files, their depth, and a start."""
+def given(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Test images of the dataset as ``photos`` in a folder with other files, their ``depth``, and a ``start.json``."""
     folder = tmp_path_factory.mktemp("localize")
-    tiny.write_dataset(folder / "data")
-    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
     (folder / "photos").mkdir()
     (folder / "depth").mkdir()
     for name in ("t_0000", "t_0001", "t_0002"):
-        shutil.copy(folder / f"data/images/{name}.png", folder / "photos")
-        shutil.copy(folder / f"data/depth/{name}.png", folder / f"depth/{name}.depth.png")
+        shutil.copy(shared / f"data/images/{name}.png", folder / "photos")
+        shutil.copy(shared / f"data/depth/{name}.png", folder / f"depth/{name}.depth.png")
     (folder / "photos/notes.txt").write_text("x")
-    pose = open_dataset(folder / "data").views("test")[0].T_ref_camera.matrix().tolist()
+    pose = open_dataset(shared / "data").views("test")[0].T_ref_camera.matrix().tolist()
     (folder / "start.json").write_text(json.dumps({"T_world_camera": pose}))
     return folder
 
 
 @pytest.fixture
-def place(shared: Path) -> list[object]:
+def place(shared: Path, given: Path) -> list[Any]:
     """The arguments by which photos are localized quickly; QUERY comes after them."""
-    return ["localize", *QUICK, "--start", shared / "start.json", shared / "map"]
+    return ["localize", *QUICK, "--start", given / "start.json", shared / "map"]
 
 
 def objects(out: str) -> list[dict[str, Any]]:
@@ -61,8 +57,10 @@ def objects(out: str) -> list[dict[str, Any]]:
 # Photos.
 
 
-def test_a_folder_of_photos_is_localized_in_one_run(bidnerf: Run, shared: Path, place: list[object]) -> None:
-    status, out, err = bidnerf(*place, shared / "photos", *FOCAL, "--json")
+def test_a_folder_of_photos_is_localized_in_one_run(
+    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path
+) -> None:
+    status, out, err = bidnerf(*place, given / "photos", *FOCAL, "--json", "--draw", tmp_path)
     assert status == 0, err
     found = objects(out)
     assert [each["frame"] for each in found] == ["t_0000", "t_0001", "t_0002"]
@@ -70,44 +68,53 @@ def test_a_folder_of_photos_is_localized_in_one_run(bidnerf: Run, shared: Path, 
     assert err.count("focal length 32 px, as given") == 1  # the same camera is reported once
     assert err.count("skipped notes.txt") == 1
     assert "of 3 converged" in err
+    names = sorted(file.name for file in tmp_path.iterdir())
+    assert names == [f"overlay-t_000{i}.png" for i in range(3)]
+    pictures = [iio.imread(tmp_path / name) for name in names]
+    assert all(picture.shape == pictures[0].shape and picture.std() > 10 for picture in pictures)
+    assert not np.array_equal(pictures[0], pictures[1])
 
 
-def test_a_photo_has_no_error_since_it_has_no_truth(bidnerf: Run, shared: Path, place: list[object]) -> None:
-    status, out, _ = bidnerf(*place, shared / "photos/t_0001.png", *FOCAL)
+def test_a_photo_has_no_error_since_it_has_no_truth(bidnerf: Run, given: Path, place: list[Any]) -> None:
+    status, out, _ = bidnerf(*place, given / "photos/t_0001.png", *FOCAL)
     assert status == 0
     assert out.startswith("t_0001: ")
     assert "error" not in out
     assert out.splitlines()[-5].startswith("  T_world_camera (camera axes x right")
 
 
-def test_depth_without_a_measurement_is_told(
-    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
+def test_depth_that_is_missing_or_without_a_measurement_is_told(
+    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path
 ) -> None:
     empty = tmp_path / "t_0001.npy"
     np.save(empty, np.zeros((24, 24), dtype=np.uint16))
-    err = bidnerf(*place, shared / "photos/t_0001.png", *FOCAL, "--depth", empty)[2]
+    err = bidnerf(*place, given / "photos/t_0001.png", *FOCAL, "--depth", empty).err
     assert "the depth image holds no measurement, so only colour is used" in err
+    photos = [given / "photos" / f"{name}.png" for name in ("t_0000", "t_0001")]
+    status, _, err = bidnerf(*place, *photos, *FOCAL, "--depth", given / "depth/t_0000.depth.png")
+    assert status == 0, err
+    assert "t_0001: no measured depth was given; colour only" in err
+    assert "t_0000: no measured depth" not in err
 
 
 def test_an_answer_is_the_same_alone_among_others_and_as_a_frame(
-    bidnerf: Run, shared: Path, place: list[object]
+    bidnerf: Run, shared: Path, given: Path, place: list[Any]
 ) -> None:
-    depth = ["--depth", *sorted((shared / "depth").iterdir()), "--depth-unit", "0.001"]
-    together = objects(bidnerf(*place, shared / "photos", *FOCAL, "--json", *depth)[1])[1]
-    alone = objects(
-        bidnerf(*place, shared / "photos/t_0001.png", *FOCAL, "--json", *depth[:1], depth[2], *depth[4:])[1]
-    )[0]
-    frame = objects(bidnerf(*place, shared / "data", "--frame", "t_0001", "--json")[1])[0]
+    depth, unit = sorted((given / "depth").iterdir()), ["--depth-unit", "0.001"]
+    photo = [*place, given / "photos/t_0001.png", *FOCAL, "--json"]
+    together = objects(bidnerf(*place, given / "photos", *FOCAL, "--json", "--depth", *depth, *unit).out)[1]
+    (alone,) = objects(bidnerf(*photo, "--depth", depth[1], *unit).out)
+    (frame,) = objects(bidnerf(*place, shared / "data", "--frame", "t_0001", "--json").out)
     assert together["T_world_camera"] == alone["T_world_camera"]
     assert np.allclose(alone["T_world_camera"], frame["T_world_camera"], atol=1e-9)
-    without = objects(bidnerf(*place, shared / "photos/t_0001.png", *FOCAL, "--json")[1])[0]
+    (without,) = objects(bidnerf(*photo).out)
     assert without["loss"] != alone["loss"]
 
 
 def test_a_broken_photo_does_not_stop_the_others(
-    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
+    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path
 ) -> None:
-    photos = Path(shutil.copytree(shared / "photos", tmp_path / "photos"))
+    photos = Path(shutil.copytree(given / "photos", tmp_path / "photos"))
     (photos / "t_0001.png").write_bytes((photos / "t_0001.png").read_bytes()[:80])
     status, out, err = bidnerf(*place, photos, *FOCAL, "--json", "--out", tmp_path / "poses.json")
     assert status == 1
@@ -121,92 +128,57 @@ def test_a_broken_photo_does_not_stop_the_others(
     assert json.loads((tmp_path / "poses.json").read_text()) == [good, bad, last]
 
 
-def test_a_photo_without_a_camera_is_refused_in_a_line(
-    bidnerf: Run, shared: Path, place: list[object]
+def test_what_is_no_query_is_refused_in_a_line(
+    bidnerf: Run, shared: Path, given: Path, place: list[Any], tmp_path: Path
 ) -> None:
-    status, out, err = bidnerf(*place, shared / "photos/t_0001.png")
-    assert (status, out, err.count("\n")) == (1, "", 1)
-    assert "no focal length in EXIF" in err
+    (tmp_path / "empty").mkdir()
+    photos, data, known = given / "photos", shared / "data", shared / "map"
+    other = shutil.copytree(known, tmp_path / "other")
+    assert_refused(bidnerf(*place, photos / "t_0001.png"), 1, "no focal length in EXIF")
+    assert_refused(bidnerf(*place, tmp_path / "empty"), 1, tmp_path / "empty", "empty")
+    assert_refused(bidnerf("localize", photos, known), 2, f"'{photos}'", f"'{known}'", "MAP comes first")
+    assert_refused(bidnerf("localize", known, other), 2, f"'{known}' and '{other}' are maps", "QUERY")
+    assert_refused(bidnerf(*place, data / "transforms.json"), 1, data / "transforms.json", f"folder, {data}")
+
+
+# Datasets.
 
 
 @pytest.mark.parametrize("command", ["localize", "view", "evaluate"])
 def test_a_frame_of_another_split_is_told_where_it_is(
     bidnerf: Run, shared: Path, tmp_path: Path, command: str
 ) -> None:
-    name = open_dataset(shared / "data").frame_names("train")[0]
     out = {"view": ["--save", tmp_path / "page.html"], "evaluate": ["--out", tmp_path / "r.jsonl"]}
-    found = bidnerf(command, shared / "map", shared / "data", "--frame", name, *out.get(command, []))
-    assert found.status == 1
-    assert f"no frame {name!r}, which is in split 'train'; choose that split" in found.err
+    words = [command, shared / "map", shared / "data", "--frame", "r_0000", *out.get(command, [])]
+    assert_refused(bidnerf(*words), 1, "no frame 'r_0000'", "split 'train'", after_remarks=True)
 
 
-def test_all_splits_of_a_dataset_are_localized(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
-    words = [
-        "localize",
-        *QUICK,
-        "--start",
-        shared / "start.json",
-        shared / "map",
-        shared / "data",
-        "--split",
-        "all",
-    ]
-    found = bidnerf(*words, "--json", "--out", tmp_path / "transforms.json")
-    dataset = open_dataset(shared / "data")
-    count = sum(len(dataset.frame_names(split)) for split in dataset.splits)
-    assert len(objects(found.out)) == count, found.err
-
-
-def test_arguments_in_another_order_are_told_apart(
-    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
-) -> None:
-    swapped = bidnerf("localize", shared / "photos", shared / "map")
-    assert swapped.status == 2
-    assert f"'{shared / 'photos'}' is not a map, but '{shared / 'map'}' is: MAP comes first" in swapped.err
-    shutil.copytree(shared / "map", tmp_path / "other")
-    maps = bidnerf("localize", shared / "map", tmp_path / "other")
-    assert maps.status == 2
-    assert f"'{shared / 'map'}' and '{tmp_path / 'other'}' are maps, and no QUERY follows them" in maps.err
-    status, _, err = bidnerf(*place, shared / "data" / "transforms.json")
-    assert status == 1
-    assert f"transforms.json: is a file of a dataset; give its folder, {shared / 'data'}" in err
-
-
-def test_a_folder_without_photos_is_refused(bidnerf: Run, place: list[object], tmp_path: Path) -> None:
-    status, out, err = bidnerf(*place, tmp_path)
-    assert (status, out) == (1, "")
-    assert "the folder is empty" in err
-
-
-# Datasets.
-
-
-def test_without_names_each_frame_of_the_split_is_a_query(bidnerf: Run, shared: Path) -> None:
-    status, out, _ = bidnerf(
-        "localize", shared / "map", shared / "data", *QUICK, "--perturb", "0.1", "5", "--json"
-    )
+def test_each_frame_of_a_split_or_of_all_is_a_query(bidnerf: Run, shared: Path, place: list[Any]) -> None:
+    split = ["localize", shared / "map", shared / "data", *QUICK, "--perturb", "0.1", "5"]
+    status, out, _ = bidnerf(*split, "--json")
     assert status == 0
-    each = objects(out)
-    assert [found["frame"] for found in each] == ["t_0000", "t_0001", "t_0002"]
-    assert all(found["error"]["translation"] > 0 for found in each)
-    listed = bidnerf("localize", shared / "map", shared / "data", *QUICK, "--perturb", "0.1", "5")[1]
-    assert len(listed.splitlines()) == 3
+    found = objects(out)
+    assert [each["frame"] for each in found] == ["t_0000", "t_0001", "t_0002"]
+    assert all(each["error"]["translation"] > 0 for each in found)
+    assert len(bidnerf(*split).out.splitlines()) == 3
+    everything = bidnerf(*place, shared / "data", "--split", "all", "--json")
+    assert len(objects(everything.out)) == 9, everything.err
 
 
-# Files of poses, and pictures.
+# Files of poses.
 
 
 def test_files_of_poses_hold_what_converged(
-    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    accepted = Verdict(Outcome.CONVERGED, "whatever it explains")
-    monkeypatch.setattr("bidnerf_core.localization.first_order.descent_verdict", lambda *given: accepted)
-    sure = [*place, shared / "photos", *FOCAL, "--json"]
-    found = objects(bidnerf(*sure, "--out", tmp_path / "poses.tum")[1])
+    answer = Localizer.__call__
+    monkeypatch.setattr(Localizer, "__call__", lambda *a: replace(answer(*a), outcome=Outcome.CONVERGED))
+    sure = [*place, given / "photos", *FOCAL, "--json"]
+    found = objects(bidnerf(*sure, "--out", tmp_path / "poses.tum").out)
     rows = np.loadtxt(tmp_path / "poses.tum")
     positions = [[row[3] for row in each["T_world_camera"][:3]] for each in found]
     np.testing.assert_allclose(rows[:, 1:4], positions, atol=1e-9)
-    assert bidnerf(*sure, "--out", tmp_path / "my_transforms.json")[0] == 0
+    assert bidnerf(*sure, "--out", tmp_path / "my_transforms.json").status == 0
     (tmp_path / "my_transforms.json").rename(tmp_path / "transforms.json")
     dataset = open_dataset(tmp_path)
     read = {view.frame.name: view for split in dataset.splits for view in dataset.views(split)}
@@ -218,170 +190,20 @@ def test_files_of_poses_hold_what_converged(
 
 
 def test_without_an_accepted_pose_no_file_is_written(
-    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
+    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path
 ) -> None:
-    doubtful = [*place, shared / "photos", *FOCAL, "--converged-loss", "0"]
+    doubtful = [*place, given / "photos", *FOCAL, "--converged-loss", "0"]
     status, _, err = bidnerf(*doubtful, "--out", tmp_path / "poses.txt")
     assert status == 1
     assert "no pose converged" in err
     assert "0 of 3 converged; do they show the scene of this map?" in err
     assert list(tmp_path.iterdir()) == []
-    assert bidnerf(*doubtful, "--out", tmp_path / "none" / "poses.txt")[0] == 1
-
-
-def test_pictures_are_drawn_of_each_query(
-    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
-) -> None:
-    status, _, err = bidnerf(*place, shared / "photos", *FOCAL, "--draw", tmp_path / "drawn")
-    assert status == 0, err
-    names = sorted(file.name for file in (tmp_path / "drawn").iterdir())
-    assert names == [f"overlay-t_000{i}.png" for i in range(3)]
-    pictures = [iio.imread(tmp_path / "drawn" / name) for name in names]
-    assert all(picture.shape == pictures[0].shape and picture.std() > 10 for picture in pictures)
-    assert not np.array_equal(pictures[0], pictures[1])
-
-
-# Trained, but not baked; two at once.
-
-
-def test_a_map_that_was_not_baked_is_baked_by_resume(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(shared / "map", tmp_path / "map"))
-    assert load_info(out).surface is None
-    before = load_info(out).weights
-    status, _, err = bidnerf("train", shared / "data", "--out", out, "--resume")
-    assert status == 0, err
-    assert "training is complete" in err
-    assert load_info(out).surface is not None
-    assert load_info(out).weights == before
-    status, _, err = bidnerf("train", shared / "data", "--out", out, "--resume")
-    assert status == 1
-    assert "and baked, nothing to resume" in err
-
-
-def test_a_folder_that_another_process_writes_into_is_refused(
-    bidnerf: Run, shared: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "map"
-    with output_folder(out, overwrite=False):
-        status, said, err = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
-        assert (status, said, err.count("\n")) == (1, "", 1)
-        assert "another bidnerf process is writing here" in err
-        assert out.is_dir()
-    assert bidnerf("train", shared / "data", "--out", out, *tiny.options(2))[0] == 0
-
-
-# Names, help, start.
-
-
-def test_names_cannot_control_the_terminal(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
-    assert printable("naïve 名 é") == "naïve 名 é"
-    assert printable("a\x1b[31m\x00\u202e\udc80\x9b") == "a\\x1b[31m\\x00\\u202e\\udc80\\x9b"
-    out = Path(shutil.copytree(shared / "map", tmp_path / "a\x1b]0;x\x07b"))
-    description = json.loads((out / "map.json").read_text())
-    (out / "map.json").write_text(json.dumps(description | {"data": "\x1b[2J"}))
-    for words in (["info", out], ["info", tmp_path / "\x1b[2Jnone"]):
-        _, said, err = bidnerf(*words)
-        assert "\x1b" not in said + err
-        assert "\\x1b" in said + err
-
-
-@dataclasses.dataclass(frozen=True)
-class Inner(Settings):
-    """What is inside."""
-
-    plain: int = 1  # shown always
-    rare: Annotated[int, EXPERT] = 2  # shown to experts
-
-
-@dataclasses.dataclass(frozen=True)
-class Rare(Settings):
-    """What only experts touch."""
-
-    first: int = 1  # of two
-    second: int = 2  # of two
-
-
-@dataclasses.dataclass(frozen=True)
-class Outer(Settings):
-    """What is outside."""
-
-    inner: Inner = Inner()
-    group: Annotated[Rare, EXPERT] = Rare()
-    other: float = 0.5  # shown, too
-
-
-def command(config: Outer = Outer()) -> Outer:
-    """Take settings."""
-    return config
-
-
-def test_help_hides_what_experts_need(capsys: pytest.CaptureFixture[str]) -> None:
-    assert without_expert_settings(command)[1] == 3
-    for option in ("--help", "--help-all"):
-        with pytest.raises(SystemExit):
-            parse("x", command, [option])
-        page = capsys.readouterr().out
-        assert "--plain" in page
-        assert "shown, too" in page
-        assert "inner options" in page
-        assert "config.inner" not in page
-        assert ("--second" in page) == ("--rare" in page) == (option == "--help-all")
-        assert ("3 expert settings are not shown; --help-all" in page) == (option == "--help")
-
-
-def test_experts_settings_are_parsed_though_they_are_not_shown(bidnerf: Run) -> None:
-    short, whole = (
-        bidnerf("localize", "--method", "bid-lm", "--help")[1],
-        bidnerf("localize", "--method", "bid-lm", "--help-all")[1],
-    )
-    assert "--pivot" not in short
-    assert "--pivot" in whole
-    status, _, err = bidnerf("localize", "--method", "bid-lm", "--pivot", "camera", "no-map", "no-query")
-    assert status == 1
-    assert "needs a start" in err
-
-
-@pytest.mark.parametrize("words", [["--help"], ["--version"], ["backends"], ["frobnicate"]], ids=" ".join)
-def test_commands_that_compute_nothing_do_without_torch(words: list[str]) -> None:
-    program = (
-        "import sys; from bidnerf_core.cli import main; main(sys.argv[1:]);"
-        "sys.exit(3 if {'torch', 'numpy', 'kornia'} & set(sys.modules) else 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_localizing_imports_nothing_that_only_other_work_needs() -> None:
-    program = "import sys, bidnerf_core.cli.localize, bidnerf_core as bn; bn.Localizer, bn.load_map; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    others = {
-        "imageio",
-        "scipy.optimize",
-        "matplotlib",
-        "viser",
-        "pycolmap",
-        "av",
-        "jinja2",
-        "uvicorn",
-        "torch._dynamo",
-    }
-    assert not others & set(done.stdout.split())
-
-
-def test_public_names_are_there_and_no_others() -> None:
-    import bidnerf_core
-
-    for name in bidnerf_core.__all__:
-        assert getattr(bidnerf_core, name) is not None
-    assert set(bidnerf_core.__all__) <= set(dir(bidnerf_core))
-    with pytest.raises(AttributeError, match="attribute localise"):
-        _ = bidnerf_core.localise
+    assert bidnerf(*doubtful, "--out", tmp_path / "none" / "poses.txt").status == 1
 
 
 @pytest.mark.parametrize(("name", "kept"), [("found.json", True), ("found.txt", False), (None, False)])
 def test_an_interrupted_run_keeps_its_answers(
-    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     name: str | None, kept: bool,
 ) -> None:  # fmt: skip
     """Two of the three photos are answered; two steps from a start do not converge, so a trajectory would be empty."""
@@ -394,7 +216,7 @@ def test_an_interrupted_run_keeps_its_answers(
     read = Photos.read
     monkeypatch.setattr(Photos, "read", stopping)
     out = [] if name is None else ["--out", tmp_path / name]
-    status, _, err = bidnerf(*place, shared / "photos", *FOCAL, *out)
+    status, _, err = bidnerf(*place, given / "photos", *FOCAL, *out)
     assert status == 130
     assert [file.name for file in tmp_path.iterdir()] == ([name] if kept else [])
     if kept and name:
@@ -403,10 +225,59 @@ def test_an_interrupted_run_keeps_its_answers(
         assert [each["frame"] for each in found] == ["t_0000", "t_0001"]
 
 
-def test_a_photo_without_depth_among_others_is_named(bidnerf: Run, shared: Path, place: list[object]) -> None:
-    photos = [shared / "photos" / f"{name}.png" for name in ("t_0000", "t_0001")]
-    depth = shared / "depth/t_0000.depth.png"
-    status, _, err = bidnerf(*place, *photos, *FOCAL, "--depth", depth)
+# Maps, names and imports.
+
+
+def test_a_map_that_was_not_baked_is_baked_by_resume(
+    bidnerf: Run, shared: Path, map_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=5000))
+    before = load_info(map_folder)
+    assert before.surface is None
+    resume = ["train", shared / "data", "--out", map_folder, "--resume"]
+    status, _, err = bidnerf(*resume)
     assert status == 0, err
-    assert "t_0001: no measured depth was given; colour only" in err
-    assert "t_0000: no measured depth" not in err
+    assert "training is complete" in err
+    assert load_info(map_folder).surface is not None
+    assert load_info(map_folder).weights == before.weights
+    assert_refused(bidnerf(*resume), 1, "and baked, nothing to resume")
+
+
+def test_names_cannot_control_the_terminal(bidnerf: Run, map_folder: Path, tmp_path: Path) -> None:
+    assert printable("naïve 名 é") == "naïve 名 é"
+    assert printable("a\x1b[31m\x00\u202e\udc80\x9b") == "a\\x1b[31m\\x00\\u202e\\udc80\\x9b"
+    out = map_folder.rename(tmp_path / "a\x1b]0;x\x07b")
+    description = json.loads((out / "map.json").read_text())
+    (out / "map.json").write_text(json.dumps(description | {"data": "\x1b[2J"}))
+    for words in (["info", out], ["info", tmp_path / "\x1b[2Jnone"]):
+        _, said, err = bidnerf(*words)
+        assert "\x1b" not in said + err
+        assert "\\x1b" in said + err
+
+
+def modules_after(program: str) -> set[str]:
+    """Return the modules that a program of its own imported."""
+    program = f"import sys\n{program}\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_commands_that_compute_nothing_do_without_torch() -> None:
+    run = "for word in ('--help', '--version', 'backends', 'frobnicate'): main([word])"
+    found = modules_after(f"from bidnerf_core.cli import main\n{run}")
+    assert "bidnerf_core.cli.backends" in found
+    assert not {"torch", "numpy", "kornia"} & found
+
+
+def test_localizing_imports_nothing_that_only_other_work_needs() -> None:
+    program = "import bidnerf_core.cli.localize, bidnerf_core as bn; bn.Localizer, bn.load_map"
+    others = "imageio scipy.optimize matplotlib viser pycolmap av jinja2 uvicorn torch._dynamo"
+    assert not {*others.split()} & modules_after(program)
+
+
+def test_public_names_are_there_and_no_others() -> None:
+    for name in bidnerf_core.__all__:
+        assert getattr(bidnerf_core, name) is not None
+    assert set(bidnerf_core.__all__) <= set(dir(bidnerf_core))
+    with pytest.raises(AttributeError, match="attribute localise"):
+        _ = bidnerf_core.localise

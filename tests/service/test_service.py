@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import importlib
 import json
@@ -12,10 +13,9 @@ import re
 import shutil
 import signal
 import socket
-import struct
+import tempfile
 import threading
 import time
-import zlib
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,7 +27,6 @@ import pytest
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
-import tiny
 from bidnerf_core import (
     InputError,
     ServiceClient,
@@ -38,13 +37,13 @@ from bidnerf_core import (
     service_app,
     settings_of,
 )
-from bidnerf_core.cli import main
 from bidnerf_core.service import Access
 from bidnerf_core.service.description import description
 from bidnerf_core.service.pool import Pool
 from bidnerf_core.service.requests import PARAMETERS
 from bidnerf_core.service.server import named
-from commands import Run
+from bombs import png_of
+from commands import Run, assert_refused
 
 QUICK = {"max_steps": 3, "rays": 64}
 LIMITS = ServiceLimits(
@@ -80,6 +79,10 @@ class Service:
         self.run(self._life.__aexit__(None, None, None))
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
+
+    def gauge(self, name: str) -> float:
+        """A number that the service tells of itself now."""
+        return self.pool.metrics.gauges[name][1]()
 
     def run(self, work: Awaitable[Any]) -> Any:
         async def waited() -> Any:
@@ -145,27 +148,29 @@ class Place:
     folder: Path
     photo: bytes
     start: str
-    answer: dict[str, Any]  # of the command line
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+def place(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder = tmp_path_factory.mktemp("service")
-    tiny.write_dataset(folder / "data")
-    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+    (folder / "uploads").mkdir()
+    (folder / "data").symlink_to(shared / "data")
+    shutil.copytree(shared / "map", folder / "map")
+    shutil.copytree(shared / "map", folder / "hall")
+    anchor = {"latitude": 47.4, "longitude": 19.0, "height": 120.0, "position_sigma": 0.5}
+    (folder / "hall/anchor.json").write_text(json.dumps(anchor))
     shutil.copy(folder / "data/images/t_0000.png", folder / "photo.png")
     pose = open_dataset(folder / "data").views("test")[0].T_ref_camera.matrix().tolist()
     (folder / "start.json").write_text(json.dumps({"T_world_camera": pose}))
-    return Place(folder, (folder / "photo.png").read_bytes(), json.dumps(pose), {})
+    return Place(folder, (folder / "photo.png").read_bytes(), json.dumps(pose).replace(" ", ""))
 
 
 @pytest.fixture(scope="module")
 def service(place: Place) -> Iterator[Service]:
-    shutil.copytree(place.folder / "map", place.folder / "hall")
-    anchor = {"latitude": 47.4, "longitude": 19.0, "height": 120.0, "position_sigma": 0.5}
-    (place.folder / "hall/anchor.json").write_text(json.dumps(anchor))
     maps = [place.folder / "map", place.folder / "hall"]
-    running = Service(service_app(maps, limits=LIMITS, method="bid", config=QUICK))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(place.folder / "uploads"))
+        running = Service(service_app(maps, limits=LIMITS, method="bid", config=QUICK))
     yield running
     running.close()
 
@@ -175,12 +180,8 @@ def form(**parts: bytes | str) -> bytes:
     text = b""
     for name, value in parts.items():
         file = f'; filename="{name}.bin"' if isinstance(value, bytes) else ""
-        content = value if isinstance(value, bytes) else value.encode()
-        text += (
-            f'--xyz\r\nContent-Disposition: form-data; name="{name}"{file}\r\n\r\n'.encode()
-            + content
-            + b"\r\n"
-        )
+        head = f'--xyz\r\nContent-Disposition: form-data; name="{name}"{file}\r\n\r\n'
+        text += head.encode() + (value if isinstance(value, bytes) else value.encode()) + b"\r\n"
     return text + b"--xyz--\r\n"
 
 
@@ -188,37 +189,21 @@ def test_answers_are_those_of_the_command_line(service: Service, place: Place, b
     options = [f"--{name.replace('_', '-')}={value}" for name, value in QUICK.items()]
     words = ["localize", place.folder / "map", place.folder / "photo.png", "--method=bid", *options]
     depth = place.folder / "data/depth/t_0000.png"
-    given = [
-        "--start",
-        place.folder / "start.json",
-        "--focal=32",
-        "--depth",
-        depth,
-        "--depth-unit=0.001",
-        "--seed=7",
-    ]
-    expected = json.loads(bidnerf(*words, *given, "--json").out)
-    body = form(
-        photo=place.photo,
-        depth=depth.read_bytes(),
-        start=place.start,
-        focal="32",
-        depth_unit="0.001",
-        seed="7",
-    )
+    words += ["--start", place.folder / "start.json", "--depth", depth, "--depth-unit=0.001"]
+    expected = json.loads(bidnerf(*words, "--focal=32", "--seed=7", "--json").out)
+    parts = {"photo": place.photo, "depth": depth.read_bytes(), "start": place.start}
+    body = form(**parts, focal="32", depth_unit="0.001", seed="7")
     reply = service.post("/maps/map/localize", body, FORM)
     assert reply.status == 200
     assert list(reply.json) == list(expected)
-    for key in expected.keys() - {"seconds"}:
-        assert reply.json[key] == (
-            pytest.approx(expected[key], rel=1e-6) if key == "loss" else expected[key]
-        ), key
+    assert reply.json["loss"] == pytest.approx(expected["loss"], rel=1e-6)
+    same = expected.keys() - {"seconds", "loss"}
+    assert {key: reply.json[key] for key in same} == {key: expected[key] for key in same}
 
 
 def test_a_photo_may_be_the_body(service: Service, place: Place) -> None:
-    reply = service.post(
-        f"/localize?map=map&focal=32&name=%3Cscript%3E&start={place.start.replace(' ', '')}", place.photo
-    )
+    query = f"map=map&focal=32&name=%3Cscript%3E&start={place.start}"
+    reply = service.post(f"/localize?{query}", place.photo)
     assert reply.status == 200
     assert reply.json["frame"] == "<script>"
     assert reply.headers["content-type"] == "application/json"
@@ -231,45 +216,24 @@ def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
     assert service.post("/localize", body, FORM).json["frame"] == "pass wd"
     named = form(photo=place.photo, start=place.start, focal="32", map="map", name="<script>")
     assert service.post("/localize", named, FORM).json["frame"] == "<script>"
-    for path in (
-        "/maps/..%2f..%2fetc%2fpasswd",
-        "/maps/../map.json",
-        "/maps/map/map.json",
-        "/maps/.",
-        "/etc/passwd",
-    ):
-        assert service.get(path).status == 404, path
+    for path in ("..%2f..%2fetc%2fpasswd", "../map.json", "map/map.json", ".", "../../etc/passwd"):
+        assert service.get(f"/maps/{path}").status == 404, path
+    assert service.get("/etc/passwd").status == 404
     for text in ("../map", "/etc/passwd", "map\0", "x" * 5000):
         reply = service.post("/localize", form(photo=place.photo, map=text), FORM)
         assert reply.status in (400, 404), text
     assert service.post("/localize?map=map&camera=/etc/passwd", place.photo).status == 422
     assert "passwd" not in service.get("/metrics").body.decode()
-    folder = service.pool._folder
-    assert folder is not None
-    assert list(Path(folder.name).iterdir()) == []
-
-
-def png(width: int, height: int) -> bytes:
-    """Return a small file that describes a large image of one colour."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
-
-    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
-    rows = zlib.compress(bytes((width + 7) // 8 + 1) * min(height, 1000), 9)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    (folder,) = (place.folder / "uploads").iterdir()
+    assert list(folder.iterdir()) == []
 
 
 def test_limits_hold_before_anything_is_decoded(service: Service, place: Place) -> None:
-    bomb = service.post("/localize?map=map&focal=32", png(9000, 9000))
+    bomb = service.post("/localize?map=map&focal=32", png_of(9000, 9000))
     assert bomb.status == 422
     assert "9000x9000, expected at most 1 megapixels" in bomb.json["detail"]
-    assert (
-        service.post("/localize?map=map", form(photo=place.photo, depth=png(60000, 60000)), FORM).status
-        == 422
-    )
+    depth = form(photo=place.photo, depth=png_of(60000, 60000))
+    assert service.post("/localize?map=map", depth, FORM).status == 422
     large = service.run(service.ask("POST", "/localize", [b"x"], {"content-length": str(2 * 10**9)}))
     assert large.status == 413
     assert large.headers["connection"] == "close"
@@ -282,29 +246,12 @@ def test_limits_hold_before_anything_is_decoded(service: Service, place: Place) 
 
 def test_malformed_requests_are_refused_with_a_reason(service: Service, place: Place) -> None:
     drawn = random.Random(0)
-    kinds = [
-        FORM,
-        "multipart/form-data",
-        "image/png",
-        "text/html",
-        "application/json",
-        "multipart/form-data; boundary=",
-        "",
-    ]
-    seeds = [
-        place.photo,
-        form(photo=place.photo, focal="32"),
-        b'{"sensorReadings": {"cameraReadings": [{}]}}',
-        b"",
-        png(9, 9),
-    ]
-    paths = [
-        "/localize",
-        "/maps/map/localize",
-        "/maps/hall/geopose",
-        "/geopose?map=hall",
-        "/maps/\xff/localize",
-    ]
+    forms = [FORM, "multipart/form-data", "multipart/form-data; boundary="]
+    kinds = [*forms, "image/png", "text/html", "application/json", ""]
+    geopose = b'{"sensorReadings": {"cameraReadings": [{}]}}'
+    seeds = [place.photo, form(photo=place.photo, focal="32"), geopose, b"", png_of(9, 9)]
+    named = ["/maps/map/localize", "/maps/hall/geopose", "/maps/\xff/localize"]
+    paths = ["/localize", "/geopose?map=hall", *named]
     found = set()
     for _ in range(250):
         body = bytearray(drawn.choice(seeds))
@@ -328,34 +275,27 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
 
 
 def test_what_is_missing_is_named(service: Service, place: Place) -> None:
-    for path, part in (
-        (
-            f"/localize?focal=32&start={place.start.replace(' ', '')}",
-            "start was given without map, expected map as one of",
-        ),
-        ("/localize?focal=32", "needs a start"),
-        ("/localize?map=map&fcal=3", "did you mean 'focal'?"),
-        ("/localize?map=map&focal=x", 'focal is "x", expected a number'),
-        ("/localize?map=map&focal=1&focal=2", "focal is given twice"),
-        ("/localize?map=map&depth_unit=1", "depth_unit was given without depth"),
-        ("/localize?map=map&focal=32", "needs a start"),
+    for query, *parts in (
+        (f"focal=32&start={place.start}", "start was given without map", "map"),
+        ("focal=32", "needs a start"),
+        ("map=map&fcal=3", "did you mean 'focal'?"),
+        ("map=map&focal=x", 'focal is "x"', "a number"),
+        ("map=map&focal=1&focal=2", "focal is given twice"),
+        ("map=map&depth_unit=1", "depth_unit was given without depth"),
+        ("map=map&focal=32", "needs a start"),
     ):
-        assert part in service.post(path, place.photo).json["detail"]
+        detail = service.post(f"/localize?{query}", place.photo).json["detail"]
+        assert [part for part in parts if part not in detail] == []
     assert service.post("/localize?map=map").json["detail"].startswith("no photo, expected")
-    body = b'{"type": "geopose"}'
-    assert (
-        "expected map as one of map, hall"
-        in service.post("/geopose", body, "application/json").json["detail"]
-    )
+    geopose = service.post("/geopose", b'{"type": "geopose"}', "application/json")
+    assert "expected map as one of map, hall" in geopose.json["detail"]
     refused = service.get("/localize")
     assert (refused.status, refused.headers["allow"]) == (405, "POST")
     for path in ("/nothing", "/maps/", "/maps/nothing", "/maps/nothing/geopose"):
         assert service.get(path).json["status"] == 404, path
     for number in ("1_0", "\u0663", " 5", "infinity", "0x10"):
-        assert (
-            "expected a number"
-            in service.post(f"/localize?map=map&focal={number}", place.photo).json["detail"]
-        )
+        reply = service.post(f"/localize?map=map&focal={number}", place.photo)
+        assert "expected a number" in reply.json["detail"]
 
 
 def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
@@ -387,7 +327,7 @@ def stopped(service: Service) -> Iterator[int]:
 
 
 def request(service: Service, place: Place, leaving: asyncio.Event | None = None) -> Any:
-    path = f"/localize?map=map&focal=32&start={place.start.replace(' ', '')}"
+    path = f"/localize?map=map&focal=32&start={place.start}"
     return asyncio.run_coroutine_threadsafe(
         service.ask("POST", path, [place.photo], leaving=leaving), service.loop
     )
@@ -397,7 +337,7 @@ def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place)
     before = service.pool.metrics.restarts["died"]
     with stopped(service) as process:
         waiting = [request(service, place) for _ in range(3)]
-        quickly(lambda: len(service.pool._waiting) == 2)
+        quickly(lambda: service.gauge("queue_length") == 2)
         os.kill(process, signal.SIGKILL)
         assert [reply.result(60).status for reply in waiting] == [200] * 3
     assert service.pool.metrics.restarts["died"] == before + 1
@@ -405,12 +345,11 @@ def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place)
 
 @pytest.mark.slow
 def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, place: Place) -> None:
-    nursery = service.pool._nursery
-    assert nursery is not None
+    (nursery,) = service.pool.metrics.processes()["maps"]
     with stopped(service) as process:
         waiting = request(service, place)
-        quickly(lambda: service.pool._taken == 1)
-        nursery.kill()
+        quickly(lambda: service.gauge("requests_in_progress") == 1)
+        os.kill(nursery, signal.SIGKILL)
         os.kill(process, signal.SIGKILL)
         assert waiting.result(150).status == 200
 
@@ -419,11 +358,11 @@ def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -
     leaving = asyncio.Event()
     with stopped(service):
         waiting = request(service, place, leaving)
-        quickly(lambda: service.pool._taken == 1 and not service.pool._waiting)
+        quickly(lambda: (service.gauge("requests_in_progress"), service.gauge("queue_length")) == (1, 0))
         service.loop.call_soon_threadsafe(leaving.set)
         assert waiting.result(20).status == 499
     assert service.pool.metrics.restarts["cancelled"] == 1
-    assert service.pool._taken == 0
+    assert service.gauge("requests_in_progress") == 0
 
 
 def test_work_that_takes_too_long_is_stopped(service: Service, place: Place) -> None:
@@ -460,29 +399,15 @@ def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
     token = "0123456789abcdef"
     assert status(token, host="example.org") == 401
     assert status(token, host="localhost") == 401
-    for wrong in (
-        "Bearer",
-        "Bearer x",
-        f"Basic {token}",
-        f"bearer{token}",
-        f"Bearer {token}x",
-        "Bearer \xe9",
-    ):
+    near = (f"Basic {token}", f"bearer{token}", f"Bearer {token}x")
+    for wrong in ("Bearer", "Bearer x", *near, "Bearer \xe9"):
         assert status(token, authorization=wrong) == 401, wrong
     assert status(token, host="example.org", authorization=f"Bearer {token}") == 200
     assert status(token, "/health", host="example.org") == 200
     assert refused == [("/localize", 403)] * 8 + [("/localize", 401)] * 8
 
 
-def test_refusals_are_counted(service: Service) -> None:
-    before = service.pool.metrics.requests["refused", 403]
-    assert asyncio.run(service.ask("GET", "/maps", [], {"host": "example.org"})).status == 403
-    assert service.pool.metrics.requests["refused", 403] == before + 1
-
-
 def test_geopose_answers_with_an_honest_accuracy(service: Service, place: Place) -> None:
-    import base64
-
     def body(**more: Any) -> bytes:
         reading = {
             "imageBytes": base64.b64encode(place.photo).decode(), "imageFormat": "PNG", "size": [24, 24],
@@ -526,8 +451,10 @@ def test_every_path_is_described(service: Service) -> None:
             assert "403" in said["paths"][path][method]["responses"]
     queried = {p["name"] for p in said["paths"]["/localize"]["post"]["parameters"]}
     assert queried == set(PARAMETERS)
+    assert asyncio.run(service.ask("GET", "/maps", [], {"host": "example.org"})).status == 403
     text = service.get("/metrics").body.decode()
-    assert 'bidnerf_requests_total{path="/localize",status="200"}' in text
+    for path, status in (("/localize", 200), ("refused", 403)):
+        assert f'bidnerf_requests_total{{path="{path}",status="{status}"}}' in text
     assert "bidnerf_workers 1" in text
     assert set(service.get("/maps").json) == {"map", "hall"}
     assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
@@ -542,14 +469,8 @@ def address(place: Place) -> Iterator[tuple[str, int]]:
         told.extend([url, token])
         ready.set()
 
-    options: Any = {
-        "port": 0,
-        "limits": LIMITS,
-        "method": "bid",
-        "config": QUICK,
-        "ready": tell,
-        "stop": stop,
-    }
+    options: Any = {"port": 0, "limits": LIMITS, "method": "bid", "config": QUICK}
+    options |= {"ready": tell, "stop": stop}
     running = threading.Thread(target=serve, args=[place.folder / "map"], kwargs=options)
     running.start()
     try:
@@ -598,20 +519,15 @@ def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, i
         answer = spoken(address, bytes(content))
         statuses.add(answer[9:10] if answer.startswith(b"HTTP/1.1 ") else b"closed")
     assert statuses <= {b"2", b"4", b"closed"}
-    for content in (
-        b"\x00\x01\r\n\r\n",
-        b"GET / HTTP/9\r\n\r\n",
-        b"GET " + b"x" * 100_000 + b" HTTP/1.1\r\n\r\n",
-    ):
+    endless = b"GET " + b"x" * 100_000 + b" HTTP/1.1\r\n\r\n"
+    for content in (b"\x00\x01\r\n\r\n", b"GET / HTTP/9\r\n\r\n", endless):
         head, _, body = spoken(address, content).partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 400")
         assert b"application/problem+json" in head
         assert json.loads(body)["status"] == 400
     for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
-        answer = spoken(
-            address, f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode()
-        )
-        assert answer.startswith(b"HTTP/1.1 404"), path
+        asked = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+        assert spoken(address, asked.encode()).startswith(b"HTTP/1.1 404"), path
     assert spoken(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
 
 
@@ -629,9 +545,8 @@ def test_a_body_without_end_and_a_client_without_haste_are_cut_off(
             while sent < 2 * 10**9:
                 connection.sendall(b"%x\r\n%s\r\n" % (len(block), block) if b"chunked" in length else block)
                 sent += len(block)
-        assert sent < 3 * 10**7, (
-            length
-        )  # what the buffers of the system take, beside the megabyte that is allowed
+        # What the buffers of the system take, beside the megabyte that is allowed.
+        assert sent < 3 * 10**7, length
     began = time.monotonic()
     with socket.create_connection(address, timeout=20) as connection:
         connection.sendall(head + b"Content-Length: 1000\r\n\r\nx")
@@ -685,7 +600,7 @@ def test_a_token_that_is_given_is_not_shown(
     def announced(maps: Any, *, token: str | None, ready: Any, **more: Any) -> None:
         ready("http://localhost:1", token or "made-up-0123456789")
 
-    monkeypatch.setattr("bidnerf_core.service.server.serve", announced)
+    monkeypatch.setattr("bidnerf_core.cli.serve.serve_maps", announced)
     (tmp_path / "token").write_text("secret-0123456789")
     given = bidnerf("serve", tmp_path, "--token-file", tmp_path / "token")
     assert "Bearer" in given.out + given.err
@@ -706,11 +621,9 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     with pytest.raises(InputError, match="expected at least 16"):
         service_app("MAP", token="short")
     assert service_app("MAP", method="bid", config=settings_of("bid", QUICK)) is not None
-    with pytest.raises(InputError, match="config is a int, expected settings of bid"):
+    with pytest.raises(InputError, match="int, expected settings of bid"):
         service_app("MAP", method="bid", config=5)
     with pytest.raises(InputError, match="timeout is 0"):
         ServiceLimits(timeout=0)
     assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
-    status, _, err = bidnerf("serve", place.folder / "data")
-    assert status == 1
-    assert "no map.json found" in err
+    assert_refused(bidnerf("serve", place.folder / "data"), 1, place.folder / "data", "no map.json")

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import json
 import re
-from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
-from bidnerf_core import SE3, BakeConfig, Frame, Map, View, train
+from bidnerf_core import SE3, BakeConfig, Frame, View, train
 from bidnerf_core.datasets import Query
 from photo_room import CAMERA, HALF, photograph
 from photo_room import walk as walk
 from tiny import config
 
 HOSTILE = "<script>document.title = 'run'</script>"
-_KEPT: list[TemporaryDirectory[str]] = []  # until the process ends
 
 
 def posed(T: SE3, name: str, seed: int = 0) -> View:
@@ -31,20 +28,11 @@ def posed(T: SE3, name: str, seed: int = 0) -> View:
     return View(Frame.from_numpy(photograph(T, seed), CAMERA, depth=depth, depth_unit=1.0, name=name), T)
 
 
-@cache
-def room() -> Map:
-    """Return a map in a folder: its field is hardly trained, its surface and landmarks are exact."""
-    folder = TemporaryDirectory()
-    _KEPT.append(folder)
+def make_room(folder: Path) -> None:
+    """Train a map of the room for two steps into ``folder / "map"``, and bake it."""
     views = [posed(T, f"view {number}") for number, T in enumerate(walk(8))]
-    return train(
-        views,
-        backend="hashgrid",
-        out=Path(folder.name) / "room",
-        config=config(2),
-        bake=BakeConfig(cells=20_000),
-        refine_poses="never",
-    )
+    bake = BakeConfig(cells=20_000)
+    train(views, backend="hashgrid", out=folder / "map", config=config(2), bake=bake, refine_poses="never")
 
 
 def query(name: str = "unseen", seed: int = 0) -> Query:

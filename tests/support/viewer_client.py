@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import viewed
-from bidnerf_core import Localizer, ServiceLimits
+from bidnerf_core import Localizer, Map, ServiceLimits
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import Photos
 from bidnerf_core.viewer import serve_view
@@ -61,15 +61,15 @@ class Client:
 
 
 @contextlib.contextmanager
-def serving(token: str | None = None, camera: CameraSource | None = None) -> Iterator[Client]:
+def serving(room: Map, token: str | None = None, camera: CameraSource | None = None) -> Iterator[Client]:
     """Run a viewer of the room, with one photo to choose; ``camera`` is that of other photos."""
     stop, ready = threading.Event(), SimpleQueue[str]()
     with tempfile.TemporaryDirectory() as folder:
         source = Photos([viewed.photo_file(Path(folder))], CameraSource(assumed=(CAMERA,)))
-        options = {
-            "port": 0, "token": token, "limits": LIMITS, "ready": ready.put, "stop": stop, "camera": camera,
-        }  # fmt: skip
-        thread = threading.Thread(target=serve_view, args=(Localizer(viewed.room()), source), kwargs=options)
+        options = {"token": token, "limits": LIMITS, "ready": ready.put, "stop": stop, "camera": camera}
+        thread = threading.Thread(
+            target=serve_view, args=(Localizer(room), source), kwargs=options | {"port": 0}
+        )
         thread.start()
         try:
             yield Client(int(urlsplit(ready.get(timeout=120)).port or 0))

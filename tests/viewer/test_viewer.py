@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 import re
+from base64 import b64decode
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,9 @@ import pytest
 import torch
 
 import viewed
-from bidnerf_core import SE3, InputError, Intrinsics, Localizer, view
+from bidnerf_core import SE3, InputError, Intrinsics, Localization, Localizer, Map, view
 from bidnerf_core.cli.report import link_to
+from bidnerf_core.datasets import Query
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.evaluation import ResultTable
 from bidnerf_core.evaluation.report import doubtful
@@ -46,17 +48,40 @@ from bidnerf_core.viewer.rendering import field_image, quick_image
 from bidnerf_core.viewer.saving import MODULES, page_html
 from bidnerf_core.viewer.scene import shown_map, towards
 from bidnerf_core.viewer.view import localized
-from commands import Run
+from commands import Run, assert_refused
 
 
 @pytest.fixture(scope="module")
-def localizer() -> Localizer:
-    return Localizer(viewed.room())
+def localizer(room: Map) -> Localizer:
+    return Localizer(room)
 
 
 @pytest.fixture(scope="module")
-def found(localizer: Localizer) -> ShownAnswer:
-    return localized(localizer, viewed.query())
+def query() -> Query:
+    return viewed.query()
+
+
+@pytest.fixture(scope="module")
+def recording(localizer: Localizer, query: Query) -> tuple[Localization, SearchRecord]:
+    """A localization of the photo, and the record of its search."""
+    with recorded() as record:
+        answer = localizer(query.views)
+    return answer, record
+
+
+@pytest.fixture(scope="module")
+def answer(recording: tuple[Localization, SearchRecord]) -> Localization:
+    return recording[0]
+
+
+@pytest.fixture(scope="module")
+def found(localizer: Localizer, query: Query) -> ShownAnswer:
+    return localized(localizer, query)
+
+
+@pytest.fixture(scope="module")
+def refused(localizer: Localizer) -> ShownAnswer:
+    return localized(localizer, viewed.query(viewed.HOSTILE, seed=5))
 
 
 def test_a_trajectory_in_another_unit_than_the_map_is_remarked(
@@ -72,11 +97,6 @@ def test_a_trajectory_in_another_unit_than_the_map_is_remarked(
         shown_trajectory(tmp_path / f"path.{ending}", "metres")
         assert f"path.{ending}: is in units, but the map is in metres" in caplog.text
         caplog.clear()
-
-
-@pytest.fixture(scope="module")
-def refused(localizer: Localizer) -> ShownAnswer:
-    return localized(localizer, viewed.query(viewed.HOSTILE, seed=5))
 
 
 def test_an_accepted_pose_passes_its_figures(found: ShownAnswer) -> None:
@@ -129,8 +149,7 @@ def test_probabilities_of_the_answers_to_a_question_add_up(found: ShownAnswer, r
         assert math.isclose(sum(each.probability for each in contest.answers), 1, abs_tol=0.02), contest
 
 
-def test_each_comparison_is_a_contest_of_its_own(localizer: Localizer) -> None:
-    answer = localizer(viewed.query().views)
+def test_each_comparison_is_a_contest_of_its_own(answer: Localization) -> None:
     there = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 2.0)
     mirror, twin = ComparedExplanation("mirrored", 90.0, None), ComparedExplanation("a twin", -1.0, there)
     record = SearchRecord(explanations=[mirror, twin])
@@ -147,33 +166,32 @@ def test_each_comparison_is_a_contest_of_its_own(localizer: Localizer) -> None:
     assert other.probability > pose.probability
 
 
-def test_the_loss_of_a_descent_is_the_first_figure(localizer: Localizer) -> None:
-    said, answer = Support(0.9, 5.0, -3.0, 9.0), localizer(viewed.query().views)
+def test_the_loss_of_a_descent_is_the_first_figure(answer: Localization) -> None:
+    said = Support(0.9, 5.0, -3.0, 9.0)
     lost = replace(answer, confidence=said.confidence, diagnostics=DescentDiagnostics(0.036, 0.02, said))
     first = acceptance_figures(lost, None)[0]
     assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "below 0.02", False)  # fmt: skip
     assert "not even a local optimum" in contests(lost, None)[0].remark
 
 
-def test_a_descent_is_shown_step_by_step_with_its_loss(localizer: Localizer) -> None:
-    answer = localizer(viewed.query().views)
+def test_a_descent_is_shown_step_by_step_with_its_loss(room: Map, answer: Localization) -> None:
     T, losses = SE3.stack([*viewed.walk(500), answer.T_world_camera]), torch.linspace(0.5, 0.1, 500)
-    steps = shown_answer(viewed.room(), "descent", replace(answer, poses=T, losses=losses)).steps
+    steps = shown_answer(room, "descent", replace(answer, poses=T, losses=losses)).steps
     assert len(steps) <= MOST_STEPS + 1
     assert [steps[0].caption, steps[-1].caption] == ["step 0 of 500", HERE]
     assert [step.loss for step in steps] == sorted((step.loss for step in steps if step.loss), reverse=True)
     assert steps[0].loss == 0.5
 
 
-def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(localizer: Localizer) -> None:
-    query = viewed.query()
-    with recorded() as record:
-        answer = localizer(query.views)
-    here = shown_answer(viewed.room(), "here", answer, query.frame, record)
+def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(
+    room: Map, query: Query, recording: tuple[Localization, SearchRecord]
+) -> None:
+    answer, record = recording
+    here = shown_answer(room, "here", answer, query.frame, record)
     assert {figure.pose for figure in here.figures} == {here.matches.pose if here.matches else None} == {""}
     away = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 1.0)
     given_up = replace(answer, T_world_camera=away, diagnostics=None, confidence=None)
-    there = shown_answer(viewed.room(), "there", given_up, query.frame, record)
+    there = shown_answer(room, "there", given_up, query.frame, record)
     assert (
         {figure.pose for figure in there.figures}
         == {there.matches.pose if there.matches else None}
@@ -182,20 +200,20 @@ def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(localizer: Loc
     assert EARLIER in next(each.remark for each in there.contests if not each.of_pose)
 
 
-def test_a_likelier_pose_is_shown_as_such_also_once_it_was_taken(localizer: Localizer) -> None:
-    query = viewed.query()
-    with recorded() as record:
-        answer = localizer(query.views)
+def test_a_likelier_pose_is_shown_as_such_also_once_it_was_taken(
+    room: Map, recording: tuple[Localization, SearchRecord]
+) -> None:
+    answer, record = recording
     T = answer.T_world_camera
     there = replace(T, translation=T.translation + 1.0)
     compared = SearchRecord(record.steps, record.landmarks, [ComparedExplanation("two places", -2.0, there)])
-    kept = shown_answer(viewed.room(), "a", replace(answer, outcome=Outcome.AMBIGUOUS), record=compared)
+    kept = shown_answer(room, "a", replace(answer, outcome=Outcome.AMBIGUOUS), record=compared)
     assert kept.runner_up is not None
     assert kept.runner_up.probability == pytest.approx(1 / (1 + math.exp(-2)))
     assert kept.contests[0].remark == KEPT
     assert kept.steps[-2].caption == "two places"  # both poses, the likelier first
     assert kept.steps[-2].scores == (-2.0, 0.0)
-    taken = shown_answer(viewed.room(), "b", replace(answer, T_world_camera=there), record=compared)
+    taken = shown_answer(room, "b", replace(answer, T_world_camera=there), record=compared)
     assert taken.runner_up is not None
     assert taken.runner_up.probability == pytest.approx(1 / (1 + math.exp(2)))
     assert taken.runner_up.pose == pytest.approx(
@@ -204,10 +222,10 @@ def test_a_likelier_pose_is_shown_as_such_also_once_it_was_taken(localizer: Loca
     assert taken.contests[0].answers[0].probability > 0.8
 
 
-def test_a_localization_is_not_recorded_unless_asked_for(localizer: Localizer) -> None:
-    query = viewed.query()
-    with recorded() as record:
-        with_record = localizer(query.views)
+def test_a_localization_is_not_recorded_unless_asked_for(
+    localizer: Localizer, query: Query, recording: tuple[Localization, SearchRecord]
+) -> None:
+    with_record, record = recording
     steps = len(record.steps)
     without = localizer(query.views)
     assert current_record() is None
@@ -229,9 +247,8 @@ def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator
     assert ellipsoid(T, None) is None
 
 
-def test_depth_difference_is_the_offset_of_a_shifted_measurement(localizer: Localizer) -> None:
-    image = localizer.scene.render(viewed.query().views[0])
-    frame = viewed.query().frame
+def test_depth_difference_is_the_offset_of_a_shifted_measurement(room: Map, query: Query) -> None:
+    image, frame = room.render(query.views[0]), query.frame
     shifted = depth_difference(
         image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0))
     )
@@ -255,8 +272,6 @@ def test_normals_point_to_the_side_of_the_cameras(generator: torch.Generator) ->
 def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) -> None:
     points = 1000 + 7 * torch.randn((50, 3), generator=generator, dtype=torch.float64)
     found = packed_points(points)
-    from base64 import b64decode
-
     places = np.frombuffer(b64decode(found.places.base64), "<u2").reshape(-1, 3)
     back = np.array(found.lower) + places / 65535 * found.size
     assert np.abs(back - points.numpy()).max() <= found.size / 65535
@@ -264,9 +279,9 @@ def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) 
 
 
 def test_the_page_holds_its_state_and_hostile_names_stay_text(
-    found: ShownAnswer, refused: ShownAnswer
+    room: Map, found: ShownAnswer, refused: ShownAnswer
 ) -> None:
-    state = PageState(shown_map(viewed.room(), 2), (found, refused), title=viewed.HOSTILE)
+    state = PageState(shown_map(room, 2), (found, refused), title=viewed.HOSTILE)
     page = page_html(state)
     assert viewed.HOSTILE not in page
     assert page.count("</script>") == 3  # of the state, of three.js and of the modules
@@ -276,8 +291,8 @@ def test_the_page_holds_its_state_and_hostile_names_stay_text(
     assert held["map"]["unit"] == "m"
 
 
-def test_the_page_asks_nobody_for_anything(found: ShownAnswer) -> None:
-    page = page_html(PageState(shown_map(viewed.room(), 0), (found,)))
+def test_the_page_asks_nobody_for_anything(room: Map, found: ShownAnswer) -> None:
+    page = page_html(PageState(shown_map(room, 0), (found,)))
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
     assert policy is not None
     assert "default-src 'none'" in policy[1]
@@ -289,18 +304,12 @@ def test_the_page_asks_nobody_for_anything(found: ShownAnswer) -> None:
     modules = page.rpartition('<script type="module">')[2]
     assert "import " not in re.sub(r"//.*", "", modules)
     assert len(MODULES) == len(set(MODULES))
-
-
-def test_names_of_the_pages_modules_are_defined_once() -> None:
-    page = page_html(PageState(shown_map(viewed.room(), 0)))
-    modules = page.rpartition('<script type="module">')[2]
     names = re.findall(r"^(?:async )?(?:function|class|const|let) (\w+)", modules, re.MULTILINE)
-    assert len(names) == len(set(names))
+    assert len(names) == len(set(names))  # the modules are one script
 
 
-def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(found: ShownAnswer) -> None:
-    query = viewed.query()
-    shown = view(viewed.room(), frame=query.frame)
+def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(room: Map, query: Query) -> None:
+    shown = view(room, frame=query.frame)
     markup = shown._repr_html_()
     assert 'sandbox="allow-scripts"' in markup
     source = re.search(r'srcdoc="([^"]*)"', markup)
@@ -309,8 +318,7 @@ def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(found: ShownA
     assert "1 localization" in repr(shown)
 
 
-def test_another_explanation_that_fits_as_well_is_the_first_figure(localizer: Localizer) -> None:
-    answer = localizer(viewed.query().views)
+def test_another_explanation_that_fits_as_well_is_the_first_figure(answer: Localization) -> None:
     twin, mirror = (
         ComparedExplanation("a twin", 0.0, answer.T_world_camera),
         ComparedExplanation("mirrored", 90.0, None),
@@ -321,15 +329,13 @@ def test_another_explanation_that_fits_as_well_is_the_first_figure(localizer: Lo
 
 
 def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(
-    localizer: Localizer, tmp_path: Path
+    room: Map, answer: Localization, tmp_path: Path
 ) -> None:
-    localizer(viewed.query().views).save(tmp_path / "pose.json")
-    from bidnerf_core import Localization
-
-    answer = shown_answer(viewed.room(), "earlier", Localization.load(tmp_path / "pose.json"))
-    assert answer.accepted
-    assert answer.rendered is None
-    assert answer.figures[0].name == "confidence"
+    answer.save(tmp_path / "pose.json")
+    shown = shown_answer(room, "earlier", Localization.load(tmp_path / "pose.json"))
+    assert shown.accepted
+    assert shown.rendered is None
+    assert shown.figures[0].name == "confidence"
 
 
 def test_what_is_no_map_is_refused() -> None:
@@ -337,25 +343,21 @@ def test_what_is_no_map_is_refused() -> None:
         view("room")  # type: ignore[arg-type]
 
 
-def test_view_saves_a_page_of_photos(bidnerf: Run, tmp_path: Path) -> None:
+def test_view_saves_a_page_of_photos(bidnerf: Run, room: Map, tmp_path: Path) -> None:
     photo, page = viewed.photo_file(tmp_path), tmp_path / "page.html"
-    folder = viewed.room().folder
-    done = bidnerf("view", folder, photo, "--save", page)
-    assert done.status == 0, done.err
-    (answer,) = viewed.state_of(page.read_text())["answers"]
-    assert answer["name"] == "photo"
-    assert answer["accepted"], answer["reason"]
-    assert bidnerf("view", folder, photo, "--save", tmp_path / "page.txt").status != 0
-    assert bidnerf("view", folder, photo, "--save", photo).status != 0
-    nothing = bidnerf("view", folder, tmp_path / "none.png", "--save", page)
-    assert nothing.status == 1
-    assert "none.png" in nothing.err
-    some = bidnerf("view", folder, photo, tmp_path / "none.png", "--save", page)
-    assert some.status == 0
-    assert "none.png" in some.err
-    (_, answer) = viewed.state_of(page.read_text())["answers"]  # the page says what is wrong, too
-    assert not answer["accepted"]
-    assert "none.png" in answer["reason"]
+    place, none = ["view", room.folder, photo], tmp_path / "none.png"
+    for wrong, status in ((tmp_path / "page.txt", 1), (photo, 2)):
+        assert_refused(bidnerf(*place, "--save", wrong), status, wrong, after_remarks=True)
+    nothing = bidnerf("view", room.folder, none, "--save", page)
+    assert_refused(nothing, 1, none, after_remarks=True)
+    assert not page.exists()
+    some = bidnerf(*place, none, "--save", page)
+    assert some.status == 0, some.err
+    assert str(none) in some.err
+    good, bad = viewed.state_of(page.read_text())["answers"]
+    assert (good["name"], good["accepted"]) == ("photo", True), good["reason"]
+    assert not bad["accepted"]
+    assert "none.png" in bad["reason"]  # the page says what is wrong, too
 
 
 def test_a_report_links_to_the_frames_that_are_wrong_or_refused() -> None:
@@ -373,8 +375,8 @@ def test_a_report_links_to_the_frames_that_are_wrong_or_refused() -> None:
     assert link_to(Path("/a/pages/my map.html"), Path("/a/report")) == "../pages/my%20map.html"
 
 
-def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted() -> None:
-    scene, pose = viewed.room(), viewed.walk(3)[1]
+def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted(room: Map) -> None:
+    scene, pose = room, viewed.walk(3)[1]
     camera = Intrinsics.from_hfov(60, 160, 90)
     whole = render_image(scene.field, camera, pose, scene.bounds).rgb
     asked = list[bool]()

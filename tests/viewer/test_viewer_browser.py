@@ -22,7 +22,7 @@ pytest.importorskip("playwright", reason="Playwright is not installed")
 from playwright.sync_api import sync_playwright
 
 import viewed
-from bidnerf_core import SE3, Localizer
+from bidnerf_core import SE3, Localizer, Map
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.viewer import page_of, shown_row, shown_trajectory
 from bidnerf_core.viewer.answer import shown_answer
@@ -68,10 +68,10 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def saved(room: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page with an accepted photo, a refused one with a hostile name, results and a trajectory."""
     folder = tmp_path_factory.mktemp("page")
-    localizer = Localizer(viewed.room())
+    localizer = Localizer(room)
     answers = [
         localized(localizer, viewed.query()),
         localized(localizer, viewed.query(viewed.HOSTILE, seed=5)),
@@ -93,7 +93,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("elsewhere", "imprecise"),
         )
     ]
-    page = page_of(viewed.room(), answers, shown_trajectory(folder / "track.json"), rows)
+    page = page_of(room, answers, shown_trajectory(folder / "track.json"), rows)
     (folder / "notebook.html").write_text(f"<!doctype html><title>notebook</title>{page._repr_html_()}")
     return save_page(page.state, folder / "page.html")
 
@@ -130,10 +130,10 @@ def value(page: Any, field: str) -> str:
     return str(page.input_value(field))
 
 
-def test_a_photo_is_chosen_and_localized_live(browser: Any, tmp_path: Path) -> None:
+def test_a_photo_is_chosen_and_localized_live(browser: Any, room: Map, tmp_path: Path) -> None:
     photo = viewed.photo_file(tmp_path, "a <b>photo.png")
     with (
-        serving(camera=CameraSource(hfov=61.5)) as client,
+        serving(room, camera=CameraSource(hfov=61.5)) as client,
         opened(browser, f"http://127.0.0.1:{client.port}/", LAPTOP) as page,
     ):
         assert page.title().startswith("room")
@@ -231,11 +231,11 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
         assert not page.is_visible("#words")
 
 
-def test_a_descent_can_be_replayed(browser: Any, tmp_path: Path) -> None:
-    found = Localizer(viewed.room())(viewed.query().views)
+def test_a_descent_can_be_replayed(browser: Any, room: Map, tmp_path: Path) -> None:
+    found = Localizer(room)(viewed.query().views)
     poses, losses = SE3.stack([*viewed.walk(30), found.T_world_camera]), torch.linspace(0.5, 0.1, 30)
-    answer = shown_answer(viewed.room(), "descent", replace(found, poses=poses, losses=losses))
-    file = save_page(page_of(viewed.room(), [answer]).state, tmp_path / "page.html")
+    answer = shown_answer(room, "descent", replace(found, poses=poses, losses=losses))
+    file = save_page(page_of(room, [answer]).state, tmp_path / "page.html")
     with opened(browser, file.as_uri(), LAPTOP, offline=True) as page:
         page.locator("#step").fill("10")
         assert page.text_content("#caption") == "step 10 of 30: loss 0.362"

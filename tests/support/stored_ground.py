@@ -1,0 +1,55 @@
+"""The textured ground as a map that commands open as if it were stored, and a flight over it as a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+import bidnerf_core.cli.localize as localize_module
+import bidnerf_core.cli.track as track_module
+from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf_core.captures import StoredCamera
+from bidnerf_core.datasets import write_transforms
+from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.maps import MapInfo
+from bidnerf_core.testing import MapWithLandmarks, textured_map
+
+
+@dataclass(frozen=True, eq=False)
+class StoredGround(MapWithLandmarks):
+    """The textured ground with the description that stored maps have."""
+
+    cameras: tuple[StoredCamera, ...] = ()
+
+    @property
+    def info(self) -> MapInfo:
+        return MapInfo("ground", {}, self.bounds, 1, True, "data", weights="ground", cameras=self.cameras)
+
+    @property
+    def unit(self) -> LengthUnit:
+        return self.info.unit
+
+    @property
+    def up(self) -> None:
+        return None
+
+
+def open_ground(
+    patch: pytest.MonkeyPatch, cameras: Sequence[StoredCamera] = (), assumed: tuple[Intrinsics, ...] = ()
+) -> None:
+    """Let commands open the ground, whatever folder they name. ``assumed``: the landmarks' cameras, if given."""
+    known = textured_map(surface=True)
+    assert known.landmarks is not None
+    landmarks = replace(known.landmarks, cameras=assumed) if assumed else known.landmarks
+    ground = StoredGround(known.field, known.bounds, landmarks, known.surface, cameras=tuple(cameras))
+    for module in (localize_module, track_module):
+        patch.setattr(module, "load_map", lambda folder: ground)
+
+
+def write_flight(folder: Path, frames: Sequence[tuple[Frame, SE3]]) -> Path:
+    """Write frames and their poses as the test split of a dataset."""
+    write_transforms(folder, {"test": [View(frame, T) for frame, T in frames]}, (0.0, 0.0, 0.0))
+    return folder
