@@ -1,4 +1,7 @@
-"""Acceptance: right answers are accepted, wrong ones rejected, and each outcome has its reason."""
+"""Acceptance: from the measures of a pose to its outcome and reason, and those of poses at a surface.
+
+The methods' own tests have right and wrong answers as a whole; the verdicts are needed here for the threshold of each measure.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,6 @@ from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.settings import RenderedThresholds
-from bidnerf_core.scenes.demo import demo_room
 
 
 def rejection(T: SE3, cloud: PointCloud, margin: float = math.inf) -> Verdict | None:
@@ -33,17 +35,6 @@ def rejection(T: SE3, cloud: PointCloud, margin: float = math.inf) -> Verdict | 
 
 def outcome(T: SE3, cloud: PointCloud, margin: float = math.inf) -> Outcome:
     return surface_diagnostics(PointSearch(baked.toy(), cloud).judge(), T, margin).verdict().outcome
-
-
-def searched(cloud: PointCloud, generator: Generator) -> Verdict | None:
-    """Return what rejects the best pose that there is for ``cloud``."""
-    found = PointSearch(baked.toy(), cloud)(None, 128, generator)
-    return rejection(found.T[0], cloud, found.margin)
-
-
-def test_right_poses_are_accepted() -> None:
-    for view in baked.unseen():
-        assert outcome(view.T_ref_camera, baked.cloud(view)) is Outcome.CONVERGED
 
 
 def test_wrong_poses_are_rejected(generator: Generator) -> None:
@@ -163,24 +154,6 @@ def test_a_descent_has_to_explain_more_than_a_single_colour_does(least: float, e
     verdict = descent_verdict(0.01, 0.02, True, "reached 5 steps", found, least)
     assert verdict.outcome is expected
     assert ("explains only" in verdict.reason) is not verdict.accepted
-
-
-def test_other_colours_are_rejected() -> None:
-    view = baked.unseen()[0]
-    cloud = baked.cloud(view)
-    inverted = baked.points(cloud.points, 1 - cloud.rgb, cloud.origins)
-    assert outcome(view.T_ref_camera, inverted) is Outcome.COLOUR_MISMATCH
-
-
-def test_a_mirrored_object_is_rejected(generator: Generator) -> None:
-    cloud = baked.cloud(baked.unseen()[0])
-    mirror = torch.tensor([-1.0, 1.0, 1.0])
-    assert searched(baked.points(cloud.points * mirror, cloud.rgb, cloud.origins), generator) is not None
-
-
-def test_an_image_of_something_else_is_rejected(generator: Generator) -> None:
-    room = baked.images(replace(demo_room(), bounds=baked.BOUNDS), 1, seed=0)[0]
-    assert searched(baked.cloud(room), generator) is not None
 
 
 def test_lines_of_sight_run_through_the_surface_from_behind() -> None:

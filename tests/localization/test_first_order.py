@@ -1,21 +1,18 @@
-"""First-order methods: what updates turn about, when descents stop, and where pixels are drawn."""
+"""First-order methods: what updates turn about, when descents stop, and where pixels are drawn.
+
+``AdamSteps`` and ``History`` are needed here for what no answer shows: steps beside torch's Adam, and the rule of the best pose.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
-import tiny
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import DrawerName, draw, uniform
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     AdamSettings,
@@ -30,23 +27,16 @@ from bidnerf_core.localization import (
     SampledLoss,
     objective_of,
     pivot,
-    rig,
-    settings_of,
 )
 from bidnerf_core.localization.acceptance import DescentDiagnostics
 from bidnerf_core.localization.beyond_chance import NO_RIVAL
 from bidnerf_core.localization.solvers.adam import AdamSteps
-from bidnerf_core.localization.solvers.history import WINDOW
+from bidnerf_core.localization.solvers.history import WINDOW, History
 from bidnerf_core.localization.solvers.pivots import PivotName
-from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_hashgrid import backend as hashgrid
-from problems import FieldMap, localize, single
+from blob_images import BOUNDS, CAMERA, TRUTH
+from problems import localize, single
 
-BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
-TRUTH = orbit(4.0, 3, seed=1)[1]
 FIELD = GaussianBlobs.random()
 XI = torch.tensor([0.02, -0.01, 0.03, 0.05, -0.07, 0.04], dtype=torch.float64)
 
@@ -61,15 +51,6 @@ def problem() -> Problem:
     return single(FIELD, BOUNDS, photograph(), perturb(TRUTH, 0.2, 4.0, seed=3))
 
 
-@pytest.mark.parametrize("pixels", ["interest-regions", "uniform"])
-def test_inerf_finds_its_place(problem: Problem, pixels: DrawerName) -> None:
-    found = localize(problem, "inerf", {"rays": 256, "max_steps": 150, "pixels": pixels}, seed=0)
-    before, after = (pose_error(T, TRUTH) for T in (problem.start, found.T_world_camera))
-    assert found.method == "inerf"
-    assert float(after.translation) < 0.25 * float(before.translation)
-    assert float(after.rotation_deg) < 0.25 * float(before.rotation_deg)
-
-
 def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
     """Alone at its few corners this soft scene says too little of the pose; that they are looked at can be seen."""
     losses = [
@@ -77,26 +58,6 @@ def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
         for name in ("uniform", "interest-points", "interest-regions")
     ]
     assert len(set(losses)) == 3
-
-
-def test_inerf_uses_no_depth(problem: Problem) -> None:
-    frame = problem.views[0].frame
-    wrong = torch.full((40, 48), 7.0)
-    few = {"rays": 64, "max_steps": 3}
-    answers = [
-        localize(single(FIELD, BOUNDS, replace(frame, depth=depth), problem.start), "inerf", few)
-        for depth in (None, wrong)
-    ]
-    assert torch.equal(answers[0].poses.matrix(), answers[1].poses.matrix())
-
-
-def test_an_image_of_a_single_colour_determines_nothing() -> None:
-    """The loss of a plain background is 0 wherever no ray meets anything."""
-    plain = Frame("plain", torch.ones((CAMERA.height, CAMERA.width, 3)), CAMERA)
-    away = SE3(TRUTH.rotation, TRUTH.translation + 10)
-    found = localize(single(FIELD, BOUNDS, plain, away), "bid", {"rays": 64, "max_steps": 2})
-    assert found.outcome is Outcome.UNDETERMINED
-    assert "fit about as well" in found.reason or "single-colour" in found.reason
 
 
 @pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.CONVERGED), (1e-6, Outcome.RENDERING_MISMATCH)])
@@ -114,12 +75,6 @@ def test_the_loss_of_depth_is_not_compared_with_that_of_a_colour(problem: Proble
     assert isinstance(found.diagnostics, DescentDiagnostics)
     assert found.diagnostics.support.plain == NO_RIVAL
     assert "contrast" not in found.reason
-
-
-def test_inerf_takes_one_image() -> None:
-    views = [View(photograph(T), T) for T in (orbit(4.0, 3, seed=1)[0], TRUTH)]
-    with pytest.raises(InputError, match="one image, got 2; method bid"):
-        localize(rig(FieldMap(FIELD, BOUNDS), views, TRUTH), "inerf")
 
 
 def test_the_learning_rate_is_inerfs(problem: Problem) -> None:
@@ -198,38 +153,6 @@ def test_best_is_no_worse_than_last_by_its_own_measure(problem: Problem) -> None
     assert best.loss <= last.loss
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"stop_step": -1.0}, "stop_step is -1.0, expected a number from 0 up"),
-        ({"stop_loss": -1.0}, "stop_loss is -1.0"),
-        ({"colour_scale": 0.0}, "colour_scale is 0.0"),
-        ({"rays": 0}, "rays is 0"),
-    ],
-)
-def test_bad_settings_are_named(settings: dict[str, float], message: str) -> None:
-    for method in ("bid", "inerf"):
-        with pytest.raises(InputError, match=message):
-            settings_of(method, settings)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_thresholds_are_finite(value: float) -> None:
-    with pytest.raises(InputError, match=f"stop_loss is {value}, expected a number from 0 up"):
-        AdamSettings(stop_loss=value)
-
-
-def test_rays_are_moved_to_the_device_of_the_field(problem: Problem) -> None:
-    """The device "meta" stands for a GPU: it is another device, and one that every machine has."""
-    elsewhere = hashgrid.build(tiny.config(), BOUNDS).to("meta")
-    assert replace(problem, field=elsewhere).device.type == "meta"
-    assert problem.device.type == "cpu"  # a field without parameters
-    pixels = draw(problem.views, 8, uniform, torch.Generator().manual_seed(0), device="meta")
-    rays = pixels.rays(problem.start, BOUNDS)
-    parts = (pixels.origins, pixels.directions, pixels.rgb, pixels.distance, rays.origins, rays.near)
-    assert {part.device.type for part in parts} == {"meta"}
-
-
 def test_updates_are_those_of_torch() -> None:
     """Steps on a quadratic loss of the translation, beside torch's own Adam on the same gradients."""
     goal = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64)
@@ -246,21 +169,6 @@ def test_updates_are_those_of_torch() -> None:
         optimizer.step()
         steps()
         torch.testing.assert_close(steps.T.translation, place.detach())
-
-
-def test_a_block_holds_the_steps_that_were_taken() -> None:
-    config = AdamSettings(learning_rate=0.1)
-    steps = AdamSteps(lambda T: T.translation.sum() + 1, Pivot(SE3.identity()), config, SE3.identity())
-    for _ in range(WINDOW):
-        steps()
-    poses, losses, finite = steps.block()
-    assert finite.all()
-    torch.testing.assert_close(losses[1:], poses.translation[:-1].sum(-1) + 1)
-    torch.testing.assert_close(poses[WINDOW - 1].matrix(), steps.T.matrix())
-    taken = poses.matrix().clone()
-    steps()
-    torch.testing.assert_close(steps.block()[0][0].matrix(), steps.T.matrix())
-    assert torch.equal(poses.matrix(), taken)  # not overwritten by later steps
 
 
 def test_each_step_of_a_descent_follows_from_the_one_before(problem: Problem) -> None:
@@ -294,3 +202,49 @@ def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one(
     torch.testing.assert_close(linear(zero), exact(zero))
     derivatives = [torch.autograd.functional.jacobian(update, zero) for update in (linear, exact)]
     torch.testing.assert_close(*derivatives)
+
+
+def history(losses: list[float]) -> History:
+    """Return a history with these losses and a centimetre along x a step."""
+    poses = [
+        SE3.exp(torch.tensor([0.01 * i, 0, 0, 0, 0, 0], dtype=torch.float64)) for i in range(len(losses) + 1)
+    ]
+    return History(poses, losses)
+
+
+def test_the_best_pose_is_where_the_mean_loss_was_least() -> None:
+    losses = [1.0] * 30 + [0.2] * WINDOW + [0.5] * 30
+    losses[5] = 0.0  # one lucky draw is not the best
+    way = history(losses)
+    T, mean = way.answer("best")
+    assert mean == pytest.approx(0.2)
+    assert float(T.translation[0]) == pytest.approx(0.01 * (30 + WINDOW - 1))
+    T, mean = way.answer("last")
+    assert float(T.translation[0]) == pytest.approx(0.01 * len(losses))
+    assert mean == pytest.approx(0.5)
+
+
+def test_a_short_history_answers_with_its_end() -> None:
+    T, mean = history([0.1, 5.0]).answer("best")
+    assert float(T.translation[0]) == pytest.approx(0.02)
+    assert mean == pytest.approx(2.55)
+    assert math.isnan(history([]).answer("best")[1])
+
+
+def test_the_length_of_steps_is_measured() -> None:
+    assert history([1.0] * 40).recent_step() == pytest.approx(0.01)
+    assert history([1.0] * 40).stop(0.0, 0.011) is not None
+    assert history([1.0] * 40).stop(0.0, 0.009) is None
+    assert history([1.0] * (WINDOW - 1)).stop(10.0, 10.0) is None
+    assert history([]).recent_step() == math.inf
+
+
+def test_a_batch_adds_its_best_pose_after_each_step() -> None:
+    """Two poses over two steps; the history gets half of each cost, as the loss that Adam reports."""
+    xi = torch.zeros((3, 2, 6), dtype=torch.float64)
+    xi[..., 0] = torch.tensor([[0.0, 10.0], [1.0, 11.0], [2.0, 12.0]])
+    costs = torch.tensor([[4.0, 6.0], [3.0, 2.0], [1.0, 2.0]], dtype=torch.float64)
+    seen = History([SE3.identity()])
+    seen.add_batch(SE3.exp(xi), costs)
+    assert [float(T.translation[0]) for T in seen.poses] == pytest.approx([0.0, 11.0, 2.0])
+    assert seen.losses == [2.0, 1.0]

@@ -75,18 +75,6 @@ def gradient(loss: SampledLoss, problem: Problem) -> torch.Tensor:
     return torch.autograd.grad(value, xi)[0] if value.requires_grad else torch.zeros(6)
 
 
-def test_candidates_are_drawn_where_there_is_matter(frame: Frame) -> None:
-    problem = problem_at(frame, 0.0)
-    shares = []
-    for candidates in (1, 8):
-        loss = loss_of(problem, candidates=candidates)
-        loss(problem.start_for("bid"))
-        assert loss._batches is not None
-        shares.append(float(loss._batches[0].measured.double().mean()))
-        assert loss._batches[0].distance.shape == (1, 64)
-    assert shares[1] > 1.5 * shares[0]
-
-
 def test_a_start_from_which_nothing_is_met_has_a_gradient_towards_the_box_only_by_its_term(
     frame: Frame,
 ) -> None:
@@ -120,12 +108,6 @@ def test_a_blurred_field_is_the_field_convolved_with_a_gaussian() -> None:
     assert blurred.sampler is Wave.sampler
 
 
-def test_equal_samples_ignore_what_the_field_leaves_out(frame: Frame) -> None:
-    problem = problem_at(frame, 0.0)
-    scene = loss_of(problem, samples=7)._field()
-    assert scene.sampler == Stratified(7, BOX)
-
-
 def test_the_papers_settings_are_presets() -> None:
     paper, ours = (to_flat(METHODS["bid"].settings(name)) for name in ("paper", "paper-scene"))
     assert (paper["rays"], paper["max_steps"], paper["level"], paper["depth_weight"]) == (2048, 1000, 0, 1.0)
@@ -148,12 +130,6 @@ def test_bid_finds_the_ball_where_the_papers_objective_does_not(frame: Frame) ->
     assert (usual.candidates, usual.box_weight) == (3, 1.0)
 
 
-def test_candidates_are_not_drawn_where_every_pixel_shows_matter(frame: Frame) -> None:
-    everywhere = replace(frame, rgb=frame.rgb.clamp(min=0.5), depth=None)
-    assert loss_of(problem_at(frame, 0.0), candidates=3)._candidates == 3
-    assert loss_of(problem_at(everywhere, 0.0), candidates=3)._candidates == 1
-
-
 def test_depth_that_has_no_weight_is_not_used(frame: Frame) -> None:
     problem = problem_at(frame, 3.0)
     loss = replace(
@@ -174,9 +150,3 @@ def test_a_preset_can_be_changed_and_is_checked() -> None:
     assert Localizer(world, "bid", preset="paper", warm_up=False).config == METHODS["bid"].settings("paper")
     with pytest.raises(InputError, match="preset 'paper' and a BidConfig, expected one"):
         Localizer(world, "bid", METHODS["bid"].settings(), preset="paper")
-
-
-def test_a_preset_localizes(frame: Frame) -> None:
-    few = {**to_flat(METHODS["bid"].settings("paper-scene")), "rays": 64, "max_steps": 3}
-    found = localize(problem_at(frame, 0.2), "bid", few)
-    assert found.steps == 3

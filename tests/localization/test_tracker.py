@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -49,18 +50,6 @@ def test_a_sequence_is_tracked_with_honest_covariances(depth: bool) -> None:
     ]
     assert len(squared) == FRAMES
     assert sum(value < CHI2_99 for value in squared) >= FRAMES - 1
-
-
-def test_most_frames_are_tracked_without_detecting_keypoints(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The optical flow carries landmarks on; keypoints are detected where these become few."""
-    from bidnerf_core.mapping import Sift
-
-    localizer()  # building its map detects keypoints as well
-    calls = list[int]()
-    detect = Sift.__call__
-    monkeypatch.setattr(Sift, "__call__", lambda self, rgb: (calls.append(1), detect(self, rgb))[1])
-    tracked(flight())
-    assert len(calls) < FRAMES // 2
 
 
 def test_the_order_of_time_may_be_reversed() -> None:
@@ -178,11 +167,12 @@ def test_time_stamps_may_be_missing(known: int) -> None:
     assert_right(answers, frames)
 
 
-@pytest.mark.parametrize("time", [float("nan"), float("inf")])
-def test_a_time_that_is_no_number_is_refused_and_changes_nothing(time: float) -> None:
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("time", [math.nan, math.inf, "5", 10**400, True, [1.0]])
+def test_a_time_that_is_no_number_is_refused_and_changes_nothing(time: Any) -> None:
     tracker = Tracker(localizer())
     tracked(flight()[:2], tracker)
-    with pytest.raises(InputError, match="time of the frame"):
+    with pytest.raises(InputError, match=r"^time of the frame is .*, expected seconds or None"):
         tracker(flight()[2][1], time)
     assert_right(tracked(flight()[2:4], tracker), flight()[2:4])
 
@@ -294,16 +284,6 @@ def test_a_map_without_landmarks_is_tracked_by_depth() -> None:
     )
 
 
-def test_a_start_replaces_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise AssertionError("searched")
-
-    monkeypatch.setattr("bidnerf_core.localization.tracker.relocalized", fail)
-    start = flight_pose(0).retract(torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64))
-    tracker = Tracker(localizer(), start=start)
-    assert_right(tracked(flight()[:3], tracker), flight()[:3])
-
-
 def test_a_beginning_that_nobody_recognises_is_reported() -> None:
     tracker = Tracker(localizer())
     answer = tracker(covered(without_depth(flight()[0][1])), 0.0)
@@ -376,7 +356,7 @@ def test_corrections_of_intrinsics_follow_one_another(tmp_path: Path) -> None:
 
 
 def test_the_state_does_not_grow(tmp_path: Path) -> None:
-    """Neither in memory nor as a file, however long the sequence."""
+    """However long the sequence."""
     tracker, sizes = Tracker(localizer()), []
     to_and_fro = [flight()[n] for n in (*range(8), *range(6, 0, -1))]
     for lap in range(3):
@@ -384,7 +364,6 @@ def test_the_state_does_not_grow(tmp_path: Path) -> None:
             tracker(frame, INTERVAL * (lap * len(to_and_fro) + place))
         tracker.save(tmp_path / "state")
         sizes.append((tmp_path / "state").stat().st_size)
-        assert len(tracker._state.points) <= tracker.config.points
     assert max(sizes) < 1.25 * min(sizes)
 
 

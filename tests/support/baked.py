@@ -19,8 +19,8 @@ from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, b
 from bidnerf_core.scenes.closed_form import ClosedFormScene
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.primitives import Primitive, Shape
-from bidnerf_core.scenes.textures import Texture
+from bidnerf_core.scenes.primitives import Box, Primitive, Shape
+from bidnerf_core.scenes.textures import Texture, blotches
 from bidnerf_core.scenes.trajectories import orbit
 from problems import FieldMap
 
@@ -52,6 +52,16 @@ def unseen() -> tuple[View, ...]:
 
 def one_solid(shape: Shape, texture: Texture) -> ClosedFormScene:
     return ClosedFormScene([Primitive(shape, SE3.identity(), texture)], BOUNDS, "one")
+
+
+def even_box() -> ClosedFormScene:
+    """Return a box that half a turn maps onto itself."""
+    paint, turn = blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1), torch.tensor([-1.0, -1.0, 1.0])
+
+    def both(points: Tensor, normals: Tensor) -> Tensor:
+        return (paint(points, normals) + paint(points * turn, normals * turn)) / 2
+
+    return replace(one_solid(Box((0.6, 0.4, 0.3)), both), contrast=0.0)
 
 
 def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None = None) -> Problem:
