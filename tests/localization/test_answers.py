@@ -193,7 +193,6 @@ POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
     "rig": ({"others": POSES[1:2]}, Right()),
     "rig, focal 0.95": ({"pose": 1, "others": POSES[:1], "stated": scaled(0.95)}, MAP),
     "poster from near": ({"flat": True, "at": looking_in(0.5)}, Right(metres=0.05, degrees=1.0)),
-    "poster from afar": ({"flat": True, "at": looking_in(0.5, 0.3, 9.0)}, Outcome.AMBIGUOUS),
 }  # fmt: skip
 
 

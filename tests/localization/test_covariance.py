@@ -88,15 +88,6 @@ def test_what_a_wall_does_not_determine_has_the_size_of_the_scene() -> None:
     assert deviation[5] > 1
 
 
-def test_the_surface_covariance_does_not_depend_on_the_scale_of_the_search() -> None:
-    """It is always measured at the finest scale."""
-    view = baked.unseen()[0]
-    cloud = baked.cloud(view)
-    costs = (SurfaceCost(baked.toy(), cloud, PointScales(scale)) for scale in (0.05, 0.5))
-    one, other = (surface_covariance(cost, view.T_ref_camera) for cost in costs)
-    torch.testing.assert_close(one, other)
-
-
 def test_the_surface_covariance_of_a_plane_is_that_of_a_few_independent_distances() -> None:
     """Noise sigma of n independent distances leaves ``sigma / sqrt(n)``; the right colour counts as much as the place."""
     noise, surface = 0.003, baked.patch()

@@ -64,7 +64,7 @@ def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
 def test_colours_have_to_be_explained_better_than_by_a_single_one(
     problem: Problem, share: float, outcome: Outcome
 ) -> None:
-    settings = {"rays": 256, "max_steps": 150, "plain_share": share}
+    settings = {"rays": 128, "max_steps": 100, "plain_share": share}
     assert localize(problem, "inerf", settings, seed=0).outcome is outcome
 
 

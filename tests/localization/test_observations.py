@@ -29,7 +29,6 @@ from bidnerf_core.localization import (
     objective_of,
     window,
 )
-from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from problems import localize, single
@@ -98,18 +97,6 @@ def test_a_moved_world_leaves_the_depth_loss_as_it_is() -> None:
     moved = motion @ start
     there = depth_loss(single(FIELD.moved(motion), roomy, photograph(), moved, lidar()), moved)
     assert here == pytest.approx(there, rel=1e-3)
-
-
-def test_a_pose_is_found_from_colour_and_a_lidar() -> None:
-    """The camera has no depth."""
-    start = perturb(TRUTH, 0.3, 6.0, seed=3)
-    config = {
-        "rays": 64, "depth_rays": 128, "max_steps": 120, "learning_rate": 0.08, "depth_weight": 0.3, "level": None,
-    }  # fmt: skip
-    found = localize(single(FIELD, BOUNDS, photograph(), start, lidar()), "bid", config)
-    error = pose_error(found.T_world_camera, TRUTH)
-    assert float(error.translation) < 0.05
-    assert float(error.rotation_deg) < 1.0
 
 
 def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:

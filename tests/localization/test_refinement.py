@@ -10,7 +10,6 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     ColourSettings,
@@ -70,18 +69,6 @@ def test_the_covariance_is_the_cameras_whatever_the_pivot() -> None:
         torch.testing.assert_close(
             other.covariance.diagonal(), found[0].covariance.diagonal(), rtol=0.1, atol=0
         )
-
-
-def test_a_few_steps_alone_are_those_of_a_refinement() -> None:
-    problem, near = single(FIELD, BOUNDS, FRAME, None), perturb(TRUTH, 0.05, 1.0, seed=2)
-    stage, settings = RefinementStage(3, 512), rendered()
-    steps = take_few_steps(problem, near, stage, settings, Generator().manual_seed(0))
-    poses = steps.poses
-    assert steps.inliers > 0.95
-    whole = refine(problem, near[None], (stage,), settings, Generator().manual_seed(0))
-    assert torch.allclose(poses.matrix(), whole.poses.matrix(), atol=1e-3)
-    errors = pose_error(poses, TRUTH).translation
-    assert float(errors[-1]) < 0.3 * float(errors[0])
 
 
 def test_at_the_truth_no_step_leads_away() -> None:

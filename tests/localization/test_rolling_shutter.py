@@ -13,7 +13,7 @@ from bidnerf_core import Localizer, View
 from bidnerf_core.evaluation.faults.camera import rolling_shutter
 from bidnerf_core.frames.pixels import observe
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
+from bidnerf_core.localization import AutoConfig, LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
@@ -78,7 +78,7 @@ def test_views_of_a_rig_are_taken_as_still() -> None:
 def test_fusion_does_not_put_back_what_the_motion_has_removed(depth: bool, seed: int) -> None:
     stored = replace(textured_map(surface=True), landmarks=matcher().landmarks)
     view = photo(2.0, seed, depth)
-    answer, alone = Localizer(stored)(view.frame), found(view)
+    answer, alone = Localizer(stored, config=AutoConfig(fused_rays=256))(view.frame), found(view)
     assert answer.converged
     assert "fused with " + ("depth" if depth else "rendering") in answer.reason
     assert answer.covariance is not None
