@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
+from answers import CHI2_999, assert_covered
 from bidnerf_core import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.registry import registered
-from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field
 from conditions import (
-    CHI2_999,
     COPY,
     NOT_RENDERED,
     POSES,
@@ -82,16 +82,14 @@ def assert_as_expected(
         moved = bool(getattr(found.diagnostics, "rolling_shutter", False))
         assert (found.outcome, camera) == (Outcome.CONVERGED, expected.camera), found.reason
         assert expected.moved in (None, moved), found.reason
-        assert found.covariance is not None
-        assert normalized_error_squared(found.T_world_camera, truth, found.covariance) < CHI2_999
+        assert_covered(found.T_world_camera, truth, found.covariance, CHI2_999)
         if found.intrinsics is not None:
             assert found.intrinsics.fx == pytest.approx(true.fx, rel=0.04)
             assert (found.intrinsics.cx, found.intrinsics.cy) == pytest.approx((true.cx, true.cy), abs=8)
     elif isinstance(expected, Outcome):
         assert found.outcome is expected, found.reason
         if expected is Outcome.MISCALIBRATED:  # the covariance contains the pose with the right camera
-            assert found.covariance is not None
-            assert normalized_error_squared(found.T_world_camera, truth, found.covariance) < CHI2_999
+            assert_covered(found.T_world_camera, truth, found.covariance, CHI2_999)
     elif expected is REJECTED:
         assert not found.converged, found.reason
 

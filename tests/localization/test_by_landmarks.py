@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from answers import assert_covered, assert_near, colour_only
 from bidnerf_core import Localization, Localizer, Outcome, View
 from bidnerf_core.depth.sensors import find_depth_sensor
 from bidnerf_core.geometry.se3 import SE3
@@ -32,7 +33,6 @@ from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textur
 
 TRUTH = unseen().T_ref_camera
 RAYS = 256
-CHI2_99 = 16.8  # of six degrees of freedom
 
 
 @functools.cache
@@ -43,10 +43,6 @@ def matcher() -> LandmarkMatcher:
     return LandmarkMatcher(replace(landmarks, calibration_scatter=scatter, correlation=1.0))
 
 
-def without_depth(view: View) -> View:
-    return replace(view, frame=replace(view.frame, depth=None))
-
-
 def answer(*views: View, rays: int = 0, map: MapWithLandmarks | None = None, seed: int = 0) -> LandmarkAnswer:
     problem = rig(map or textured_map(), views, None, matcher=matcher())
     found = answer_by_landmarks(problem, matcher(), rays, seed)
@@ -54,24 +50,12 @@ def answer(*views: View, rays: int = 0, map: MapWithLandmarks | None = None, see
     return found
 
 
-def squared_distance(T: SE3, covariance: Tensor) -> float:
-    """Return the squared Mahalanobis distance of the true pose."""
-    xi = (T.inverse() @ TRUTH).log()
-    return float(xi @ torch.linalg.solve(covariance, xi))
-
-
-def assert_within(T: SE3, metres: float, degrees: float) -> None:
-    error = pose_error(T, TRUTH)
-    assert float(error.translation) < metres
-    assert float(error.rotation_deg) < degrees
-
-
 def test_landmarks_alone_find_a_photo() -> None:
-    found = answer(without_depth(unseen()))
+    found = answer(colour_only(unseen()))
     assert found.terms == ()
     assert torch.equal(found.T.matrix(), found.found.T_world_camera.matrix())
-    assert_within(found.T, 0.02, 0.5)
-    assert squared_distance(found.T, found.covariance) < CHI2_99
+    assert_near(found.T, TRUTH, 0.02, 0.5)
+    assert_covered(found.T, TRUTH, found.covariance)
 
 
 @pytest.mark.parametrize(
@@ -80,21 +64,21 @@ def test_landmarks_alone_find_a_photo() -> None:
     ids=["depth", "rendering", "both"],
 )
 def test_each_further_term_brings_the_pose_nearer(depth: bool, rays: int, terms: tuple[str, ...]) -> None:
-    view = unseen() if depth else without_depth(unseen())
-    found, alone = answer(view, rays=rays, map=textured_map(surface=True)), answer(without_depth(unseen()))
+    view = unseen() if depth else colour_only(unseen())
+    found, alone = answer(view, rays=rays, map=textured_map(surface=True)), answer(colour_only(unseen()))
     assert found.terms == terms
     before, after = (pose_error(T, TRUTH) for T in (alone.T, found.T))
     assert float(after.translation) < float(before.translation)
     assert float(after.rotation_deg) < float(before.rotation_deg)
-    assert squared_distance(found.T, found.covariance) < CHI2_99
+    assert_covered(found.T, TRUTH, found.covariance)
 
 
 def test_more_terms_make_the_covariance_smaller() -> None:
     """Measurements beside the landmarks add information in every direction and take none away."""
-    alone = answer(without_depth(unseen()))
+    alone = answer(colour_only(unseen()))
     for more in (
         answer(unseen(), map=textured_map(surface=True)),
-        answer(without_depth(unseen()), rays=RAYS),
+        answer(colour_only(unseen()), rays=RAYS),
     ):
         difference = alone.covariance - more.covariance
         root = torch.linalg.cholesky(torch.linalg.inv(alone.covariance))
@@ -105,17 +89,17 @@ def test_more_terms_make_the_covariance_smaller() -> None:
 
 def test_rendering_brings_a_pose_by_blurred_keypoints_to_that_of_the_field() -> None:
     """The image is what the field renders, so that rendered rays alone have no error."""
-    assert_within(answer(without_depth(unseen()), rays=RAYS).T, 0.002, 0.05)
+    assert_near(answer(colour_only(unseen()), TRUTH, rays=RAYS).T, 0.002, 0.05)
 
 
 @pytest.mark.parametrize("gain", [0.5, 1.6])
 def test_another_exposure_does_not_mislead_rendering(gain: float) -> None:
     """Half of the exposure, or one at which bright colours are clipped."""
-    view = without_depth(unseen())
+    view = colour_only(unseen())
     exposed = replace(view, frame=replace(view.frame, rgb=(gain * view.frame.rgb).clamp(max=1)))
     found = answer(exposed, rays=RAYS)
     assert found.terms == ("rendering",)
-    assert_within(found.T, 0.004, 0.1)
+    assert_near(found.T, TRUTH, 0.004, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +109,7 @@ def test_another_exposure_does_not_mislead_rendering(gain: float) -> None:
 )
 def test_a_blurred_field_is_not_rendered(noise: float | None, terms: tuple[str, ...]) -> None:
     blurred = replace(textured_map(), colour_noise=noise)
-    assert answer(without_depth(unseen()), rays=RAYS, map=blurred).terms == terms
+    assert answer(colour_only(unseen()), rays=RAYS, map=blurred).terms == terms
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
@@ -135,7 +119,7 @@ def test_an_approximate_focal_length_is_found_and_no_other_term_uses_the_wrong_o
     found = answer(replace(unseen(), frame=frame), rays=RAYS, map=textured_map(surface=True))
     assert found.found.focal_factor == pytest.approx(factor, rel=0.03)
     assert found.terms == ()
-    assert squared_distance(found.T, found.covariance) < CHI2_99
+    assert_covered(found.T, TRUTH, found.covariance)
 
 
 @pytest.mark.parametrize(("factor", "estimated"), [(1.0, False), (0.98, False), (0.85, True), (1.2, True)])
@@ -147,7 +131,7 @@ def test_a_calibrated_focal_length_is_replaced_only_where_it_cannot_be_right(
     found = answer(replace(unseen(), frame=frame))
     assert found.found.focal_factor == (pytest.approx(factor, rel=0.03) if estimated else 1)
     if estimated or factor == 1:
-        assert squared_distance(found.T, found.covariance) < CHI2_99
+        assert_covered(found.T, TRUTH, found.covariance)
 
 
 def test_the_scale_of_a_depth_sensor_is_found() -> None:
@@ -158,7 +142,7 @@ def test_the_scale_of_a_depth_sensor_is_found() -> None:
     found = answer(view, map=textured_map(surface=True))
     assert found.terms == ("depth",)
     assert found.found.depth_scale == pytest.approx(1 / 1.03, rel=0.01)
-    assert_within(found.T, 0.015, 0.3)
+    assert_near(found.T, TRUTH, 0.015, 0.3)
 
 
 @pytest.mark.parametrize("scale", [0.001, 0.3048, 0.8, 1.2])
@@ -167,9 +151,9 @@ def test_depth_of_another_unit_is_left_out(scale: float) -> None:
     depth = unseen().frame.depth
     assert depth is not None
     view = replace(unseen(), frame=replace(unseen().frame, depth=scale * depth))
-    found, plain = (answer(v, rays=RAYS, map=textured_map(surface=True)) for v in (view, without_depth(view)))
+    found, plain = (answer(v, rays=RAYS, map=textured_map(surface=True)) for v in (view, colour_only(view)))
     assert found.terms == plain.terms == ("rendering",)
-    assert_within(found.T, 0.004, 0.1)
+    assert_near(found.T, TRUTH, 0.004, 0.1)
     problem = rig(textured_map(surface=True), (view,), None, matcher=matcher())
     reason = localization_by_landmarks(problem, found, 0.0).reason
     assert f"without depth: it is {1 / found.found.depth_scale:.3g} times that of the landmarks" in reason
@@ -197,7 +181,7 @@ def test_a_depth_scale_is_shrunk_as_far_as_the_sensor_is_accurate(sensor: str, k
 
 
 def test_the_answer_tells_its_path_and_what_was_fused() -> None:
-    view = without_depth(unseen())
+    view = colour_only(unseen())
     start = TRUTH.retract(torch.full((6,), 0.1, dtype=torch.float64))
     problem = rig(textured_map(), [view], start)
     said = localization_by_landmarks(problem, answer(view, rays=RAYS), began=0.0)
@@ -219,10 +203,10 @@ def localized(view: View, map: MapWithLandmarks | None = None, start: SE3 | None
 
 def test_auto_takes_landmarks_first_with_a_start_or_without() -> None:
     start = TRUTH.retract(torch.full((6,), 0.5, dtype=torch.float64))  # far off: it must not matter
-    for found in (localized(without_depth(unseen())), localized(without_depth(unseen()), start=start)):
+    for found in (localized(colour_only(unseen())), localized(colour_only(unseen()), start=start)):
         assert found.outcome is Outcome.CONVERGED
         assert "landmark inliers" in found.reason
-        assert_within(found.T_world_camera, 0.02, 0.5)
+        assert_near(found.T_world_camera, TRUTH, 0.02, 0.5)
 
 
 def test_landmarks_can_be_switched_off() -> None:
@@ -246,7 +230,7 @@ def test_without_keypoints_measured_depth_is_searched_for_on_the_surface() -> No
 @pytest.mark.parametrize("grey", [0.0, 0.5])
 def test_a_covered_lens_is_not_found_by_rendering_either(grey: float) -> None:
     """A gain and a bias fit a single colour to whatever the map shows."""
-    view = without_depth(blank(grey))
+    view = colour_only(blank(grey))
     found = localized(view, textured_map(surface=True))
     assert found.outcome is Outcome.UNDETERMINED
     assert found.reason
@@ -273,10 +257,8 @@ def misled(right: float, most: int | None, monkeypatch: pytest.MonkeyPatch, **se
     assert scene.landmarks is not None
     landmarks = replace(scene.landmarks[torch.arange(len(scene.landmarks))[:most]], features="misleading")
     config = replace(QUICK, **settings)
-    found = Localizer(replace(scene, landmarks=landmarks), config=config)(
-        without_depth(unseen()).frame, TRUTH
-    )
-    assert_within(found.T_world_camera, 0.02, 0.5)
+    found = Localizer(replace(scene, landmarks=landmarks), config=config)(colour_only(unseen()).frame, TRUTH)
+    assert_near(found.T_world_camera, TRUTH, 0.02, 0.5)
     return found
 
 

@@ -11,8 +11,8 @@ import torch
 
 import baked
 import module_fields
+from answers import without_depth
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
-from bidnerf_core.frames.frame import View
 from bidnerf_core.localization import AutoConfig, settings_of
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field
@@ -50,10 +50,6 @@ def ground() -> MapWithLandmarks:
     return replace(found, field=AsModule(found.field))  # type: ignore[arg-type]
 
 
-def without_depth(view: View) -> Frame:
-    return replace(view.frame, depth=None)
-
-
 def same(here: Localization, there: Localization, tolerance: float = 1e-6) -> None:
     assert there.T_world_camera.device == torch.device("cpu")
     torch.testing.assert_close(
@@ -86,7 +82,7 @@ def test_auto_by_depth() -> None:
 def test_auto_by_colour() -> None:
     """It is rejected, as a part of the image is in one colour."""
     (view,) = module_fields.shown(1, seed=5)
-    frame = without_depth(view)
+    frame = without_depth(view.frame)
     rgb = frame.rgb.clone()
     rgb[: rgb.shape[0] // 3] = 0.5
     here = on_both(blobs(), replace(frame, rgb=rgb), **BY_COLOUR)
@@ -96,7 +92,7 @@ def test_auto_by_colour() -> None:
 @pytest.mark.parametrize("depth", [True, False])
 def test_auto_by_landmarks(depth: bool) -> None:
     view = textured_field.unseen()
-    here = on_both(ground(), view.frame if depth else without_depth(view), **SETTINGS)
+    here = on_both(ground(), view.frame if depth else without_depth(view.frame), **SETTINGS)
     assert here.converged, here.reason
     assert ("fused with depth and rendering" if depth else "fused with rendering") in here.reason
 

@@ -96,12 +96,6 @@ def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
     assert torch.equal(one.poses.matrix(), other.poses.matrix())
 
 
-@pytest.mark.parametrize("name", ["scene", "camera", "world"])
-def test_no_update_is_no_motion(problem: Problem, name: PivotName) -> None:
-    stayed = pivot(name, problem).moved(TRUTH, torch.zeros(6, dtype=torch.float64))
-    torch.testing.assert_close(stayed.matrix(), TRUTH.matrix())
-
-
 def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
     torch.testing.assert_close(pivot("camera", problem).moved(TRUTH, XI).matrix(), TRUTH.retract(XI).matrix())
     torch.testing.assert_close(

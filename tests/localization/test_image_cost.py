@@ -176,20 +176,6 @@ def test_the_scales_of_the_search_allow_for_twice_and_half_the_exposure(factor: 
     assert here < 2.6 * exact  # colours that are clipped at twice the exposure tell less
 
 
-def test_another_exposure_costs_little(generator: Generator) -> None:
-    small, T = of_toy(24)
-    view = baked.unseen()[0]
-    darker = thumbnail(
-        View(Frame("d", 0.8 * view.frame.rgb + 0.05, view.frame.intrinsics), SE3.identity()), 24
-    )
-    plain, fitted = (
-        float(compared(on_surface(), [darker], scales, T[None]).cost[0]) for scales in (PLAIN, ColourScales())
-    )
-    exact = float(compared(on_surface(), [small], ColourScales(), T[None]).cost[0])
-    assert fitted < plain
-    assert fitted < 1.5 * exact + 0.02
-
-
 PINHOLE = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64)
 LENS = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64, (-0.2, 0.05, 0.001, -0.002))
 

@@ -1,4 +1,4 @@
-"""Normal equations, a Gaussian prior as one, and Levenberg-Marquardt for many poses: it finds what scipy finds, never goes uphill, and takes no step it cannot solve for."""
+"""Normal equations, a Gaussian prior as such, and Levenberg-Marquardt, which finds what scipy finds and takes no step that it cannot solve for."""
 
 from __future__ import annotations
 
@@ -180,12 +180,6 @@ def test_the_hessian_at_the_mean_gives_the_covariance_back(pivot: str, covarianc
     torch.testing.assert_close(found, covariance, rtol=1e-8, atol=1e-14)
 
 
-def test_a_solver_finds_the_mean_from_afar(covariance: Tensor, generator: Generator) -> None:
-    prior = GaussianPrior(MEAN, covariance, PIVOTS["scene"])
-    found = descend(prior, away(1.0, generator), 20, prior.pivot.moved).T
-    torch.testing.assert_close(found.matrix(), MEAN.matrix().expand(2, 4, 4), rtol=0, atol=1e-6)
-
-
 def test_two_priors_meet_where_their_information_says(generator: Generator) -> None:
     """A Kalman update: close by, the sum of two priors is least at the mean weighted by information."""
     first, second = (torch.diag(torch.rand(6, generator=generator, dtype=torch.float64) + 0.5) for _ in "ab")
@@ -328,24 +322,3 @@ def test_what_cannot_be_solved_takes_no_step_and_harms_no_other(
     found = descend(first_spoilt, starts(3), 20)
     assert torch.equal(found.T[0].matrix(), starts(3)[0].matrix())
     torch.testing.assert_close(found.T[1:].matrix(), descend(evaluate, starts(3), 20).T[1:].matrix())
-
-
-def test_two_costs_are_descended_as_one() -> None:
-    """Half of the points in each of two costs, which a sum joins, lead where all of them in one do."""
-
-    def part(chosen: slice) -> Callable[[SE3], NormalEquations]:
-        def cost(T: SE3) -> NormalEquations:
-            r, jacobian = rows(T)
-            r, jacobian = r[:, chosen].flatten(1), jacobian[:, chosen].flatten(1, 2)
-            return NormalEquations(
-                (r**2).sum(-1), (jacobian.mT @ r[..., None])[..., 0], jacobian.mT @ jacobian
-            )
-
-        return cost
-
-    both = Sum((part(slice(0, 25)), part(slice(25, 40))))
-    one, whole = both(starts(3)), evaluate(starts(3))
-    for name in ("cost", "gradient", "hessian"):
-        torch.testing.assert_close(getattr(one, name), getattr(whole, name))
-    found = descend(both, starts(3), 20)
-    torch.testing.assert_close(found.T.matrix(), descend(evaluate, starts(3), 20).T.matrix())

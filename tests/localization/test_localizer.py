@@ -206,13 +206,6 @@ def test_a_device_that_is_another_one_gets_a_copy_of_the_field() -> None:
     assert Localizer(own, "bid", device="cpu", warm_up=False).scene is own
 
 
-def test_a_field_that_cannot_be_moved_is_named() -> None:
-    with pytest.raises(
-        InputError, match=r"device meta: the map's field is a GaussianBlobs, expected an nn.Module"
-    ):
-        Localizer(MAP, "bid", device="meta")
-
-
 def test_a_matrix_with_rounded_numbers_becomes_a_rigid_transform() -> None:
     rounded = torch.tensor(np.round(START.matrix().numpy(), 6))
     assert float((pose_from_matrix(rounded, "start").matrix() - START.matrix()).abs().max()) < 1e-5

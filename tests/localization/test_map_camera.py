@@ -1,4 +1,4 @@
-"""The cameras of a map's images as an alternative to the intrinsics that a query states: corrections, and how likely they are.
+"""The cameras of a map's images, of the same shape or of others, as an alternative to the intrinsics that a query states.
 
 The table of ``test_answers`` has which camera an image is found to have. ``correction_between`` and ``map_cameras`` are needed here for
 what no answer shows: the correction itself, and the prior odds.
@@ -13,6 +13,8 @@ import pytest
 import torch
 
 from bidnerf_core import Intrinsics
+from bidnerf_core.camera.intrinsics import stretched_cameras
+from bidnerf_core.camera.orientation import QUARTER_TURNS
 from bidnerf_core.localization import LandmarkMatcher, propose
 from bidnerf_core.localization.landmarks.map_camera import (
     MapCamera,
@@ -163,3 +165,67 @@ def test_images_of_different_cameras_are_taken_as_they_are_given() -> None:
     found = propose(LandmarkMatcher(ground_landmarks()), [wrong, views[1]])
     assert found is not None
     assert found.intrinsics_of(own) is None
+
+
+LANDSCAPE = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))
+TILTED = replace(LANDSCAPE, distortion=(0.0,) * 12 + (0.1, 0.0))
+POINTS = torch.tensor([[0.1, -0.2, 1.0], [-0.4, 0.3, 2.0], [0.5, 0.1, 1.5]], dtype=torch.float64)
+
+
+def test_quarter_turns_go_to_both_sides() -> None:
+    one, other = LANDSCAPE.quarter_turns()
+    assert (one.width, one.height) == (other.width, other.height) == (480, 640)
+    assert one != other
+    assert {camera for turned in (one, other) for camera in turned.quarter_turns()} >= {LANDSCAPE}
+    assert TILTED.quarter_turns() == ()
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_turned_camera_sees_what_a_turned_image_shows(number: int) -> None:
+    turned, orientation = LANDSCAPE.quarter_turns()[number], QUARTER_TURNS[number]
+    angle = math.pi / 2 * (1 if orientation.mirrors_rows else -1)
+    turn = torch.tensor(
+        [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+    u, v = LANDSCAPE.project(POINTS).unbind(-1)
+    upright = torch.stack([480 - v, u] if orientation.mirrors_rows else [v, 640 - u], dim=-1)
+    assert torch.allclose(turned.project(POINTS @ turn.mT), upright)
+
+
+@pytest.mark.parametrize(("width", "height", "scale"), [(480, 480, 1.0), (320, 180, 0.5), (640, 480, 1.0)])
+def test_a_centre_crop_touches_two_edges(width: int, height: int, scale: float) -> None:
+    part = LANDSCAPE.centre_crop(width, height)
+    shift = torch.tensor([(640 * scale - width) / 2, (480 * scale - height) / 2], dtype=torch.float64)
+    assert torch.allclose(part.project(POINTS) + shift, scale * LANDSCAPE.project(POINTS))
+    assert float(shift.min()) == 0
+
+
+def test_the_map_camera_of_a_portrait_image_is_turned_to_either_side() -> None:
+    given = Intrinsics.from_focal(540, 480, 640)
+    one, other = LANDSCAPE.quarter_turns()
+    found = map_cameras(given, (LANDSCAPE, LANDSCAPE))
+    assert [camera.intrinsics for camera in found] == [one, other]
+    assert float(found[0].correction[0].exp()) == pytest.approx(520.5 / 540, rel=0.005)
+    assert stretched_cameras((LANDSCAPE,), 480, 640) == ((one,), (other,))
+
+
+def test_of_landscape_and_portrait_images_those_of_the_shape_of_the_query_are_taken() -> None:
+    one, _ = LANDSCAPE.quarter_turns()
+    portrait = replace(one, fx=500.0, fy=500.0)
+    for cameras in ((LANDSCAPE, portrait), (portrait, LANDSCAPE)):
+        (found,) = map_cameras(Intrinsics.from_focal(510, 480, 640), cameras)
+        assert found.intrinsics == portrait
+    assert map_cameras(portrait, (TILTED,)) == []
+    assert map_cameras(portrait, ()) == []
+
+
+def test_crops_are_compared_only_on_demand() -> None:
+    square = Intrinsics.from_focal(400, 480, 480)
+    assert LANDSCAPE.centre_crop(480, 480) not in [c.intrinsics for c in map_cameras(square, (LANDSCAPE,))]
+    found = map_cameras(square, (LANDSCAPE,), crops=True)
+    assert LANDSCAPE.centre_crop(480, 480) in [camera.intrinsics for camera in found]
+    (whole,) = map_cameras(
+        Intrinsics.from_focal(400, 640, 480), (LANDSCAPE, LANDSCAPE.centre_crop(480, 480)), crops=True
+    )
+    assert whole.intrinsics == LANDSCAPE

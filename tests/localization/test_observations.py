@@ -89,16 +89,6 @@ def test_no_residual_at_the_truth_and_some_elsewhere() -> None:
     assert depth_loss(problem, perturb(TRUTH, 0.2, 5.0, seed=0)) > 1e-4
 
 
-def test_a_moved_world_leaves_the_depth_loss_as_it_is() -> None:
-    motion = SE3.exp(torch.tensor([0.2, -0.1, 0.3, 0.5, -0.7, 1.1], dtype=torch.float64))
-    roomy = SceneBounds((-30.0,) * 3, (30.0,) * 3, 2.0, 6.5, BOUNDS.background)
-    start = perturb(TRUTH, 0.2, 5.0, seed=0)
-    here = depth_loss(single(FIELD, roomy, photograph(), start, lidar()), start)
-    moved = motion @ start
-    there = depth_loss(single(FIELD.moved(motion), roomy, photograph(), moved, lidar()), moved)
-    assert here == pytest.approx(there, rel=1e-3)
-
-
 def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:
     """All black to the eye: no pixel has a gradient that is of use, but the distance comes right."""
     dark = Frame("dark", torch.zeros(40, 48, 3), CAMERA)
@@ -119,21 +109,6 @@ def test_weight_zero_leaves_depth_rays_out() -> None:
         localize(single(FIELD, BOUNDS, photograph(), start, rays), "bid", few) for rays in (lidar(), None)
     )
     assert torch.equal(with_rays.poses.matrix(), without.poses.matrix())
-
-
-def test_the_gradient_by_the_pose_is_the_numerical_one() -> None:
-    drawn = lidar().drawn(40, torch.Generator().manual_seed(0), torch.float64)
-    start = perturb(TRUTH, 0.1, 2.0, seed=1)
-    here = drawn.rays(start, BOUNDS)
-
-    def loss(xi: torch.Tensor) -> torch.Tensor:
-        moved = drawn.rays(start.retract(xi), BOUNDS)  # the sampled interval is held, as autograd does
-        parts = (moved.origins, moved.directions, here.near, here.far)
-        rays = type(here)(*(part[None] for part in parts))
-        return OBJECTIVE.loss(render(FIELD, rays), drawn[None])
-
-    zero = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(loss, zero, eps=1e-6, atol=1e-6)
 
 
 def test_rays_are_drawn_from_the_generator_or_all_taken() -> None:

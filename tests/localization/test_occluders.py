@@ -14,13 +14,8 @@ from bidnerf_core.frames.pixels import drawer
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization
 from bidnerf_core.localization.alternatives import mirror_image
-from bidnerf_core.localization.landmarks.guided import projected_landmarks
 from bidnerf_core.localization.search.occluders import nearest_piece
-from bidnerf_core.mapping.geometry.calibration import GIVEN
-from bidnerf_core.mapping.landmarks.features import SIFT
-from bidnerf_core.mapping.landmarks.image_keypoints import image_keypoints
 from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import textured_map, unseen
 from problems import localize
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)
@@ -115,22 +110,6 @@ def test_only_what_is_in_front_of_the_surface_hides_it() -> None:
         assert in_front == pytest.approx(expected, abs=0.15), factor
 
 
-def test_pixels_without_a_measurement_are_no_piece() -> None:
-    depth = wall((slice(10, 50), slice(20, 60)), 0.6)
-    holes = depth.clone()
-    holes[::7, ::3], holes[60:] = torch.inf, torch.nan
-    clean, spoilt = (nearest_piece(baked.problem(seen(d))) for d in (depth, holes))
-    assert clean is not None
-    assert spoilt is not None
-    frames = [part.rest.views[0].frame for part in (clean, spoilt)]
-    assert frames[0].hidden is not None
-    assert frames[1].hidden is not None
-    assert torch.equal(frames[1].hidden, frames[0].hidden & holes.isfinite())
-    few = torch.zeros((SIZE, SIZE))
-    few[0, :3] = torch.tensor([1.0, 2.0, 3.0])
-    assert nearest_piece(baked.problem(seen(few))) is None
-
-
 def test_what_the_user_hides_stays_hidden() -> None:
     view = seen(wall((slice(10, 50), slice(20, 60)), 0.6))
     own = torch.zeros((SIZE, SIZE), dtype=torch.bool)
@@ -200,23 +179,6 @@ def test_a_hidden_board_does_not_matter() -> None:
     assert found.converged
     assert "in front" not in found.reason
     assert float(pose_error(found.T_world_camera, view.T_ref_camera).translation) < 0.05
-
-
-def test_hidden_landmarks_are_not_missed() -> None:
-    view = unseen()
-    landmarks = textured_map().landmarks
-    assert landmarks is not None
-    camera = view.frame.intrinsics
-    hidden = torch.zeros((camera.height, camera.width), dtype=torch.bool)
-    hidden[:, : camera.width // 2] = True
-    counts = []
-    for frame in (view.frame, replace(view.frame, hidden=hidden)):
-        image = image_keypoints(View(frame, SE3.identity()), SIFT)
-        (shown,) = projected_landmarks([image], landmarks, view.T_ref_camera, GIVEN, 3.0)
-        counts.append((len(image.keypoints), len(shown)))
-    (keypoints, landmarks_before), (kept, landmarks_after) = counts
-    assert 0 < kept < 0.8 * keypoints
-    assert 0 < landmarks_after < 0.8 * landmarks_before
 
 
 def test_what_is_behind_the_surface_was_no_occluder() -> None:

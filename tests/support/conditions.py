@@ -26,7 +26,6 @@ QUICK = settings_of(
     | {"coarse_steps": 1, "coarse_rays": 64, "fine_steps": 1, "fine_rays": 64},
 )
 NOT_RENDERED = replace(QUICK, fused_rays=0)
-CHI2_99, CHI2_999 = 16.8, 22.5  # of six degrees of freedom
 
 
 @dataclass(eq=False)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import torch
 
+from answers import without_depth as without_depth
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.results.errors import pose_error
@@ -41,10 +42,6 @@ def covered(frame: Frame) -> Frame:
     dark = 0.02 + 0.01 * torch.rand(frame.rgb.shape, generator=generator)
     depth = None if frame.depth is None else torch.zeros_like(frame.depth)
     return replace(frame, rgb=dark, depth=depth)
-
-
-def without_depth(frame: Frame) -> Frame:
-    return replace(frame, depth=None)
 
 
 @functools.cache
