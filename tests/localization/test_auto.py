@@ -28,7 +28,6 @@ from bidnerf_core.localization import (
     Problem,
     rig,
 )
-from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_room
 from problems import FieldMap, localize
@@ -185,7 +184,7 @@ def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_se
 def test_a_few_depth_rays_are_too_little_to_search_by() -> None:
     """The images decide where there are fewer points than a shape needs."""
     view = baked.unseen()[0]
-    few = in_camera(view)[: LEAST_POINTS - 1]
+    few = in_camera(view)[:49]
     problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, few)
     quick = {"hypotheses": 8, "rounds": 1, "coarse_steps": 1, "fine_steps": 1, "fine_rays": 64}
     found = localize(problem, "auto", quick)

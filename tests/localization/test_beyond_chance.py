@@ -1,4 +1,7 @@
-"""Agreement beyond chance: a plain wall looks the same from anywhere, so that no pose before it is accepted."""
+"""Agreement beyond chance: a plain wall looks the same from anywhere, so that no pose before it is accepted.
+
+``support`` and ``log_odds`` are needed here for the odds themselves, which no answer shows.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Poses by colour alone, as ``auto`` finds them without depth: a closed-form field, its baked surface, and plain images."""
+"""Poses by colour alone, as ``auto`` finds them without depth: a closed-form field, its baked surface, and plain images.
+
+Two verdicts on an answer by colour are needed here by name, as images to which they apply are hard to come by.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Poses by landmarks, alone and fused with depth and rendering, and what ``auto`` does where they do not convince."""
+"""Poses by landmarks, alone and fused with depth and rendering, and what ``auto`` does where they do not convince.
+
+``answer_by_landmarks`` shows which measurements were fused; ``DepthScale`` how far a sensor's scale is shrunk.
+"""
 
 from __future__ import annotations
 

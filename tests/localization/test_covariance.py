@@ -1,4 +1,7 @@
-"""Covariances of poses: symmetric, positive definite, growing with the noise, large where nothing is determined; refinement on rays."""
+"""Covariances of poses: symmetric, positive definite, growing with the noise, large where nothing is determined; refinement on rays.
+
+The covariances of costs are needed here for closed forms and repeated trials.
+"""
 
 from __future__ import annotations
 

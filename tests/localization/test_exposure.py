@@ -1,4 +1,7 @@
-"""Exposure: weighted least squares with priors, against numpy, under outliers; and measured points with the exposure of the map."""
+"""Exposure: weighted least squares with priors, against numpy, under outliers; and measured points with the exposure of the map.
+
+An exposure is estimated inside of costs and shows in no answer, hence ``fit_exposure``, ``robust_exposure`` and their use on points.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Fused poses: a prior, measured points of unknown scale and rendered rays together; what is known of the scale of depth."""
+"""Fused poses: a prior, measured points of unknown scale and rendered rays together; what is known of the scale of depth.
+
+``fused_pose`` and the joint cost of pose and depth are needed here for numerical derivatives, and for terms one by one.
+"""
 
 from __future__ import annotations
 

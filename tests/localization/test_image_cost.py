@@ -1,4 +1,7 @@
-"""The cost of whole small images: thumbnails, where the cost is least, where its steps lead, and how exposure enters."""
+"""The cost of whole small images: thumbnails, where the cost is least, where its steps lead, and how exposure enters.
+
+Costs and thumbnails are needed here for derivatives and convolutions, which no answer shows.
+"""
 
 from __future__ import annotations
 

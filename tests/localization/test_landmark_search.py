@@ -1,4 +1,7 @@
-"""Search by landmarks: poses, their covariance, rigs, unknown focal lengths, and what leads to no answer."""
+"""Search by landmarks: poses, their covariance, rigs, unknown focal lengths, and what leads to no answer.
+
+Points are seen without an image, so that ``propose`` is called with their detector; matching is compared with an exhaustive one.
+"""
 
 from __future__ import annotations
 

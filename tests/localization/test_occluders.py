@@ -1,4 +1,7 @@
-"""Something in front of the scene: it is cut out of the depth image, and the pose is found without it."""
+"""Something in front of the scene: it is cut out of the depth image, and the pose is found without it.
+
+``nearest_piece`` is needed here for which pixels are taken for an occluder.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,11 @@ import torch
 
 import baked
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import drawer
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization
-from bidnerf_core.localization.alternatives import mirror_image
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.results.errors import pose_error
 from problems import localize
@@ -166,7 +169,7 @@ def test_nothing_is_measured_where_the_scene_is_hidden() -> None:
     masked = replace(frame, hidden=hidden)
     assert masked.depth is not None
     assert torch.equal(masked.depth, torch.where(hidden, 0, frame.depth))
-    mirrored = mirror_image(masked).hidden
+    mirrored = faulty(View(masked, SE3.identity()), "mirror", 0).frame.hidden
     assert mirrored is not None
     assert torch.equal(mirrored, hidden.flip(1))
 

@@ -1,4 +1,7 @@
-"""What widens the reach of first-order steps, and the presets with the paper's settings."""
+"""What widens the reach of first-order steps, and the presets with the paper's settings.
+
+``Blurred`` is needed here for a convolution in closed form.
+"""
 
 from __future__ import annotations
 

@@ -15,10 +15,8 @@ import pytest
 import torch
 
 from answers import answer
-from bidnerf_core import InputError, Localizer
-from bidnerf_core.localization import Outcome, risk
-from bidnerf_core.localization.settings import AutoConfig
-from bidnerf_core.localization.tracking.relocalization import relocalized
+from bidnerf_core import InputError, Localizer, Tracker
+from bidnerf_core.localization import AutoConfig, Outcome, risk
 from bidnerf_core.testing.textured_field import textured_map, unseen
 
 LEVELS = ((0.01, 0.97), (0.05, 0.9), (0.1, 0.8))
@@ -182,8 +180,7 @@ def test_the_localizer_and_the_search_of_a_tracker_keep_to_it(
     for share in (None, 0.1, 0.01):
         localizer = Localizer(textured_map(), config=AutoConfig(fused_rays=0, risk=share), warm_up=False)
         frame = unseen().frame
-        each = localizer(frame) if search == "localizer" else relocalized(localizer, frame, None, 0, 0)
-        assert each is not None
+        each = localizer(frame) if search == "localizer" else Tracker(localizer)(frame, 0.0)
         found.append(each)
     assert [each.converged for each in found] == [True, True, False]
     for each in found[1:]:

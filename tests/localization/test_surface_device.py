@@ -1,4 +1,7 @@
-"""Steps on a surface that lies on a simulated device: they neither leave it nor wait for it, and lead where the CPU's do."""
+"""Steps on a surface that lies on a simulated device: they neither leave it nor wait for it, and lead where the CPU's do.
+
+The stages of both searches are needed here, as a whole method waits for the device between its stages.
+"""
 
 from __future__ import annotations
 

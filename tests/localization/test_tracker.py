@@ -18,7 +18,6 @@ from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.tensors import read_tensors_and_metadata
-from bidnerf_core.localization.tracking.state import METHOD, CorrectedCamera
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.testing.textured_field import CAMERA, textured_map, view
 from conditions import ground_landmarks, with_landmarks
@@ -42,7 +41,7 @@ def test_a_sequence_is_tracked_with_honest_covariances(depth: bool) -> None:
     frames = [(t, frame if depth else without_depth(frame), T) for t, frame, T in flight()]
     answers = tracked(frames)
     assert_right(answers, frames)
-    assert {answer.method for answer in answers} == {METHOD}
+    assert {answer.method for answer in answers} == {"track"}
     squared = [
         float(normalized_error_squared(a.T_world_camera, T, a.covariance))
         for a, (_, _, T) in zip(answers, frames, strict=True)
@@ -297,25 +296,6 @@ def test_a_map_that_cannot_be_searched_asks_for_a_start() -> None:
     bare = replace(textured_map(), landmarks=None)
     with pytest.raises(InputError, match="start"):
         Tracker(Localizer(bare))(flight()[0][1], 0.0)
-
-
-def test_corrections_of_intrinsics_follow_one_another(tmp_path: Path) -> None:
-    first = CorrectedCamera(replace(CAMERA, fx=140.0, cx=60.0), CAMERA, False)
-    second = CorrectedCamera(CAMERA, replace(CAMERA, fx=133.0, cy=50.0), False)
-    both = first.then(second)
-    frame = replace(flight()[0][1], intrinsics=first.given)
-    assert both.corrected(frame).intrinsics == second.corrected(first.corrected(frame)).intrinsics
-    assert both.focal_factor(frame) == pytest.approx((133 / 140) ** 0.5)  # those down did not change
-    other = replace(frame, intrinsics=replace(first.given, fx=154.0))  # it has focused nearer
-    refocused = first.corrected(other).intrinsics
-    assert refocused.fx == pytest.approx(154 * 130 / 140)
-    assert replace(refocused, fx=CAMERA.fx) == CAMERA
-    tracker = Tracker(localizer())
-    tracker._state = replace(tracker._state, camera=both)
-    tracker.save(tmp_path / "state.safetensors")
-    again = Tracker(localizer())
-    again.restore(tmp_path / "state.safetensors")
-    assert again._state.camera == both
 
 
 def test_the_state_does_not_grow(tmp_path: Path) -> None:

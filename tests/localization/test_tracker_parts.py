@@ -1,8 +1,12 @@
-"""Ways to measure a frame beside followed landmarks: colour alone, depth alone, depth beside landmarks, and odometry."""
+"""Ways to measure a frame beside followed landmarks: colour alone, depth alone, depth beside landmarks, and odometry.
+
+Odometry, flow and the fusion with depth are needed here for oracles: the true motion, noise, and a general solver.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,14 +30,14 @@ from bidnerf_core.localization.tracking.measuring import followed
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.localization.tracking.recognition import LEAST_CORNERS, Odometry
-from bidnerf_core.localization.tracking.state import TrackerState
+from bidnerf_core.localization.tracking.state import CorrectedCamera, TrackerState
 from bidnerf_core.localization.tracking.surface import (
     fused_with_surface,
     measured_cloud,
 )
 from bidnerf_core.mapping.landmarks.features import grey_image
 from bidnerf_core.results.errors import pose_error
-from bidnerf_core.testing.textured_field import textured_map
+from bidnerf_core.testing.textured_field import CAMERA, textured_map
 from flights import (
     INTERVAL,
     assert_honest,
@@ -164,3 +168,22 @@ def test_fusing_with_depth_minimizes_the_sum_of_prior_and_surface(steps: int) ->
     assert float(smaller[0]) > -1e-12
     assert bool((torch.linalg.eigvalsh(fused.noise) > 0).all())
     assert bool((torch.linalg.eigvalsh(fused.bias) > 0).all())
+
+
+def test_corrections_of_intrinsics_follow_one_another(tmp_path: Path) -> None:
+    first = CorrectedCamera(replace(CAMERA, fx=140.0, cx=60.0), CAMERA, False)
+    second = CorrectedCamera(CAMERA, replace(CAMERA, fx=133.0, cy=50.0), False)
+    both = first.then(second)
+    frame = replace(flight()[0][1], intrinsics=first.given)
+    assert both.corrected(frame).intrinsics == second.corrected(first.corrected(frame)).intrinsics
+    assert both.focal_factor(frame) == pytest.approx((133 / 140) ** 0.5)  # those down did not change
+    other = replace(frame, intrinsics=replace(first.given, fx=154.0))  # it has focused nearer
+    refocused = first.corrected(other).intrinsics
+    assert refocused.fx == pytest.approx(154 * 130 / 140)
+    assert replace(refocused, fx=CAMERA.fx) == CAMERA
+    tracker = Tracker(localizer())
+    tracker._state = replace(tracker._state, camera=both)
+    tracker.save(tmp_path / "state.safetensors")
+    again = Tracker(localizer())
+    again.restore(tmp_path / "state.safetensors")
+    assert again._state.camera == both
