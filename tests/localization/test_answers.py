@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from answers import CHI2_999, assert_covered
 from bidnerf_core import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.registry import registered
@@ -39,6 +38,7 @@ from conditions import (
     with_landmarks,
 )
 from landmark_scene import PINHOLE, looking_in
+from localizations import CHI2_999, assert_covered
 
 LARGEST = 0.05, 2.0
 """Largest error of any accepted pose: metres and degrees, at distances of 1.7 to 4.4 m."""

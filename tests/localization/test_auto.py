@@ -11,7 +11,6 @@ import torch
 import baked
 import blob_images
 import module_fields
-from answers import assert_covered, assert_near, colour_only
 from bidnerf_core import Localizer
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty
@@ -30,6 +29,7 @@ from bidnerf_core.localization import (
 )
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_room
+from localizations import assert_covered, assert_near, colour_only
 from problems import FieldMap, localize
 from tiny import depth_rays_of
 

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 import baked
-from answers import answer, assert_covered, assert_near, colour_only
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.fields.rendering import render_image
@@ -26,6 +25,7 @@ from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from landmark_scene import Points, ring
+from localizations import answer, assert_covered, assert_near, colour_only
 from problems import FieldMap, localize
 
 BOUNDS = replace(baked.BOUNDS, lower=(-1.2, -1.2, -1.2), upper=(1.2, 1.2, 1.2))

@@ -13,7 +13,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from answers import assert_covered, assert_near, colour_only
 from bidnerf_core import Localization, Localizer, Outcome, View
 from bidnerf_core.depth.sensors import find_depth_sensor
 from bidnerf_core.geometry.se3 import SE3
@@ -33,6 +32,7 @@ from bidnerf_core.mapping import Keypoints, Sift
 from bidnerf_core.registry import registered
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textured_map, unseen
+from localizations import assert_covered, assert_near, colour_only
 
 TRUTH = unseen().T_ref_camera
 RAYS = 256
@@ -92,7 +92,7 @@ def test_more_terms_make_the_covariance_smaller() -> None:
 
 def test_rendering_brings_a_pose_by_blurred_keypoints_to_that_of_the_field() -> None:
     """The image is what the field renders, so that rendered rays alone have no error."""
-    assert_near(answer(colour_only(unseen()), TRUTH, rays=RAYS).T, 0.002, 0.05)
+    assert_near(answer(colour_only(unseen()), rays=RAYS).T, TRUTH, 0.002, 0.05)
 
 
 @pytest.mark.parametrize("gain", [0.5, 1.6])
@@ -266,9 +266,14 @@ def misled(right: float, most: int | None, monkeypatch: pytest.MonkeyPatch, **se
 
 
 @pytest.mark.parametrize(
-    ("most", "landmarks", "expected"),
-    [(None, True, Outcome.TOO_FEW_MATCHES), (10, True, Outcome.CONVERGED), (None, False, Outcome.CONVERGED)],
-    ids=["contradicted", "hardly any landmarks", "not asked for"],
+    ("right", "most", "landmarks", "expected"),
+    [
+        (0.0, None, True, Outcome.TOO_FEW_MATCHES),
+        (0.2, None, True, Outcome.CONVERGED),
+        (0.0, 10, True, Outcome.CONVERGED),
+        (0.0, None, False, Outcome.CONVERGED),
+    ],
+    ids=["contradicted", "above chance", "hardly any landmarks", "not asked for"],
 )
 def test_an_answer_of_the_surface_that_landmarks_contradict_is_not_accepted(
     right: float, most: int | None, landmarks: bool, expected: Outcome, monkeypatch: pytest.MonkeyPatch

@@ -11,7 +11,6 @@ import torch
 
 import baked
 import module_fields
-from answers import without_depth
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.localization import AutoConfig, settings_of
 from bidnerf_core.results.errors import pose_error
@@ -19,6 +18,7 @@ from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from bidnerf_core.testing.textured_field import MapWithLandmarks
 from flights import INTERVAL, flight_frame, flight_pose
+from localizations import without_depth
 from module_fields import AsModule
 from problems import FieldMap
 

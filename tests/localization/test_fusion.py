@@ -13,7 +13,6 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from answers import CHI2_99
 from bidnerf_core.localization import (
     ColourSettings,
     GaussianPrior,
@@ -38,6 +37,7 @@ from bidnerf_core.localization.depth_scale import (
 from bidnerf_core.localization.fusion import FusedPose, Measurements, fused_pose
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
+from localizations import CHI2_99
 from problems import FieldMap
 
 TRUTH = unseen().T_ref_camera

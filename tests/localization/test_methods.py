@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 
-from answers import assert_near
 from bidnerf_core import SE3, Frame, InputError, Localization, Localizer, Outcome, View
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.localization import METHODS, settings_of
@@ -18,6 +17,7 @@ from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.trajectories import orbit
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
+from localizations import assert_near
 from problems import FieldMap
 from tiny import depth_rays_of
 

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import render, render_image
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     ColourSettings,
@@ -29,15 +28,10 @@ from bidnerf_core.localization import (
     objective_of,
     window,
 )
-from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import orbit
+from blob_images import BOUNDS, CAMERA, FIELD, FRAME, TRUTH, photograph
 from problems import localize, single
 from tiny import depth_rays_of
 
-BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
-TRUTH = orbit(4.0, 3, seed=1)[1]
-FIELD = GaussianBlobs.random()
 OBJECTIVE = objective_of(ColourSettings(), DepthSettings())
 T_CAMERA_LIDAR = SE3.exp(torch.tensor([0.3, -0.4, 0.1, 0.2, 1.5, -0.4], dtype=torch.float64))
 
@@ -56,11 +50,6 @@ def scan() -> torch.Tensor:
 
 def lidar() -> Observations:
     return Observations.from_points(scan(), T_CAMERA_LIDAR)
-
-
-def photograph(depth: bool = False) -> Frame:
-    image = render_image(FIELD, CAMERA, TRUTH, BOUNDS)
-    return Frame("frame", image.rgb, CAMERA, image.depth if depth else None)
 
 
 def depth_loss(problem: Problem, T: SE3, count: int = 10**6) -> float:
@@ -84,14 +73,14 @@ def test_points_come_back() -> None:
 
 
 def test_no_residual_at_the_truth_and_some_elsewhere() -> None:
-    problem = single(FIELD, BOUNDS, photograph(), TRUTH, lidar())
+    problem = single(FIELD, BOUNDS, photograph(depth=False), TRUTH, lidar())
     assert abs(depth_loss(problem, TRUTH)) < 1e-8
     assert depth_loss(problem, perturb(TRUTH, 0.2, 5.0, seed=0)) > 1e-4
 
 
 def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:
     """All black to the eye: no pixel has a gradient that is of use, but the distance comes right."""
-    dark = Frame("dark", torch.zeros(40, 48, 3), CAMERA)
+    dark = replace(FRAME, rgb=torch.zeros(40, 48, 3), depth=None)
     start = TRUTH.retract(torch.tensor([0, 0, -0.2, 0, 0, 0], dtype=torch.float64))
     config = {
         "rays": 1, "depth_rays": 200, "max_steps": 60, "learning_rate": 0.03, "level": None, "depth_weight": 1e3,
@@ -106,7 +95,8 @@ def test_weight_zero_leaves_depth_rays_out() -> None:
     start = perturb(TRUTH, 0.3, 6.0, seed=3)
     few = {"rays": 32, "max_steps": 3, "depth_weight": 0.0, "level": None, "pivot": "camera"}
     with_rays, without = (
-        localize(single(FIELD, BOUNDS, photograph(), start, rays), "bid", few) for rays in (lidar(), None)
+        localize(single(FIELD, BOUNDS, photograph(depth=False), start, rays), "bid", few)
+        for rays in (lidar(), None)
     )
     assert torch.equal(with_rays.poses.matrix(), without.poses.matrix())
 
@@ -123,13 +113,13 @@ def test_rays_are_drawn_from_the_generator_or_all_taken() -> None:
 
 def test_sparse_depth_images_become_rays() -> None:
     """Twenty pixels of a depth image, as structure from motion leaves them: every one is looked at."""
-    dense = photograph(depth=True)
+    dense = FRAME
     assert dense.depth is not None
     kept = dense.depth > 0
     index = kept.reshape(-1).nonzero()[::17, 0]
     depth = torch.zeros(40 * 48)
     depth[index] = dense.depth.reshape(-1)[index]
-    frame = Frame("frame", dense.rgb, CAMERA, depth.reshape(40, 48))
+    frame = replace(dense, depth=depth.reshape(40, 48))
     T = SE3.exp(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.0, -0.2], dtype=torch.float64))
     rays = depth_rays_of([View(frame, T)])
     assert len(rays) == len(index)

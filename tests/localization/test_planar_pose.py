@@ -13,7 +13,6 @@ import torch
 from torch import Generator, Tensor
 
 import conditions
-from answers import assert_near
 from bidnerf_core import Localizer, Outcome
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.landmarks.twins import second_pose, tilted_to_the_other_side
@@ -23,6 +22,7 @@ from bidnerf_core.registry import registered
 from bidnerf_core.scenes.trajectories import look_at
 from conditions import NOT_RENDERED, point_landmarks, point_view, with_landmarks
 from landmark_scene import looking_in
+from localizations import assert_near
 
 FOCAL, NOISE = 400.0, 0.3  # pixels
 TILT = 0.5  # radians

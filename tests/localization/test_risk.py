@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from answers import answer
 from bidnerf_core import InputError, Localizer, Tracker
 from bidnerf_core.localization import AutoConfig, Outcome, risk
 from bidnerf_core.testing.textured_field import textured_map, unseen
+from localizations import answer
 
 LEVELS = ((0.01, 0.97), (0.05, 0.9), (0.1, 0.8))
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from answers import CHI2_99
 from bidnerf_core import Localizer, View
 from bidnerf_core.evaluation.faults.camera import rolling_shutter
 from bidnerf_core.frames.pixels import observe
@@ -16,6 +15,7 @@ from bidnerf_core.localization import AutoConfig, LandmarkMatcher, LandmarkPose,
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
 from conditions import ground_landmarks
+from localizations import CHI2_99
 
 TRUTH = unseen().T_ref_camera
 LANDMARKS = replace(ground_landmarks(), cameras=())

@@ -13,7 +13,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from answers import CHI2_99
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
@@ -33,6 +32,7 @@ from flights import (
     tracked,
     without_depth,
 )
+from localizations import CHI2_99
 
 
 @pytest.mark.slow

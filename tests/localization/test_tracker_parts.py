@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from answers import assert_covered, assert_near
 from bidnerf_core import SE3, Frame, Localizer, Outcome, Tracker
 from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.localization import (
@@ -48,6 +47,7 @@ from flights import (
     tracked,
     without_depth,
 )
+from localizations import assert_covered, assert_near
 
 NEAR = torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64)
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from answers import assert_near
 from bidnerf_core import View
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.fields.contract import SceneBounds
@@ -20,6 +19,7 @@ from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, training_views, unseen
+from localizations import assert_near
 
 BALL = HomogeneousBall(0.5, 400.0, rgb=(0.8, 0.3, 0.2), sampler=Stratified(256))
 CUBE = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)

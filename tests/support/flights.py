@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import torch
 
-from answers import without_depth as without_depth
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.trajectories import look_at
 from bidnerf_core.testing.textured_field import textured_map, view
+from localizations import without_depth as without_depth
 
 FRAMES = 14
 INTERVAL = 0.1  # seconds
