@@ -22,10 +22,10 @@ from bidnerf_core import Frame, Localization, Localizer, Tracker, View
 from bidnerf_core.captures.relocated_photos import relocated
 from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.localization import LandmarkMatcher
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, resect, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, LandmarkMap, resect, tracked_views
 from bidnerf_core.mapping.landmarks.features import FoundOnce
 from bidnerf_core.registry import registered
-from bidnerf_core.testing.textured_field import training_views, unseen
+from bidnerf_core.testing.textured_field import textured_map, training_views, unseen
 from conditions import NOT_RENDERED, QUICK, CountedDetector, ground_landmarks, ground_views, with_landmarks
 from flights import FRAMES, assert_right, flight, flight_pose, without_depth
 
@@ -77,9 +77,10 @@ def detector(monkeypatch: pytest.MonkeyPatch) -> CountedDetector:
     return found
 
 
-def localizer(config: Any = QUICK) -> Localizer:
+def localizer(config: Any = QUICK, landmarks: LandmarkMap | None = None) -> Localizer:
     """Return one whose map has the landmarks of the detector "counted"."""
-    return Localizer(with_landmarks(ground_landmarks("counted")), config=config, warm_up=False)
+    scene = with_landmarks(landmarks or ground_landmarks("counted"))
+    return Localizer(scene, config=config, warm_up=False)
 
 
 def counted(detector: CountedDetector, act: Callable[[], Any]) -> Calls:
@@ -136,7 +137,10 @@ def test_most_tracked_frames_do_nothing_more_often_than_they_did(
 
 def test_a_start_replaces_the_search_of_a_tracker(detector: CountedDetector) -> None:
     start = flight_pose(0).retract(torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64))
-    tracker, frames, answers = Tracker(localizer(None), start=start), flight()[:3], list[Localization]()
+    landmarks = textured_map().landmarks
+    assert landmarks is not None
+    localize = localizer(None, replace(landmarks, features="counted"))
+    tracker, frames, answers = Tracker(localize, start=start), flight()[:3], list[Localization]()
     (time, frame, _), *others = frames
     assert counted(detector, lambda: answers.append(tracker(frame, time))).matched == 0
     answers += [tracker(frame, time) for time, frame, _ in others]
