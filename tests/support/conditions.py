@@ -16,6 +16,7 @@ from bidnerf_core.mapping import Features, Keypoints, LandmarkMap, Sift, build_l
 from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.textured_field import MapWithLandmarks, textured_map
 from landmark_scene import PINHOLE, Points, looking_in, ring
+from localizations import colour_only
 
 POSES = (looking_in(0.43, 0.45, 3.6), looking_in(0.2, 0.6, 4.0), looking_in(0.8, -0.2, 4.4))
 COPY = SE3.exp(torch.tensor([30.0, 5.0, -20.0, 0.2, -0.9, 0.4], dtype=torch.float64))
@@ -151,18 +152,14 @@ def ground_landmarks(features: str = "sift", scatter: float = 0.01) -> LandmarkM
 
 
 @functools.cache
-def ground_view(number: int, depth: bool = False, seed: int = 0, noise: float = 0.02) -> View:
-    """Return an image of the ground with noise; another ``seed`` is another ground."""
+def ground_view(number: int, seed: int = 0) -> View:
+    """Return an image of the ground, with depth and noisy colours; another ``seed`` is another ground."""
     view = textured_field.view(textured_field.POSES[number], f"{number}", seed)
-    off = torch.randn(view.frame.rgb.shape, generator=torch.Generator().manual_seed(number))
-    frame = replace(view.frame, rgb=(view.frame.rgb + noise * off).clamp(0, 1))
-    return replace(view, frame=frame if depth else replace(frame, depth=None))
+    noise = torch.randn(view.frame.rgb.shape, generator=torch.Generator().manual_seed(number))
+    return replace(view, frame=replace(view.frame, rgb=(view.frame.rgb + 0.02 * noise).clamp(0, 1)))
 
 
 def ground_views(fault: str, numbers: Iterable[int] = (1,), depth: bool = False, seed: int = 0) -> list[View]:
     """Return images of the ground with a fault of the catalogue."""
-    views = []
-    for number in numbers:
-        view = faulty(ground_view(number, True, seed), fault, 0)
-        views.append(view if depth else replace(view, frame=replace(view.frame, depth=None)))
-    return views
+    views = [faulty(ground_view(number, seed), fault, 0) for number in numbers]
+    return views if depth else [colour_only(view) for view in views]
