@@ -16,6 +16,7 @@ import torch
 
 from bidnerf_core import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf_core.localization import AutoConfig
+from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.registry import registered
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field
@@ -241,6 +242,13 @@ def other_camera(factor: float) -> list[View]:
     return stated(textured_field.seen(textured_field.POSES[1], camera), 1.0)
 
 
+def own_correlation() -> LandmarkMap:
+    """Return landmarks of surer cameras, whose keypoints are as correlated as those of the map's images."""
+    built = textured_field.textured_map().landmarks
+    assert built is not None
+    return replace(ground_landmarks(scatter=0.003), correlation=built.correlation)
+
+
 SHARP = AutoConfig(fused_rays=1024)
 GROUND: dict[str, tuple[Any, Expected]] = {
     "as stated, RGB": (lambda: noisy("none"), Right(metres=0.0075, degrees=0.18)),
@@ -265,11 +273,11 @@ GROUND: dict[str, tuple[Any, Expected]] = {
     "rig": (lambda: noisy("none", False, 1, 0), Right(metres=0.0058, degrees=0.12)),
     "depth 5 % too long": (lambda: noisy("depth-scale:1.05", True), Right(metres=0.0077, degrees=0.18)),
     "focal 0.5, not rendered": (
-        lambda: {"views": stated(textured_field.unseen(), 0.5), "config": NOT_RENDERED, "scatter": 0.003},
+        lambda: {"views": stated(textured_field.unseen(), 0.5), "config": NOT_RENDERED, "landmarks": own_correlation()},
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 2, not rendered": (
-        lambda: {"views": stated(textured_field.unseen(), 2.0), "config": NOT_RENDERED, "scatter": 0.003},
+        lambda: {"views": stated(textured_field.unseen(), 2.0), "config": NOT_RENDERED, "landmarks": own_correlation()},
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 1.02, not rendered": (
@@ -297,7 +305,7 @@ GROUND: dict[str, tuple[Any, Expected]] = {
 def test_ground(name: str) -> None:
     asked, expected = GROUND[name]
     query = asked()
-    scene = with_landmarks(ground_landmarks(scatter=query.get("scatter", 0.01)))
+    scene = with_landmarks(query.get("landmarks") or ground_landmarks())
     found = Localizer(scene, config=query.get("config", QUICK), warm_up=False)(query["views"])
     truth, camera = query["views"][-1].T_ref_camera, textured_field.CAMERA
     assert_as_expected(found, truth, expected, (camera,), camera)
