@@ -90,6 +90,9 @@ def support(
     near = log_odds(costs(_displaced(T, about, reach)), here)
     far = near[:0]
     if others is not None:
+        others = others.to(
+            T.translation.device, T.translation.dtype
+        )  # a search leaves them on the map's device
         others = others[_apart(T, others, about, reach)]
         far = log_odds(costs(others), here) if len(others.translation) else far
     explained, by_plain = 1.0, NO_RIVAL
@@ -118,7 +121,7 @@ def _displaced(T: SE3, about: Pivot, reach: float) -> SE3:
 def _apart(T: SE3, others: SE3, about: Pivot, reach: float) -> Bool[Tensor, "h"]:
     """Return a mask of the poses that are farther from ``T`` than the displaced ones."""
     here = about.to(T.translation.device).at(T)
-    there = about.to(T.translation.device).at(others.to(T.translation.device, T.translation.dtype))
+    there = about.to(T.translation.device).at(others)
     motion = (_repeated(here.inverse(), len(there.translation)) @ there).log()
     shift, turn = (torch.linalg.vector_norm(part, dim=-1) for part in motion.split(3, -1))
     return (shift > DISPLACEMENT * reach) | (turn > DISPLACEMENT)

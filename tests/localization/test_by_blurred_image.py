@@ -1,7 +1,11 @@
-"""Poses of blurred images, which are compared with renderings that are as blurred: a closed-form field, and photos of it."""
+"""Poses of blurred images, which are compared with renderings that are as blurred: a closed-form field, and photos of it.
+
+The table of ``test_answers`` has blurred photos; ``refined_if_blurred`` is needed here for when blur is taken into account, and when not.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -13,16 +17,8 @@ from bidnerf_core.evaluation import faulty
 from bidnerf_core.fields import Stratified, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import (
-    LandmarkMatcher,
-    Localization,
-    Outcome,
-    Problem,
-    Support,
-    by_blurred_image,
-    rig,
-)
-from bidnerf_core.localization.by_blurred_image import BLURS
+from bidnerf_core.localization import LandmarkMatcher, Localization, Outcome, Problem, Support, rig
+from bidnerf_core.localization.by_blurred_image import BLURS, refined_if_blurred
 from bidnerf_core.localization.costs.images import (
     ColourScales,
     FieldRenderer,
@@ -32,9 +28,10 @@ from bidnerf_core.localization.costs.images import (
     thumbnail,
 )
 from bidnerf_core.mapping import build_landmarks
-from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import GaussianBlobs, orbit
 from landmark_scene import Points, ring
+from localizations import answer, assert_covered
 from problems import FieldMap
 
 CLOUDS = GaussianBlobs.random(12, density=400.0)
@@ -56,17 +53,6 @@ def problem(view: View) -> Problem:
     return rig(FieldMap(FIELD, baked.BOUNDS, baked.toy()), [view], None)  # any surface: none is rendered
 
 
-def refined_if_blurred(given: Problem, found: Localization) -> Localization:
-    return by_blurred_image.refined_if_blurred(given, found)
-
-
-def answer(T: SE3, outcome: Outcome = Outcome.CONVERGED, confidence: float | None = None) -> Localization:
-    return Localization(
-        T_world_camera=T, outcome=outcome, reason="as the search has it", steps=0, seconds=1.0, loss=0.0, method="auto",
-        poses=T[None], losses=torch.zeros(0, dtype=torch.float64), confidence=confidence,
-    )  # fmt: skip
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("blur", "given"), [(1.5, Outcome.CONVERGED), (2.5, Outcome.IMPRECISE)])
 def test_a_blurred_image_is_refined_and_judged_anew(blur: float, given: Outcome) -> None:
@@ -76,41 +62,32 @@ def test_a_blurred_image_is_refined_and_judged_anew(blur: float, given: Outcome)
     assert float(error.rotation_deg) < 0.3
     assert found.converged, found.reason
     assert "blurred" in found.reason
-    assert found.covariance is not None
-    assert float(normalized_error_squared(found.T_world_camera, TRUTH, found.covariance)) < 16.8
+    assert_covered(found.T_world_camera, TRUTH, found.covariance)
     assert found.steps == len(found.losses) == len(found.poses.translation) - 1
     torch.testing.assert_close(found.poses[-1].matrix(), found.T_world_camera.matrix())
     assert found.seconds > 1.0
 
 
-def test_a_sharp_image_is_left_as_it_is() -> None:
-    given = answer(ASIDE)
-    assert refined_if_blurred(problem(photo()), given) is given
+LEFT: dict[str, tuple[Callable[[], Problem], Localization]] = {
+    "sharp": (lambda: problem(photo()), answer(ASIDE)),
+    "trusted": (lambda: problem(photo(2.0)), answer(ASIDE, confidence=0.99)),
+    "mirrored": (lambda: problem(photo(2.0)), answer(ASIDE, Outcome.MIRRORED)),
+    "miscalibrated": (lambda: problem(photo(2.0)), answer(ASIDE, Outcome.MISCALIBRATED)),
+    "contradicted": (lambda: problem(photo(2.0)), answer(ASIDE, Outcome.TOO_FEW_MATCHES)),
+    "without a surface": (lambda: replace(problem(photo(3.0)), surface=None), answer(ASIDE)),
+    "by measured depth": (lambda: problem(photo(2.0, depth=True)), answer(ASIDE)),
+    "in a blurred field": (lambda: replace(problem(photo(2.0)), colour_noise=0.1), answer(ASIDE)),
+}
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        answer(ASIDE, confidence=0.99),
-        answer(ASIDE, Outcome.MIRRORED),
-        answer(ASIDE, Outcome.MISCALIBRATED),
-        answer(ASIDE, Outcome.TOO_FEW_MATCHES),
-    ],
-    ids=["trusted", "mirrored", "miscalibrated", "contradicted"],
-)
-def test_neither_is_a_pose_that_this_cannot_improve(given: Localization) -> None:
-    assert refined_if_blurred(problem(photo(2.0)), given) is given
-
-
-def test_nor_one_by_measured_depth_nor_in_a_blurred_field_nor_without_a_surface() -> None:
-    given = answer(ASIDE)
-    assert refined_if_blurred(replace(problem(photo(3.0)), surface=None), given) is given
-    assert refined_if_blurred(problem(photo(2.0, depth=True)), given) is given
-    assert refined_if_blurred(replace(problem(photo(2.0)), colour_noise=0.1), given) is given
+@pytest.mark.parametrize("name", LEFT)
+def test_what_blur_does_not_explain_is_left_as_it_is(name: str) -> None:
+    make, given = LEFT[name]
+    assert refined_if_blurred(make(), given) is given
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "refined"), [(1.0, True), (1.05, False), (1.5, True)])
+@pytest.mark.parametrize(("factor", "refined"), [(1.0, True), (1.05, False)])
 def test_nor_one_with_intrinsics_that_differ_a_little_from_the_maps(factor: float, refined: bool) -> None:
     """A wrong focal length hardly shows in a blurred image, but moves the pose."""
     cameras = (replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy),)
@@ -124,14 +101,13 @@ def test_nor_one_with_intrinsics_that_differ_a_little_from_the_maps(factor: floa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("outcome", [Outcome.CONVERGED, Outcome.RENDERING_MISMATCH])
-def test_a_blurred_image_of_which_much_shows_something_else_is_rejected(outcome: Outcome) -> None:
+def test_a_blurred_image_of_which_much_shows_something_else_is_rejected() -> None:
     """Most of it is as the map has it, so that a blur is seen; the quarter in the middle has other colours."""
     view = photo(2.0)
     rgb = view.frame.rgb.clone()
     middle = slice(3 * CAMERA.height // 8, 5 * CAMERA.height // 8)
     rgb[middle] = 1 - rgb[middle]
-    given = answer(TRUTH, outcome)
+    given = answer(TRUTH)
     found = refined_if_blurred(problem(View(replace(view.frame, rgb=rgb), TRUTH)), given)
     assert found is not given
     assert found.outcome is Outcome.RENDERING_MISMATCH

@@ -1,4 +1,7 @@
-"""Confidence: the logistic model, its features, and how it enters the verdict."""
+"""Confidence: the logistic model, its features, and how it enters the verdict.
+
+The model is needed here for its weights and features.
+"""
 
 from __future__ import annotations
 

@@ -1,13 +1,21 @@
-"""Exposure: weighted least squares with priors, against numpy, and under outliers."""
+"""Exposure: weighted least squares with priors, against numpy, under outliers; and measured points with the exposure of the map.
+
+An exposure is estimated inside of costs and shows in no answer, hence ``fit_exposure``, ``robust_exposure`` and their use on points.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.geometry import Robust
+import baked
+from bidnerf_core.geometry import SE3, Robust
+from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
+from bidnerf_core.localization.by_depth import STRONGEST, cloud_with_exposure_of_map
 from bidnerf_core.localization.exposure import clipped, fit_exposure, robust_exposure
 
 
@@ -107,3 +115,78 @@ def test_rays_without_weight_do_not_matter(generator: Generator) -> None:
     rendered[0, :, 7] = torch.nan
     found = robust_exposure(rendered, measured, weights, Robust("huber", 0.1))
     torch.testing.assert_close(found.gain, expected.gain)
+
+
+T = SE3.identity(dtype=torch.float64)
+RGB = baked.toy().surfels.rgb
+
+
+def brought(rgb: torch.Tensor) -> PointCloud:
+    """Return every surfel, measured with colours ``rgb`` from the origin, with the map's exposure."""
+    cloud = baked.points(baked.toy().surfels.positions, rgb)
+    return cloud_with_exposure_of_map(SurfaceCost(baked.toy(), cloud, PointScales(0.1)), T)
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.0, 1.4])
+def test_the_exposure_is_taken_back(gain: float) -> None:
+    measured = (gain * RGB).clamp(max=1)
+    found = brought(measured)
+    kept = found.coloured
+    assert float(kept.double().mean()) > 0.5
+    assert float((found.rgb - RGB)[kept].abs().mean()) < 0.02
+    assert (gain == 1) or float((measured - RGB).abs().mean()) > 0.05
+
+
+def test_points_that_were_clipped_have_no_colour() -> None:
+    measured = 1.4 * RGB
+    clipped = (measured > 1.1).any(-1)
+    assert bool(clipped.any())
+    assert not bool(brought(measured.clamp(max=1)).coloured[clipped].any())
+    assert bool(brought(RGB).coloured.all()), "white things are not clipped without a gain"
+
+
+@pytest.mark.parametrize("channels", [slice(0, 3), slice(0, 1)], ids=["white", "red"])
+def test_something_white_in_front_is_not_taken_for_clipped(channels: slice) -> None:
+    """Half of the points show something white, or red, that the map does not have: their colours still contradict it."""
+    measured = 1.15 * RGB - 0.03
+    measured[::2, channels] = 1
+    found = brought(measured.clamp(0, 1))
+    wrong = (RGB[::2, channels] < 0.7).all(-1)
+    assert float(wrong.double().mean()) > 0.2
+    assert bool(found.coloured[::2][wrong].all())
+    assert float((found.rgb - RGB)[::2][wrong].abs().amax(-1).min()) > 0.1
+
+
+def test_colours_of_another_place_are_not_explained() -> None:
+    """An exposure has six numbers: it cannot turn the colours of one place into those of another."""
+    turned = RGB.roll(len(RGB) // 2, 0)
+    found = brought(turned)
+    before, after = (float((rgb - RGB).abs().mean()) for rgb in (turned, found.rgb))
+    assert after > 0.7 * before
+
+
+def test_points_without_colour_stay_as_they_are() -> None:
+    cloud = baked.points(baked.toy().surfels.positions, RGB)
+    cloud = replace(cloud, coloured=torch.zeros(len(cloud), dtype=torch.bool))
+    found = cloud_with_exposure_of_map(SurfaceCost(baked.toy(), cloud, PointScales(0.1)), T)
+    torch.testing.assert_close(found.rgb, cloud.rgb)
+    assert not bool(found.coloured.any())
+
+
+@pytest.mark.parametrize(
+    "measured",
+    [
+        RGB / (2 * STRONGEST) + 0.02,
+        torch.cat([torch.ones_like(RGB[:, :1]), 0.6 * RGB[:, 1:]], -1),
+        0.95 * RGB + 0.05 * RGB.mean(0),
+        torch.ones_like(RGB),
+    ],
+    ids=[
+        "a gain of more than two stops",
+        "a channel clipped everywhere",
+        "the low contrast of blur",
+        "white",
+    ],
+)
+def test_colours_that_no_exposure_explains_stay(measured: torch.Tensor) -> None:
+    torch.testing.assert_close(brought(measured).rgb, measured)

@@ -1,4 +1,8 @@
-"""First-order methods: what updates turn about, when descents stop, and where pixels are drawn."""
+"""First-order methods: what updates turn about, when descents stop, where pixels are drawn, and what widens their reach; presets.
+
+``AdamSteps``, ``History`` and ``Blurred`` are needed here for what no answer shows: steps beside torch's Adam, the rule of the best pose,
+and a convolution in closed form.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +12,23 @@ from dataclasses import replace
 import pytest
 import torch
 
-import tiny
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import perturb
-from bidnerf_core.fields import SceneBounds, render_image
-from bidnerf_core.frames import DrawerName, Frame, View, draw, uniform
+from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
+from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
+    METHODS,
     NO_RIVAL,
     AdamSettings,
     AdamSteps,
     BidConfig,
+    ColourSettings,
+    DepthSettings,
     DescentDiagnostics,
     DescentSettings,
     InerfConfig,
+    Localizer,
     Outcome,
     Pivot,
     Problem,
@@ -34,16 +40,15 @@ from bidnerf_core.localization import (
     rig,
     settings_of,
 )
-from bidnerf_core.localization.solvers.history import WINDOW
+from bidnerf_core.localization.costs.sampled import Blurred
+from bidnerf_core.localization.solvers.history import WINDOW, History
 from bidnerf_core.localization.solvers.pivots import PivotName
-from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import GaussianBlobs, orbit
-from bidnerf_hashgrid import backend as hashgrid
+from bidnerf_core.scenes import GaussianBlobs
+from bidnerf_core.settings import to_flat
+from bidnerf_core.testing.scene import CAMERA as SMALL_CAMERA
+from blob_images import BOUNDS, CAMERA, TRUTH
 from problems import FieldMap, localize, single
 
-BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
-TRUTH = orbit(4.0, 3, seed=1)[1]
 FIELD = GaussianBlobs.random()
 XI = torch.tensor([0.02, -0.01, 0.03, 0.05, -0.07, 0.04], dtype=torch.float64)
 
@@ -58,15 +63,6 @@ def problem() -> Problem:
     return single(FIELD, BOUNDS, photograph(), perturb(TRUTH, 0.2, 4.0, seed=3))
 
 
-@pytest.mark.parametrize("pixels", ["interest-regions", "uniform"])
-def test_inerf_finds_its_place(problem: Problem, pixels: DrawerName) -> None:
-    found = localize(problem, "inerf", {"rays": 256, "max_steps": 150, "pixels": pixels}, seed=0)
-    before, after = (pose_error(T, TRUTH) for T in (problem.start, found.T_world_camera))
-    assert found.method == "inerf"
-    assert float(after.translation) < 0.25 * float(before.translation)
-    assert float(after.rotation_deg) < 0.25 * float(before.rotation_deg)
-
-
 def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
     """Alone at its few corners this soft scene says too little of the pose; that they are looked at can be seen."""
     losses = [
@@ -76,31 +72,11 @@ def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
     assert len(set(losses)) == 3
 
 
-def test_inerf_uses_no_depth(problem: Problem) -> None:
-    frame = problem.views[0].frame
-    wrong = torch.full((40, 48), 7.0)
-    few = {"rays": 64, "max_steps": 3}
-    answers = [
-        localize(single(FIELD, BOUNDS, replace(frame, depth=depth), problem.start), "inerf", few)
-        for depth in (None, wrong)
-    ]
-    assert torch.equal(answers[0].poses.matrix(), answers[1].poses.matrix())
-
-
-def test_an_image_of_a_single_colour_determines_nothing() -> None:
-    """The loss of a plain background is 0 wherever no ray meets anything."""
-    plain = Frame("plain", torch.ones((CAMERA.height, CAMERA.width, 3)), CAMERA)
-    away = SE3(TRUTH.rotation, TRUTH.translation + 10)
-    found = localize(single(FIELD, BOUNDS, plain, away), "bid", {"rays": 64, "max_steps": 2})
-    assert found.outcome is Outcome.UNDETERMINED
-    assert "fit about as well" in found.reason or "single-colour" in found.reason
-
-
 @pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.CONVERGED), (1e-6, Outcome.RENDERING_MISMATCH)])
 def test_colours_have_to_be_explained_better_than_by_a_single_one(
     problem: Problem, share: float, outcome: Outcome
 ) -> None:
-    settings = {"rays": 256, "max_steps": 150, "plain_share": share}
+    settings = {"rays": 128, "max_steps": 100, "plain_share": share}
     assert localize(problem, "inerf", settings, seed=0).outcome is outcome
 
 
@@ -111,12 +87,6 @@ def test_the_loss_of_depth_is_not_compared_with_that_of_a_colour(problem: Proble
     assert isinstance(found.diagnostics, DescentDiagnostics)
     assert found.diagnostics.support.plain == NO_RIVAL
     assert "contrast" not in found.reason
-
-
-def test_inerf_takes_one_image() -> None:
-    views = [View(photograph(T), T) for T in (orbit(4.0, 3, seed=1)[0], TRUTH)]
-    with pytest.raises(InputError, match="one image, got 2; method bid"):
-        localize(rig(FieldMap(FIELD, BOUNDS), views, TRUTH), "inerf")
 
 
 def test_the_learning_rate_is_inerfs(problem: Problem) -> None:
@@ -136,12 +106,6 @@ def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
     }  # fmt: skip
     one, other = localize(problem, "inerf", few), localize(problem, "bid", same)
     assert torch.equal(one.poses.matrix(), other.poses.matrix())
-
-
-@pytest.mark.parametrize("name", ["scene", "camera", "world"])
-def test_no_update_is_no_motion(problem: Problem, name: PivotName) -> None:
-    stayed = pivot(name, problem).moved(TRUTH, torch.zeros(6, dtype=torch.float64))
-    torch.testing.assert_close(stayed.matrix(), TRUTH.matrix())
 
 
 def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
@@ -195,38 +159,6 @@ def test_best_is_no_worse_than_last_by_its_own_measure(problem: Problem) -> None
     assert best.loss <= last.loss
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"stop_step": -1.0}, "stop_step is -1.0, expected a number from 0 up"),
-        ({"stop_loss": -1.0}, "stop_loss is -1.0"),
-        ({"colour_scale": 0.0}, "colour_scale is 0.0"),
-        ({"rays": 0}, "rays is 0"),
-    ],
-)
-def test_bad_settings_are_named(settings: dict[str, float], message: str) -> None:
-    for method in ("bid", "inerf"):
-        with pytest.raises(InputError, match=message):
-            settings_of(method, settings)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_thresholds_are_finite(value: float) -> None:
-    with pytest.raises(InputError, match=f"stop_loss is {value}, expected a number from 0 up"):
-        AdamSettings(stop_loss=value)
-
-
-def test_rays_are_moved_to_the_device_of_the_field(problem: Problem) -> None:
-    """The device "meta" stands for a GPU: it is another device, and one that every machine has."""
-    elsewhere = hashgrid.build(tiny.config(), BOUNDS).to("meta")
-    assert replace(problem, field=elsewhere).device.type == "meta"
-    assert problem.device.type == "cpu"  # a field without parameters
-    pixels = draw(problem.views, 8, uniform, torch.Generator().manual_seed(0), device="meta")
-    rays = pixels.rays(problem.start, BOUNDS)
-    parts = (pixels.origins, pixels.directions, pixels.rgb, pixels.distance, rays.origins, rays.near)
-    assert {part.device.type for part in parts} == {"meta"}
-
-
 def test_updates_are_those_of_torch() -> None:
     """Steps on a quadratic loss of the translation, beside torch's own Adam on the same gradients."""
     goal = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64)
@@ -243,21 +175,6 @@ def test_updates_are_those_of_torch() -> None:
         optimizer.step()
         steps()
         torch.testing.assert_close(steps.T.translation, place.detach())
-
-
-def test_a_block_holds_the_steps_that_were_taken() -> None:
-    config = AdamSettings(learning_rate=0.1)
-    steps = AdamSteps(lambda T: T.translation.sum() + 1, Pivot(SE3.identity()), config, SE3.identity())
-    for _ in range(WINDOW):
-        steps()
-    poses, losses, finite = steps.block()
-    assert finite.all()
-    torch.testing.assert_close(losses[1:], poses.translation[:-1].sum(-1) + 1)
-    torch.testing.assert_close(poses[WINDOW - 1].matrix(), steps.T.matrix())
-    taken = poses.matrix().clone()
-    steps()
-    torch.testing.assert_close(steps.block()[0][0].matrix(), steps.T.matrix())
-    assert torch.equal(poses.matrix(), taken)  # not overwritten by later steps
 
 
 def test_each_step_of_a_descent_follows_from_the_one_before(problem: Problem) -> None:
@@ -291,3 +208,169 @@ def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one(
     torch.testing.assert_close(linear(zero), exact(zero))
     derivatives = [torch.autograd.functional.jacobian(update, zero) for update in (linear, exact)]
     torch.testing.assert_close(*derivatives)
+
+
+def history(losses: list[float]) -> History:
+    """Return a history with these losses and a centimetre along x a step."""
+    poses = [
+        SE3.exp(torch.tensor([0.01 * i, 0, 0, 0, 0, 0], dtype=torch.float64)) for i in range(len(losses) + 1)
+    ]
+    return History(poses, losses)
+
+
+def test_the_best_pose_is_where_the_mean_loss_was_least() -> None:
+    losses = [1.0] * 30 + [0.2] * WINDOW + [0.5] * 30
+    losses[5] = 0.0  # one lucky draw is not the best
+    way = history(losses)
+    T, mean = way.answer("best")
+    assert mean == pytest.approx(0.2)
+    assert float(T.translation[0]) == pytest.approx(0.01 * (30 + WINDOW - 1))
+    T, mean = way.answer("last")
+    assert float(T.translation[0]) == pytest.approx(0.01 * len(losses))
+    assert mean == pytest.approx(0.5)
+
+
+def test_a_short_history_answers_with_its_end() -> None:
+    T, mean = history([0.1, 5.0]).answer("best")
+    assert float(T.translation[0]) == pytest.approx(0.02)
+    assert mean == pytest.approx(2.55)
+    assert math.isnan(history([]).answer("best")[1])
+
+
+def test_the_length_of_steps_is_measured() -> None:
+    assert history([1.0] * 40).recent_step() == pytest.approx(0.01)
+    assert history([1.0] * 40).stop(0.0, 0.011) is not None
+    assert history([1.0] * 40).stop(0.0, 0.009) is None
+    assert history([1.0] * (WINDOW - 1)).stop(10.0, 10.0) is None
+    assert history([]).recent_step() == math.inf
+
+
+def test_a_batch_adds_its_best_pose_after_each_step() -> None:
+    """Two poses over two steps; the history gets half of each cost, as the loss that Adam reports."""
+    xi = torch.zeros((3, 2, 6), dtype=torch.float64)
+    xi[..., 0] = torch.tensor([[0.0, 10.0], [1.0, 11.0], [2.0, 12.0]])
+    costs = torch.tensor([[4.0, 6.0], [3.0, 2.0], [1.0, 2.0]], dtype=torch.float64)
+    seen = History([SE3.identity()])
+    seen.add_batch(SE3.exp(xi), costs)
+    assert [float(T.translation[0]) for T in seen.poses] == pytest.approx([0.0, 11.0, 2.0])
+    assert seen.losses == [2.0, 1.0]
+
+
+BACK = (0.0, 0.0, 0.0)
+BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0, BACK)
+
+
+class Ball:
+    """A yellow ball of radius 0.4 about the origin, opaque within a few centimetres."""
+
+    sampler: RaySampler = Stratified(64, BOX)
+
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        inside = torch.sigmoid(40 * (0.4 - torch.linalg.vector_norm(positions, dim=-1)))
+        return FieldValues(60 * inside, torch.ones_like(positions) * positions.new_tensor([0.9, 0.8, 0.1]))
+
+
+BALL = Ball()
+AHEAD = SE3(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, -3.0], dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def frame() -> Frame:
+    image = render_image(BALL, SMALL_CAMERA, AHEAD, BOX)
+    return Frame("ball", image.rgb, SMALL_CAMERA, image.depth)
+
+
+def problem_at(frame: Frame, shift: float) -> Problem:
+    """Return the problem whose start lies ``shift`` metres to the right of the truth."""
+    start = SE3(AHEAD.rotation, AHEAD.translation + torch.tensor([shift, 0, 0], dtype=torch.float64))
+    return rig(FieldMap(BALL, BOX), [View(frame, SE3.identity())], start)
+
+
+def loss_of(problem: Problem, **reach: float) -> SampledLoss:
+    return SampledLoss(
+        problem, objective_of(ColourSettings(), DepthSettings()), RayCounts(64), DescentSettings(),
+        ReachSettings(**reach), torch.Generator().manual_seed(0),
+    )  # fmt: skip
+
+
+def gradient(loss: SampledLoss, problem: Problem) -> torch.Tensor:
+    xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    value = loss(problem.start_for("bid").retract(xi))
+    return torch.autograd.grad(value, xi)[0] if value.requires_grad else torch.zeros(6)
+
+
+def test_a_start_from_which_nothing_is_met_has_a_gradient_towards_the_box_only_by_its_term(
+    frame: Frame,
+) -> None:
+    problem = problem_at(frame, 3.0)
+    assert float(gradient(loss_of(problem), problem).abs().max()) == 0
+    found = gradient(loss_of(problem, box_weight=1.0), problem)
+    assert float(found[0]) > 1e-3  # a step against it leads back to the left
+    near = problem_at(frame, 0.1)
+    plain, boxed = (gradient(loss_of(near, box_weight=w), near) for w in (0.0, 1.0))
+    torch.testing.assert_close(plain, boxed)  # all measured points lie in the box
+
+
+def test_points_beyond_the_box_are_right_where_the_scene_goes_on_there(frame: Frame) -> None:
+    away = problem_at(frame, 3.0)
+    problem = replace(away, bounds=replace(BOX, contracted=True))
+    assert float(gradient(loss_of(problem, box_weight=1.0), problem).abs().max()) < 1e-9
+
+
+def test_a_blurred_field_is_the_field_convolved_with_a_gaussian() -> None:
+    """The convolution of a plane wave ``cos(k x)`` is ``exp(-k^2 sigma^2 / 2) cos(k x)``."""
+
+    class Wave(Ball):
+        def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+            return FieldValues(1 + torch.cos(5 * positions[..., 0]), torch.zeros_like(positions))
+
+    blurred = Blurred(Wave(), 0.2, torch.Generator().manual_seed(0))
+    at = torch.tensor([0.1, 0.0, 0.0]).expand(20000, 3)
+    found = float(blurred.query(at, at).density.mean())
+    exact = 1 + float(torch.exp(torch.tensor(-0.5)) * torch.cos(torch.tensor(0.5)))
+    assert found == pytest.approx(exact, abs=0.02)
+    assert blurred.sampler is Wave.sampler
+
+
+def test_the_papers_settings_are_presets() -> None:
+    paper, ours = (to_flat(METHODS["bid"].settings(name)) for name in ("paper", "paper-scene"))
+    assert (paper["rays"], paper["max_steps"], paper["level"], paper["depth_weight"]) == (2048, 1000, 0, 1.0)
+    assert (paper["pivot"], ours["pivot"]) == ("camera", "scene")
+    assert {name for name in paper if paper[name] != ours[name]} == {"pivot"}
+    assert (paper["candidates"], paper["box_weight"]) == (1, 0.0)  # nothing is added to the paper's objective
+    inerf = to_flat(METHODS["inerf"].settings("paper"))
+    assert (inerf["rays"], inerf["max_steps"], inerf["learning_rate"]) == (2048, 1000, 0.01)
+
+
+def test_bid_finds_the_ball_where_the_papers_objective_does_not(frame: Frame) -> None:
+    """The pose is free to turn about the ball, so that the loss tells whether it is seen as it was."""
+    losses = [
+        float(localize(problem_at(frame, 1.5), "bid", {"rays": 64, "max_steps": 100} | reach).losses[-1])
+        for reach in ({}, {"candidates": 1, "box_weight": 0.0})
+    ]
+    assert losses[0] < 0.05
+    assert losses[1] > 0.2
+    usual = METHODS["bid"].settings().reach
+    assert (usual.candidates, usual.box_weight) == (3, 1.0)
+
+
+def test_depth_that_has_no_weight_is_not_used(frame: Frame) -> None:
+    problem = problem_at(frame, 3.0)
+    loss = replace(
+        loss_of(problem, box_weight=1.0),
+        objective=objective_of(ColourSettings(), DepthSettings(depth_weight=0.0)),
+    )
+    assert float(gradient(loss, problem).abs().max()) < 1e-9
+
+
+def test_a_preset_can_be_changed_and_is_checked() -> None:
+    changed = settings_of("bid", {"rays": 64}, preset="paper")
+    assert to_flat(changed) == to_flat(METHODS["bid"].settings("paper")) | {"rays": 64}
+    with pytest.raises(InputError, match="preset 'papers' is unknown, this method offers paper, paper-scene"):
+        settings_of("bid", {}, preset="papers")
+    with pytest.raises(InputError, match="offers none"):
+        METHODS["auto"].settings("paper")
+    world = FieldMap(BALL, BOX)
+    assert Localizer(world, "bid", preset="paper", warm_up=False).config == METHODS["bid"].settings("paper")
+    with pytest.raises(InputError, match="preset 'paper' and a BidConfig, expected one"):
+        Localizer(world, "bid", METHODS["bid"].settings(), preset="paper")

@@ -1,4 +1,7 @@
-"""Hypotheses about a camera: evidence and poses by linear algebra, against integrals and sampling."""
+"""Hypotheses about a camera: evidence and poses by linear algebra, against integrals and sampling.
+
+``posterior`` is needed here for probabilities and for the pose of each explanation, of which answers show the best one only.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,19 @@
-"""The cost of whole small images: where it is least, where its steps lead, and how exposure enters."""
+"""The cost of whole small images: thumbnails, where the cost is least, where its steps lead, and how exposure enters.
+
+Costs and thumbnails are needed here for derivatives and convolutions, which no answer shows.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import convolve1d
 from scipy.optimize import minimize
-from torch import Generator
+from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.camera import Intrinsics
@@ -26,6 +31,8 @@ from bidnerf_core.localization.costs.images import (
     ViewRenderer,
     exposed,
     render_view,
+    slopes,
+    smooth,
     thumbnail,
 )
 from bidnerf_core.localization.search.by_images import WIDE_SCALES
@@ -169,15 +176,42 @@ def test_the_scales_of_the_search_allow_for_twice_and_half_the_exposure(factor: 
     assert here < 2.6 * exact  # colours that are clipped at twice the exposure tell less
 
 
-def test_another_exposure_costs_little(generator: Generator) -> None:
-    small, T = of_toy(24)
-    view = baked.unseen()[0]
-    darker = thumbnail(
-        View(Frame("d", 0.8 * view.frame.rgb + 0.05, view.frame.intrinsics), SE3.identity()), 24
+PINHOLE = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64)
+LENS = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64, (-0.2, 0.05, 0.001, -0.002))
+
+
+def even(camera: Intrinsics) -> Tensor:
+    """Colours that change evenly with where a pixel looks."""
+    x, y, _ = camera.unproject(camera.pixel_centres()).unbind(-1)
+    return torch.stack([0.5 + 0.4 * x, 0.5 + 0.4 * y, 0.5 + 0.2 * x - 0.3 * y], -1)
+
+
+def test_smooth_is_scipys_convolution(generator: Generator) -> None:
+    image = torch.rand((2, 3, 9, 14), generator=generator)
+    kernel = np.array([1, 4, 6, 4, 1]) / 16
+    expected = convolve1d(
+        convolve1d(image.numpy(), kernel, axis=-1, mode="nearest"), kernel, axis=-2, mode="nearest"
     )
-    plain, fitted = (
-        float(compared(on_surface(), [darker], scales, T[None]).cost[0]) for scales in (PLAIN, ColourScales())
-    )
-    exact = float(compared(on_surface(), [small], ColourScales(), T[None]).cost[0])
-    assert fitted < plain
-    assert fitted < 1.5 * exact + 0.02
+    torch.testing.assert_close(smooth(image), torch.from_numpy(expected), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])
+def test_where_its_pixels_look(camera: Intrinsics) -> None:
+    T = orbit(3.0, 2, seed=0)[1]
+    small = thumbnail(View(Frame("even", even(camera), camera), T), 24)
+    assert (small.camera.width, small.camera.height) == (24, 16)
+    assert small.camera.distortion == ()
+    seen = small.rgb[:, 3:-3, 3:-3].flatten(1).T
+    x, y, _ = small.flat.view(16, 24, 3)[3:-3, 3:-3].reshape(-1, 3).unbind(-1)
+    expected = torch.stack([0.5 + 0.4 * x, 0.5 + 0.4 * y, 0.5 + 0.2 * x - 0.3 * y], -1)
+    torch.testing.assert_close(seen, expected, rtol=0, atol=3e-3)
+    inner = small.slopes.view(3, 16, 24, 2)[:, 4:-4, 4:-4].flatten(1, 2).mean(1)
+    torch.testing.assert_close(inner, torch.tensor([[0.4, 0.0], [0.0, 0.4], [0.2, -0.3]]), rtol=0, atol=0.02)
+    turned = T.to(torch.float32).rotate(small.flat * small.directness[:, None])
+    torch.testing.assert_close(small.directions, turned)
+
+
+def test_what_is_small_already_is_not_made_larger() -> None:
+    small = thumbnail(View(Frame("even", even(PINHOLE), PINHOLE), SE3.identity()), 500)
+    assert (small.camera.width, small.camera.height) == (96, 64)
+    assert slopes(small.rgb, small.camera).shape == (3, 96 * 64, 2)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import read_depth_points
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import perturb
-from bidnerf_core.fields import Observations, SceneBounds, render, render_image
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields import Observations, render
+from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     ColourSettings,
@@ -27,15 +27,10 @@ from bidnerf_core.localization import (
     objective_of,
     window,
 )
-from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import GaussianBlobs, orbit
+from blob_images import BOUNDS, CAMERA, FIELD, FRAME, TRUTH, photograph
 from problems import localize, single
 from tiny import depth_rays_of
 
-BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
-TRUTH = orbit(4.0, 3, seed=1)[1]
-FIELD = GaussianBlobs.random()
 OBJECTIVE = objective_of(ColourSettings(), DepthSettings())
 T_CAMERA_LIDAR = SE3.exp(torch.tensor([0.3, -0.4, 0.1, 0.2, 1.5, -0.4], dtype=torch.float64))
 
@@ -54,11 +49,6 @@ def scan() -> torch.Tensor:
 
 def lidar() -> Observations:
     return Observations.from_points(scan(), T_CAMERA_LIDAR)
-
-
-def photograph(depth: bool = False) -> Frame:
-    image = render_image(FIELD, CAMERA, TRUTH, BOUNDS)
-    return Frame("frame", image.rgb, CAMERA, image.depth if depth else None)
 
 
 def depth_loss(problem: Problem, T: SE3, count: int = 10**6) -> float:
@@ -82,36 +72,14 @@ def test_points_come_back() -> None:
 
 
 def test_no_residual_at_the_truth_and_some_elsewhere() -> None:
-    problem = single(FIELD, BOUNDS, photograph(), TRUTH, lidar())
+    problem = single(FIELD, BOUNDS, photograph(depth=False), TRUTH, lidar())
     assert abs(depth_loss(problem, TRUTH)) < 1e-8
     assert depth_loss(problem, perturb(TRUTH, 0.2, 5.0, seed=0)) > 1e-4
 
 
-def test_a_moved_world_leaves_the_depth_loss_as_it_is() -> None:
-    motion = SE3.exp(torch.tensor([0.2, -0.1, 0.3, 0.5, -0.7, 1.1], dtype=torch.float64))
-    roomy = SceneBounds((-30.0,) * 3, (30.0,) * 3, 2.0, 6.5, BOUNDS.background)
-    start = perturb(TRUTH, 0.2, 5.0, seed=0)
-    here = depth_loss(single(FIELD, roomy, photograph(), start, lidar()), start)
-    moved = motion @ start
-    there = depth_loss(single(FIELD.moved(motion), roomy, photograph(), moved, lidar()), moved)
-    assert here == pytest.approx(there, rel=1e-3)
-
-
-def test_a_pose_is_found_from_colour_and_a_lidar() -> None:
-    """The camera has no depth."""
-    start = perturb(TRUTH, 0.3, 6.0, seed=3)
-    config = {
-        "rays": 64, "depth_rays": 128, "max_steps": 120, "learning_rate": 0.08, "depth_weight": 0.3, "level": None,
-    }  # fmt: skip
-    found = localize(single(FIELD, BOUNDS, photograph(), start, lidar()), "bid", config)
-    error = pose_error(found.T_world_camera, TRUTH)
-    assert float(error.translation) < 0.05
-    assert float(error.rotation_deg) < 1.0
-
-
 def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:
     """All black to the eye: no pixel has a gradient that is of use, but the distance comes right."""
-    dark = Frame("dark", torch.zeros(40, 48, 3), CAMERA)
+    dark = replace(FRAME, rgb=torch.zeros(40, 48, 3), depth=None)
     start = TRUTH.retract(torch.tensor([0, 0, -0.2, 0, 0, 0], dtype=torch.float64))
     config = {
         "rays": 1, "depth_rays": 200, "max_steps": 60, "learning_rate": 0.03, "level": None, "depth_weight": 1e3,
@@ -126,24 +94,10 @@ def test_weight_zero_leaves_depth_rays_out() -> None:
     start = perturb(TRUTH, 0.3, 6.0, seed=3)
     few = {"rays": 32, "max_steps": 3, "depth_weight": 0.0, "level": None, "pivot": "camera"}
     with_rays, without = (
-        localize(single(FIELD, BOUNDS, photograph(), start, rays), "bid", few) for rays in (lidar(), None)
+        localize(single(FIELD, BOUNDS, photograph(depth=False), start, rays), "bid", few)
+        for rays in (lidar(), None)
     )
     assert torch.equal(with_rays.poses.matrix(), without.poses.matrix())
-
-
-def test_the_gradient_by_the_pose_is_the_numerical_one() -> None:
-    drawn = lidar().drawn(40, torch.Generator().manual_seed(0), torch.float64)
-    start = perturb(TRUTH, 0.1, 2.0, seed=1)
-    here = drawn.rays(start, BOUNDS)
-
-    def loss(xi: torch.Tensor) -> torch.Tensor:
-        moved = drawn.rays(start.retract(xi), BOUNDS)  # the sampled interval is held, as autograd does
-        parts = (moved.origins, moved.directions, here.near, here.far)
-        rays = type(here)(*(part[None] for part in parts))
-        return OBJECTIVE.loss(render(FIELD, rays), drawn[None])
-
-    zero = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(loss, zero, eps=1e-6, atol=1e-6)
 
 
 def test_rays_are_drawn_from_the_generator_or_all_taken() -> None:
@@ -158,13 +112,13 @@ def test_rays_are_drawn_from_the_generator_or_all_taken() -> None:
 
 def test_sparse_depth_images_become_rays() -> None:
     """Twenty pixels of a depth image, as structure from motion leaves them: every one is looked at."""
-    dense = photograph(depth=True)
+    dense = FRAME
     assert dense.depth is not None
     kept = dense.depth > 0
     index = kept.reshape(-1).nonzero()[::17, 0]
     depth = torch.zeros(40 * 48)
     depth[index] = dense.depth.reshape(-1)[index]
-    frame = Frame("frame", dense.rgb, CAMERA, depth.reshape(40, 48))
+    frame = replace(dense, depth=depth.reshape(40, 48))
     T = SE3.exp(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.0, -0.2], dtype=torch.float64))
     rays = depth_rays_of([View(frame, T)])
     assert len(rays) == len(index)

@@ -11,7 +11,7 @@ import torch
 import tiny
 from bidnerf_core import SE3, InputError, Localizer, Outcome, Tracker, View, load_map, train
 from bidnerf_core.captures.coverage import shows_distances
-from bidnerf_core.localization.localizer import direction_only
+from bidnerf_core.evaluation import faulty
 from bidnerf_core.mapping import LandmarkConfig, tracked_views
 from bidnerf_core.maps import load_info
 from bidnerf_core.testing import MapWithLandmarks, textured_map, unseen
@@ -78,8 +78,9 @@ def test_an_accepted_pose_is_imprecise_and_a_rejected_one_stays_rejected() -> No
     assert (cautious.covariance, cautious.confidence) == (None, None)
     assert "one place" in cautious.reason
     assert torch.equal(cautious.T_world_camera.matrix(), usual.T_world_camera.matrix())
-    rejected = direction_only(replace(usual, outcome=Outcome.AMBIGUOUS))
-    assert rejected.outcome is Outcome.AMBIGUOUS
+    mirrored = Localizer(flat)(replace(faulty(unseen(), "mirror", 0).frame, depth=None))
+    assert mirrored.outcome is Outcome.MIRRORED
+    assert mirrored.covariance is None
 
 
 def test_there_is_no_tracking_without_distances() -> None:

@@ -1,4 +1,8 @@
-"""The cost of rendered rays: its gradient is exact, with exposure too, and steep residuals steer but do not judge."""
+"""The cost of rendered rays: exact derivatives, with exposure too; drawn rays and their weights; steep residuals steer but do not judge.
+
+Rays of a closed-form scene have measurements that differ from it. The linearization and the residuals are needed here for numerical
+derivatives, which no answer shows.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +10,78 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Generator
 
+import blob_images
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import Objective, colour_term, depth_term, render
-from bidnerf_core.frames import Frame
-from bidnerf_core.geometry import Robust
-from bidnerf_core.localization import RefinementSettings, RefinementStage, RenderedCost
-from bidnerf_core.localization.costs.rendered import LEAST_WITH_DEPTH, Residuals, _residuals
-from problems import single
-from rendered_rays import BOUNDS, FIELD, OBJECTIVE, OBSERVED, PIVOTS, POSES, RAYS, seen
+from bidnerf_core.fields import Objective, Observations, Rays, SceneBounds, colour_term, depth_term, render
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3, Robust
+from bidnerf_core.localization import (
+    ColourSettings,
+    DepthSettings,
+    Pivot,
+    RayCounts,
+    RefinementSettings,
+    RefinementStage,
+    RenderedCost,
+    objective_of,
+    rig,
+)
+from bidnerf_core.localization.costs.linearization import Linearization, linearize
+from bidnerf_core.localization.costs.rendered import (
+    LEAST_WITH_DEPTH,
+    Residuals,
+    WeightedRays,
+    _residuals,
+    blurred,
+    draw_weighted_rays,
+)
+from bidnerf_core.scenes import GaussianBlobs, orbit
+from problems import FieldMap, single
+from tiny import depth_rays_of
+
+BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 0.9, 0.8))
+FIELD = GaussianBlobs.random()
+POSES = SE3.stack(orbit(4.0, 3, seed=1))
+PIVOTS = {
+    "camera": Pivot(SE3.identity()),
+    "scene": Pivot(
+        SE3(torch.eye(3, dtype=torch.float64), torch.tensor([0.1, -0.2, 3.9], dtype=torch.float64))
+    ),
+    "world": Pivot(None),
+}
+MISS = 0.5
+OBJECTIVE = Objective((colour_term(Robust("cauchy", 0.2)), depth_term(Robust("cauchy", 0.3), 2.0, miss=MISS)))
+
+
+def observations(count: int = 40) -> Observations:
+    """Return rays towards the scene that measured something else than what is there, some of them no depth."""
+    generator = torch.Generator().manual_seed(0)
+    across = 0.5 * torch.rand((count, 2), generator=generator, dtype=torch.float64) - 0.25
+    directions = torch.nn.functional.normalize(
+        torch.cat([across, torch.ones_like(across[:, :1])], -1), dim=-1
+    )
+    measured = torch.rand((count, 4), generator=generator, dtype=torch.float64)
+    distance = torch.where(measured[:, 3] > 0.3, 3.5 + measured[:, 3], 0)
+    coloured = torch.ones(count, dtype=torch.bool)
+    return Observations(0.05 * measured[:, :3], directions, measured[:, :3], distance, coloured)
+
+
+OBSERVED = observations()
+RAYS = WeightedRays(OBSERVED, OBJECTIVE.weights(OBSERVED[None])[0])
+
+
+def held(T: SE3) -> Rays:
+    """Return the rays from T on the intervals that they have at POSES: an interval has no derivative."""
+    here, moved = OBSERVED.rays(POSES, BOUNDS), OBSERVED.rays(T, BOUNDS)
+    return replace(moved, near=here.near, far=here.far)
+
+
+def seen(T: SE3, about: Pivot, least_weight: float = 0.0) -> Linearization:
+    return linearize(
+        FIELD, held(T), OBSERVED, OBJECTIVE.residuals, about.at(T), BOUNDS.background, least_weight
+    )
 
 
 def residuals(about: str, exposure: bool = False, surface_sigma: float = 0.0) -> Residuals:
@@ -103,3 +170,84 @@ def test_the_cost_without_derivatives_is_the_same() -> None:
     )
     torch.testing.assert_close(cost.cost(POSES), cost(POSES).cost)
     assert not bool(cost.residuals(POSES, derivatives=False).jacobian.any())
+
+
+@pytest.mark.parametrize("name", list(PIVOTS))
+def test_the_jacobian_is_the_numerical_one(name: str) -> None:
+    about, step = PIVOTS[name], 1e-5
+    exact = seen(POSES, about).jacobian
+    for k in range(6):
+        xi = step * torch.eye(6, dtype=torch.float64)[k].expand(3, 6)
+        ahead, behind = (seen(about.moved(POSES, sign * xi), about).residuals for sign in (1, -1))
+        torch.testing.assert_close(exact[..., k], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-7)
+
+
+def test_steepness_is_the_rate_along_the_steepest_shift() -> None:
+    found = seen(POSES, PIVOTS["camera"])
+    torch.testing.assert_close(found.steepness, found.jacobian[..., :3].norm(dim=-1))
+
+
+def test_air_may_be_left_out_of_derivatives() -> None:
+    exact, rough = seen(POSES, PIVOTS["scene"]), seen(POSES, PIVOTS["scene"], least_weight=1e-3)
+    torch.testing.assert_close(rough.residuals, exact.residuals)
+    assert float((rough.jacobian - exact.jacobian).norm() / exact.jacobian.norm()) < 0.05
+
+
+def test_only_the_channels_asked_for_are_differentiated() -> None:
+    only = linearize(
+        FIELD, held(POSES), OBSERVED, OBJECTIVE.residuals, POSES, BOUNDS.background, channels=(3,)
+    ).jacobian
+    torch.testing.assert_close(only[..., 3, :], seen(POSES, PIVOTS["camera"]).jacobian[..., 3, :])
+    assert float(only[..., :3, :].abs().max()) == 0
+
+
+def test_rays_that_miss_everything_have_no_derivative() -> None:
+    away = OBSERVED.rays(
+        POSES.retract(torch.tensor([0, 0, 0, 3.14, 0, 0], dtype=torch.float64).expand(3, 6)), BOUNDS
+    )
+    found = linearize(FIELD, away, OBSERVED, OBJECTIVE.residuals, POSES, BOUNDS.background)
+    assert float(found.jacobian.abs().max()) == 0
+    background = torch.tensor(BOUNDS.background, dtype=torch.float64)
+    torch.testing.assert_close(found.rgb, background.expand(3, 40, 3))
+    torch.testing.assert_close(found.residuals[..., :3], (background - OBSERVED.rgb).expand(3, 40, 3))
+    missed = torch.where(OBSERVED.measured, MISS, 0.0).double()
+    torch.testing.assert_close(found.residuals[..., 3], missed.expand(3, 40))
+
+
+@pytest.mark.parametrize("size", [2, 3, 7, 100])
+def test_blur_keeps_means_and_places(size: int) -> None:
+    """An image that changes evenly stays what it is, away from its borders."""
+    u, v = blob_images.CAMERA.pixel_centres().unbind(-1)
+    even = Frame("even", torch.stack([u / 48, v / 40, torch.full_like(u, 0.3)], -1), blob_images.CAMERA)
+    smooth = blurred(View(even, blob_images.TRUTH), size).frame.rgb
+    assert smooth.shape == even.rgb.shape
+    torch.testing.assert_close(smooth[..., 2], even.rgb[..., 2])
+    inner = smooth[size : -2 * size, size : -2 * size] - even.rgb[size : -2 * size, size : -2 * size]
+    assert inner.numel() == 0 or float(inner.abs().max()) < 1e-5
+
+
+def test_weights_of_each_kind_of_measurement_add_up_to_its_weight_in_the_objective() -> None:
+    """Colours of all pixels and each channel to 1, depths of each sensor to lambda_d."""
+    views = [View(blob_images.photograph(T), T) for T in blob_images.POSES]
+    objective = objective_of(ColourSettings(), DepthSettings(depth_weight=3.0))
+    problem = rig(FieldMap(blob_images.FIELD, blob_images.BOUNDS), views, None)
+    drawn = draw_weighted_rays(problem, objective, RayCounts(90), "uniform", 1, Generator().manual_seed(0))
+    torch.testing.assert_close(drawn.weights.sum(0), torch.tensor([1.0, 1.0, 1.0, 3.0]))
+    assert not bool(drawn.weights[~drawn.observed.measured][:, 3].any())
+
+
+def test_rays_of_depth_join_pixels_unless_depth_has_no_weight() -> None:
+    lidar = depth_rays_of([View(blob_images.FRAME, SE3.identity())])
+    problem = single(
+        blob_images.FIELD, blob_images.BOUNDS, blob_images.photograph(depth=False), blob_images.TRUTH, lidar
+    )
+    for weight, count, expected in ((2.0, 40, 90), (2.0, 0, 50), (0.0, 40, 50)):
+        objective = objective_of(ColourSettings(), DepthSettings(depth_weight=weight))
+        drawn = draw_weighted_rays(
+            problem, objective, RayCounts(50, count), "uniform", 1, Generator().manual_seed(0)
+        )
+        assert len(drawn.observed) == len(drawn.weights) == expected
+        assert not bool(drawn.weights[50:, :3].any())
+        torch.testing.assert_close(
+            drawn.weights[50:, 3:].sum(), torch.tensor(weight if count and weight else 0.0)
+        )

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import InputError, Localizer
-from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import AutoConfig, Localization, Outcome, risk
-from bidnerf_core.localization.tracking.relocalization import relocalized
+from bidnerf_core import InputError, Localizer, Tracker
+from bidnerf_core.localization import AutoConfig, Outcome, risk
 from bidnerf_core.testing import textured_map, unseen
+from localizations import answer
 
 LEVELS = ((0.01, 0.97), (0.05, 0.9), (0.1, 0.8))
 
@@ -33,13 +32,6 @@ def calibration() -> ModuleType:
 @pytest.fixture
 def levels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(risk, "levels", lambda: LEVELS)
-
-
-def answer(confidence: float | None, outcome: Outcome = Outcome.CONVERGED) -> Localization:
-    pose, losses = SE3.identity(), torch.zeros(1)
-    return Localization(
-        pose, outcome, "fine", 1, 0.0, 0.0, "auto", SE3.stack([pose]), losses, confidence=confidence
-    )
 
 
 def row(confidence: float, right: bool, fault: str, scene: str = "a", inliers: int = 50) -> dict[str, Any]:
@@ -62,8 +54,9 @@ def barely_too_many(confidence: np.ndarray) -> np.ndarray:
     return np.full_like(confidence, 0.0501)
 
 
-@pytest.mark.parametrize("wrong", [falling, overconfident, barely_too_many])
-@pytest.mark.parametrize("tolerated", [0.05, 0.1])
+@pytest.mark.parametrize(
+    ("wrong", "tolerated"), [(falling, 0.1), (falling, 0.05), (overconfident, 0.05), (barely_too_many, 0.05)]
+)
 def test_the_stated_risk_is_exceeded_as_rarely_as_promised(
     calibration: ModuleType, wrong: Callable[[np.ndarray], np.ndarray], tolerated: float
 ) -> None:
@@ -130,7 +123,7 @@ def test_stored_levels_are_monotone() -> None:
 
 @pytest.mark.usefixtures("levels")
 def test_a_smaller_risk_accepts_a_subset() -> None:
-    answers = [answer(value) for value in np.linspace(0.5, 1, 101)]
+    answers = [answer(confidence=value) for value in np.linspace(0.5, 1, 101)]
     accepted = [
         {place for place, found in enumerate(answers) if risk.within_risk(found, share).converged}
         for share in (0.01, 0.03, 0.05, 0.07, 0.1)
@@ -143,7 +136,7 @@ def test_a_smaller_risk_accepts_a_subset() -> None:
 
 @pytest.mark.usefixtures("levels")
 def test_what_is_not_sure_enough_is_uncertain_with_the_same_pose() -> None:
-    found = answer(0.95)
+    found = answer(confidence=0.95)
     judged = risk.within_risk(found, 0.01)
     assert judged.outcome is Outcome.UNCERTAIN
     assert judged.T_world_camera is found.T_world_camera
@@ -155,12 +148,12 @@ def test_what_is_not_sure_enough_is_uncertain_with_the_same_pose() -> None:
 
 @pytest.mark.usefixtures("levels")
 def test_an_answer_without_a_confidence_is_not_accepted_at_any_risk() -> None:
-    assert risk.within_risk(answer(None), 0.1).outcome is Outcome.UNCERTAIN
+    assert risk.within_risk(answer(), 0.1).outcome is Outcome.UNCERTAIN
 
 
 @pytest.mark.usefixtures("levels")
 def test_a_rejection_stays_what_it_is() -> None:
-    found = answer(0.99, Outcome.MIRRORED)
+    found = answer(outcome=Outcome.MIRRORED, confidence=0.99)
     assert risk.within_risk(found, 0.1) is found
 
 
@@ -187,10 +180,9 @@ def test_the_localizer_and_the_search_of_a_tracker_keep_to_it(
     for share in (None, 0.1, 0.01):
         localizer = Localizer(textured_map(), config=AutoConfig(fused_rays=0, risk=share), warm_up=False)
         frame = unseen().frame
-        answer = localizer(frame) if search == "localizer" else relocalized(localizer, frame, None, 0, 0)
-        assert answer is not None
-        found.append(answer)
-    assert [answer.converged for answer in found] == [True, True, False]
-    for answer in found[1:]:
-        assert torch.equal(answer.T_world_camera.matrix(), found[0].T_world_camera.matrix())
-        assert answer.confidence == found[0].confidence
+        each = localizer(frame) if search == "localizer" else Tracker(localizer)(frame, 0.0)
+        found.append(each)
+    assert [each.converged for each in found] == [True, True, False]
+    for each in found[1:]:
+        assert torch.equal(each.T_world_camera.matrix(), found[0].T_world_camera.matrix())
+        assert each.confidence == found[0].confidence

@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.fields import Observations, VoxelGrid
-from bidnerf_core.frames import Frame, View, measured_middle
+from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.mapping import SurfaceMap, SurfelIndex, Surfels
@@ -201,28 +201,6 @@ def test_without_depth_there_are_no_points() -> None:
     assert len(baked.cloud(with_depth(view, None), view, count=100)) == 50
 
 
-def test_points_are_drawn_from_some_pixels_of_a_large_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fewer pixels are drawn from and averaged; those of a few measured ones are all kept."""
-    view = View(baked.unseen()[0].frame, SE3.identity())
-    middle, count = measured_middle([view]), len(depth_rays_of([view]))
-    assert middle is not None
-    monkeypatch.setattr("bidnerf_core.localization.costs.surface.MOST_DRAWN_FROM", count // 3)
-    monkeypatch.setattr("bidnerf_core.frames.pixels.MOST_FOR_MIDDLE", count // 12)
-    cloud = PointCloud.measured((view,), None, count, torch.Generator().manual_seed(0))
-    assert count // 4 < len(cloud) <= count // 3 + 1
-    thinned = measured_middle([view])
-    assert thinned is not None
-    spread = cloud.points.double().std(0)
-    assert bool(((thinned - middle).abs() < 0.2 * spread).all())
-    assert view.frame.depth is not None
-    few = torch.zeros_like(view.frame.depth)
-    few[::9, ::7] = view.frame.depth[::9, ::7]
-    sparse = with_depth(view, few)
-    assert len(PointCloud.measured((sparse,), None, count, torch.Generator().manual_seed(0))) == int(
-        (few > 0).sum()
-    )
-
-
 def test_points_of_depth_rays_take_their_colours_from_the_views_that_see_them() -> None:
     """The pixels of a depth image, given as rays of their own, have the colours that the image shows there."""
     view = baked.unseen()[0]
@@ -249,12 +227,3 @@ def test_points_of_depth_rays_that_no_view_sees_have_no_colour() -> None:
     assert seen == {(0.0, 3.0): True, (9.0, 3.0): False, (0.0, -3.0): False}
     assert not found.all_coloured
     assert not found.rgb[~found.coloured].any()
-
-
-def test_views_and_depth_rays_have_equal_shares() -> None:
-    view = View(baked.unseen()[0].frame, SE3.identity())
-    rays = depth_rays_of([view])
-    moved = Observations(rays.origins + 0.1, rays.directions, rays.rgb, rays.distance, rays.coloured)
-    found = PointCloud.measured((view,), moved, 200, torch.Generator().manual_seed(0))
-    assert int((found.origins == 0).all(-1).sum()) == 100
-    assert len(found) == 200

@@ -1,4 +1,7 @@
-"""The motion model: predictions, fusion, and what keeps its covariance honest."""
+"""The motion model: predictions, fusion, and what keeps its covariance honest.
+
+The filter shows in no answer by itself, hence ``Motion`` and ``Clock``.
+"""
 
 from __future__ import annotations
 

@@ -1,19 +1,25 @@
-"""The baked surface is where the scene is; what only one view sees is not on it."""
+"""The baked surface is where the scene is; what only one view sees is not on it; and how large its cells are.
+
+Their size follows the resolution of the images, their noise, the number of points and the memory.
+"""
 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.errors import InputError
-from bidnerf_core.fields import FieldValues
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.fields import FieldValues, SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
+from bidnerf_core.mapping.surface.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
+from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, measured_image
 from bidnerf_core.scenes import Box, HomogeneousBall, Sphere, blotches, orbit
 
 RADIUS = 0.6
@@ -145,3 +151,112 @@ def test_settings_are_judged(wrong: dict[str, float]) -> None:
     (name,) = wrong
     with pytest.raises(InputError, match=f"{name} is"):
         BakeConfig(**wrong)  # type: ignore[arg-type]
+
+
+SCENE = baked.one_solid(Box((0.6, 0.6, 0.6)), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
+
+
+def images(noise: float, generator: Generator, count: int = 16) -> list[PosedDepthImage]:
+    found = []
+    for view in baked.images(SCENE, count, seed=0):
+        depth = view.frame.depth
+        assert depth is not None
+        noisy = torch.where(depth > 0, depth + noise * torch.randn(depth.shape, generator=generator), 0)
+        found.append(measured_image(View(replace(view.frame, depth=noisy), view.T_ref_camera), 1e9))
+    return found
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_the_noise_of_depth_is_measured(noise: float, generator: Generator) -> None:
+    # Interpolation between four pixels averages the noise of one of the two that are compared.
+    assert 0.6 * noise < depth_noise(images(noise, generator), 0.9) < 1.2 * noise
+
+
+def test_exact_depth_has_little_noise(generator: Generator) -> None:
+    assert depth_noise(images(0.0, generator), 0.9) < 0.1 * footprint(images(0.0, generator), 0.9)
+
+
+def test_a_single_image_has_no_noise(generator: Generator) -> None:
+    assert depth_noise(images(0.02, generator, 1), 0.9) == 0.0
+    assert depth_noise([], 0.9) == 0.0
+
+
+def test_the_footprint_is_that_of_the_full_image_and_the_spacing_that_of_the_thinned_one() -> None:
+    view = baked.images(SCENE, 1, seed=0)[0]
+    thinned = [measured_image(view, view.frame.intrinsics.width * view.frame.intrinsics.height / 9)]
+    assert view.frame.depth is not None
+    distance = float(view.frame.depth[view.frame.depth > 0].median())
+    assert footprint(thinned, 0.9) == pytest.approx(distance / baked.CAMERA.fx, rel=0.02)
+    assert spacing(thinned, 0.9) == pytest.approx(3 * distance / baked.CAMERA.fx, rel=0.05)
+
+
+def scattered(count: int, generator: Generator) -> Tensor:
+    """Return points (metres) in the plane z = 0.03 of the box."""
+    flat = 2 * torch.rand((count, 2), generator=generator) - 1
+    return torch.cat([flat, torch.full((count, 1), 0.03)], dim=1)
+
+
+def test_few_points_make_cells_coarser_but_no_coarser_than_their_spacing(generator: Generator) -> None:
+    many, few = scattered(100_000, generator), scattered(1000, generator)
+    assert chosen_grid(many, baked.BOUNDS, 0.02, 0.2, 200.0).cell == 0.02
+    grid = chosen_grid(few, baked.BOUNDS, 0.02, 0.2, 200.0)
+    assert 0.02 < grid.cell < 0.2
+    assert len(few) >= 1.32 * len(grid.numbers(few).unique())
+    assert chosen_grid(few[:1], baked.BOUNDS, 0.02, 0.1, 200.0).cell == 0.1
+
+
+@pytest.mark.slow
+def test_memory_is_bounded_and_a_warning_says_so(generator: Generator) -> None:
+    points = scattered(200_000, generator)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        free = chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 200.0)
+    with pytest.warns(InputWarning, match=r"MB with cells of 0\.01; cells of .* within 1 MB.*--megabytes"):
+        bounded = chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 1.0)
+    assert surface_bytes(points, bounded) <= 1e6 < surface_bytes(points, free)
+    assert bounded.cell < 0.06  # no coarser than needed
+    with pytest.warns(InputWarning, match="too many cells"):
+        assert math.prod(chosen_grid(points, baked.BOUNDS, 1e-4, 1e-4, 200.0).shape) < 2**31
+    with pytest.raises(InputError, match="allow more megabytes"):
+        chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 1e-5)
+
+
+def walls(size: tuple[float, float, float], step: float) -> Tensor:
+    """Return points (metres), ``step`` apart, on the floor, the ceiling and the walls of a room with a corner at the origin."""
+    sides = [torch.arange(step / 2, length, step) for length in size]
+    faces = []
+    for axis, length in enumerate(size):
+        for at in (0.01, length - 0.01):
+            face = [torch.tensor([at]) if i == axis else side for i, side in enumerate(sides)]
+            faces += [torch.cartesian_prod(*face)]
+    return torch.cat(faces)
+
+
+def test_a_room_in_a_box_of_a_hundred_times_its_volume_takes_little_more_memory() -> None:
+    points = walls((6.0, 4.0, 3.0), 0.04)
+    taken = {}
+    for times in (1.0, 100 ** (1 / 3)):
+        box = SceneBounds((0.0, 0.0, 0.0), (6.0 * times, 4.0 * times, 3.0 * times), 0.0, 100.0)
+        taken[times] = surface_bytes(points, VoxelGrid.covering(box, 0.05))
+    small, large = taken.values()
+    assert small < large < 2 * small
+
+
+def test_a_hundred_rooms_stay_within_the_memory_that_is_allowed() -> None:
+    room = walls((6.0, 4.0, 3.0), 0.08)
+    rooms = [room + torch.tensor([6.0 * x, 4.0 * y, 0.0]) for x in range(10) for y in range(10)]
+    box = SceneBounds((0.0, 0.0, 0.0), (60.0, 40.0, 3.0), 0.0, 100.0)
+    alone = surface_bytes(room, VoxelGrid.covering(replace(box, upper=(6.0, 4.0, 3.0)), 0.1))
+    with pytest.warns(InputWarning, match="--megabytes"):
+        grid = chosen_grid(torch.cat(rooms), box, 0.1, 0.1, 20 * alone / 1e6)
+    assert surface_bytes(torch.cat(rooms), grid) <= 20 * alone
+    assert grid.cell < 0.4  # no coarser than needed
+
+
+def test_a_baked_surface_stays_within_its_memory() -> None:
+    with pytest.warns(InputWarning, match="0\\.2 MB"):
+        surface = bake(
+            baked.FIELD, baked.BOUNDS, [], baked.images(SCENE, 12, seed=0), BakeConfig(megabytes=0.2)
+        )
+    assert surface.bytes < 0.25e6  # surfels move a little when planes are fitted
+    assert (surface.surfels.positions.abs().amax(-1) < 0.6 + surface.cell).all()

@@ -13,7 +13,6 @@ import torch
 import tiny
 from bidnerf_core import InputError
 from bidnerf_core.mapping import (
-    Features,
     Keypoints,
     Sift,
     byte_of_zero,
@@ -47,12 +46,6 @@ def test_a_spot_is_found_at_its_centre(centre: tuple[float, float]) -> None:
     assert float(off.min()) < 0.06
 
 
-def test_a_blank_image_has_no_keypoints() -> None:
-    found = Sift()(torch.full((50, 60, 3), 0.5))
-    assert len(found) == 0
-    assert found.descriptors.shape == (0, 128)
-
-
 def test_at_most_as_many_as_asked_for_and_always_the_same() -> None:
     image = textured(0)
     assert 30 <= len(Sift(count=30)(image)) <= 31  # of equal contrast, OpenCV keeps both
@@ -61,10 +54,6 @@ def test_at_most_as_many_as_asked_for_and_always_the_same() -> None:
     for other in found[1:]:
         assert torch.equal(other.pixels, found[0].pixels)
         assert torch.equal(other.descriptors, found[0].descriptors)
-
-
-def test_sift_is_a_detector() -> None:
-    assert isinstance(Sift(), Features)
 
 
 def test_distances_of_bytes_are_exact(generator: torch.Generator) -> None:

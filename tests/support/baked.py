@@ -15,7 +15,17 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import PointCloud, Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
-from bidnerf_core.scenes import ClosedFormScene, GaussianBlobs, Primitive, Shape, Texture, demo_object, orbit
+from bidnerf_core.scenes import (
+    Box,
+    ClosedFormScene,
+    GaussianBlobs,
+    Primitive,
+    Shape,
+    Texture,
+    blotches,
+    demo_object,
+    orbit,
+)
 from problems import FieldMap
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)
@@ -46,6 +56,16 @@ def unseen() -> tuple[View, ...]:
 
 def one_solid(shape: Shape, texture: Texture) -> ClosedFormScene:
     return ClosedFormScene([Primitive(shape, SE3.identity(), texture)], BOUNDS, "one")
+
+
+def even_box() -> ClosedFormScene:
+    """Return a box that half a turn maps onto itself."""
+    paint, turn = blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1), torch.tensor([-1.0, -1.0, 1.0])
+
+    def both(points: Tensor, normals: Tensor) -> Tensor:
+        return (paint(points, normals) + paint(points * turn, normals * turn)) / 2
+
+    return replace(one_solid(Box((0.6, 0.4, 0.3)), both), contrast=0.0)
 
 
 def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None = None) -> Problem:

@@ -13,6 +13,7 @@ from bidnerf_core.localization import AutoConfig
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import look_at
 from bidnerf_core.testing import textured_map, view
+from localizations import without_depth as without_depth
 
 FRAMES = 14
 INTERVAL = 0.1  # seconds
@@ -41,10 +42,6 @@ def covered(frame: Frame) -> Frame:
     dark = 0.02 + 0.01 * torch.rand(frame.rgb.shape, generator=generator)
     depth = None if frame.depth is None else torch.zeros_like(frame.depth)
     return replace(frame, rgb=dark, depth=depth)
-
-
-def without_depth(frame: Frame) -> Frame:
-    return replace(frame, depth=None)
 
 
 @functools.cache

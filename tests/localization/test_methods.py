@@ -1,0 +1,189 @@
+"""Every method on a closed-form scene: where it leads from a start, how it tells of its way, what it uses, and what it rejects."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from bidnerf_core import SE3, Frame, InputError, Localization, Localizer, Outcome, View
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.localization import METHODS, settings_of
+from bidnerf_core.mapping import BakeConfig, bake
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import orbit
+from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
+from localizations import assert_near
+from problems import FieldMap
+from tiny import depth_rays_of
+
+FEW: dict[str, dict[str, Any]] = {
+    "auto": {"points": 500, "hypotheses": 24, "rounds": 1, "refine_steps": 2, "fine_rays": 128},
+    "bid": {"rays": 256, "max_steps": 60, "learning_rate": 0.08, "decay": 0.5, "decay_steps": 20,
+            "depth_weight": 0.3, "level": None},
+    "bid-lm": {"poses": 8, "search_rays": 64, "coarse_poses": 3, "coarse_rays": 64, "middle_rays": 128,
+               "fine_rays": 512, "blur": 2},
+    "inerf": {"rays": 128, "max_steps": 60, "learning_rate": 0.04, "decay": 0.5, "decay_steps": 20},
+    "inerf-lm": {"poses": 8, "search_poses": 2, "middle_poses": 2, "coarse_rays": 64, "fine_rays": 256},
+}  # fmt: skip
+"""Settings for small images, by method."""
+FEWEST: dict[str, dict[str, Any]] = {
+    "auto": {"points": 200, "hypotheses": 8},
+    "bid": {"rays": 64, "max_steps": 3},
+    "bid-lm": {"poses": 2, "middle_rays": 32, "fine_rays": 64},
+    "inerf": {"rays": 64, "max_steps": 3},
+    "inerf-lm": {"poses": 2, "search_poses": 1, "middle_poses": 1, "coarse_rays": 32, "fine_rays": 64},
+}
+"""Settings of these that differ where the pose does not matter."""
+REMAINING = {"auto": 0.25, "bid": 0.35, "bid-lm": 0.15, "inerf": 0.4, "inerf-lm": 0.15}
+"""Largest error after the descent, as a share of the error of the start."""
+
+
+@functools.cache
+def scene(surface: bool = False) -> FieldMap:
+    seen = [(replace(CAMERA, fx=60.0, fy=60.0), T) for T in orbit(4.0, 16, elevation=(-10.0, 80.0), seed=0)]
+    return FieldMap(
+        FIELD, BOUNDS, bake(FIELD, BOUNDS, seen, config=BakeConfig(cells=100_000)) if surface else None
+    )
+
+
+def found_by(
+    method: str,
+    query: Any = FRAME,
+    start: SE3 | None = None,
+    seed: int = 0,
+    lidar: Any = None,
+    **changes: Any,
+) -> Localization:
+    config = settings_of(method, FEW[method] | changes)
+    localizer = Localizer(scene(surface=method == "auto"), method, config, warm_up=False)
+    return localizer(query, start, lidar, seed)
+
+
+def off(T: SE3, truth: SE3 = TRUTH) -> float:
+    return float(pose_error(T, truth).translation)
+
+
+def rig(depth: bool) -> list[View]:
+    return [View(photograph(T, depth), T) for T in (POSES[0], POSES[2], TRUTH)]
+
+
+@pytest.mark.parametrize("count", [1, 3], ids=["one", "rig"])
+@pytest.mark.parametrize("depth", [True, False], ids=["RGB-D", "RGB"])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_descent_from_a_start_leads_to_the_truth_and_tells_its_way(
+    method: str, depth: bool, count: int
+) -> None:
+    start = perturb(TRUTH, 0.15, 4.0, seed=2)
+    query = photograph(depth=depth) if count == 1 else rig(depth)
+    if method == "inerf" and count > 1:
+        with pytest.raises(InputError, match="one image, got 3"):
+            found_by(method, query, start)
+        return
+    found = found_by(method, query, start)
+    assert off(found.T_world_camera) < REMAINING[method] * off(start)
+    assert found.method == method
+    assert found.T_world_camera.rotation.dtype == torch.float64
+    assert not found.T_world_camera.rotation.requires_grad
+    assert found.steps == len(found.losses) == len(found.poses.translation) - 1
+    torch.testing.assert_close(found.poses[-1].matrix(), found.T_world_camera.matrix())
+    if method != "auto":  # which begins at the best of several poses
+        assert torch.equal(found.poses[0].matrix(), start.matrix())
+    if found.covariance is not None:
+        torch.testing.assert_close(found.covariance, found.covariance.mT, rtol=1e-6, atol=0)
+        assert float(torch.linalg.eigvalsh(found.covariance)[0]) > 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_random_choices_come_from_the_seed(method: str) -> None:
+    start, poses = perturb(TRUTH, 0.1, 3.0, seed=3), []
+    for seed in (4, 4, 5):
+        torch.manual_seed(len(poses))
+        poses.append(found_by(method, start=start, seed=seed, **FEWEST[method]))
+    one, same, other = (found.poses.matrix() for found in poses)
+    assert torch.equal(one, same)
+    assert not torch.equal(one[-1], other[-1])
+
+
+@pytest.mark.parametrize("method", ["inerf", "inerf-lm"])
+def test_methods_of_colour_alone_use_no_depth(method: str) -> None:
+    start, wrong = perturb(TRUTH, 0.1, 3.0, seed=2), replace(FRAME, depth=torch.full((40, 48), 9.0))
+    one, other = (found_by(method, f, start, **FEWEST[method]) for f in (photograph(depth=False), wrong))
+    assert torch.equal(one.poses.matrix(), other.poses.matrix())
+    with pytest.raises(InputError, match=f"method '{method}' uses colour alone"):
+        found_by(method, start=start, lidar=depth_rays_of([View(FRAME, SE3.identity())]))
+
+
+@pytest.mark.parametrize("method", ["bid", "bid-lm"])
+def test_the_rays_of_a_lidar_stand_in_for_depth(method: str) -> None:
+    start, lidar = perturb(TRUTH, 0.15, 4.0, seed=5), depth_rays_of([View(FRAME, SE3.identity())])
+    found = found_by(method, photograph(depth=False), start, lidar=lidar)
+    assert off(found.T_world_camera) < REMAINING[method] * off(start)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_blank_image_does_not_determine_a_pose(method: str) -> None:
+    """The loss of a plain background is 0 wherever no ray meets anything."""
+    blank = Frame("blank", torch.ones((40, 48, 3)), CAMERA)
+    few = FEWEST[method]
+    assert not found_by(method, blank, perturb(TRUTH, 0.3, 5.0, seed=0), **few).converged
+    away = found_by(method, blank, TRUTH.retract(torch.tensor([0, 0, 0, 3.1, 0, 0]).double()), **few)
+    assert away.outcome is Outcome.UNDETERMINED, away.reason
+
+
+def test_second_order_steps_come_to_the_truth_in_few_steps_of_which_adam_needs_many_more() -> None:
+    start = perturb(TRUTH, 0.4, 10.0, seed=1)
+    found = found_by("bid-lm", start=start)
+    assert_near(found.T_world_camera, TRUTH, 0.03, 0.4)
+    assert found.converged, found.reason
+    assert found.steps < 20
+    adam = Localizer(scene(), "bid", {"rays": 256, "max_steps": 20}, warm_up=False)(FRAME, start)
+    assert off(found.T_world_camera) < 0.1 * off(adam.T_world_camera)
+
+
+def test_colour_alone_finds_a_place_that_is_far() -> None:
+    """A camera that was turned by 30 degrees sees next to nothing of what it saw."""
+    start = TRUTH @ SE3.exp(torch.tensor([0.1, -0.1, 0.1, 0.0, 0.5, 0.1], dtype=torch.float64))
+    more = {"poses": 96, "search_poses": 8, "middle_poses": 3}
+    found = found_by("inerf-lm", photograph(depth=False), start, **more)
+    assert off(found.T_world_camera) < 0.03
+    assert found.converged, found.reason
+
+
+def test_an_image_of_another_exposure() -> None:
+    darker, start = replace(FRAME, rgb=0.6 * FRAME.rgb + 0.15), perturb(TRUTH, 0.2, 5.0, seed=6)
+    found = found_by("bid-lm", darker, start, exposure=True)
+    assert off(found.T_world_camera) < 0.03
+    assert found.converged, found.reason
+    assert not found_by("bid-lm", darker, start).converged
+
+
+def test_a_window_about_the_measured_depth_serves_as_well() -> None:
+    found = found_by("bid-lm", start=perturb(TRUTH, 0.2, 5.0, seed=7), depth_window=0.5, window_samples=24)
+    assert off(found.T_world_camera) < 0.03
+
+
+SENSELESS = {
+    "auto": {"points": 10, "hypotheses": 0, "rounds": 1000},
+    "bid": {"stop_step": -1.0, "stop_loss": math.nan, "colour_scale": 0.0, "rays": 0},
+    "inerf": {"stop_step": math.inf, "stop_loss": -1.0, "colour_scale": 0.0, "rays": 0},
+    "bid-lm": {
+        "poses": 0, "fine_rays": 6, "coarse_steps": 0, "blur": 0, "colour_scale": 0.0, "least_weight": 1.0,
+        "surface_sigma": -1.0, "stop_step": -1e-9, "depth_scale": 0.0, "depth_window": -0.1, "centring": -1,
+        "window_samples": 0, "depth_rays": -1,
+    },
+    "inerf-lm": {
+        "poses": 0, "search_poses": 0, "middle_steps": 0, "width": 3, "spread_rotation": -1.0, "fine_rays": 6,
+        "coarse_steps": 0, "colour_scale": 0.0, "least_weight": 1.0, "surface_sigma": -1.0,
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("method", "name"), [(m, name) for m, given in SENSELESS.items() for name in given])
+def test_settings_that_make_no_sense_are_named(method: str, name: str) -> None:
+    with pytest.raises(InputError, match=f"{name}.* expected "):
+        settings_of(method, {name: SENSELESS[method][name]})

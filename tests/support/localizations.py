@@ -1,0 +1,44 @@
+"""A made-up answer of a localization, and what answers are compared by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from bidnerf_core import SE3, Frame, Localization, Outcome, View
+from bidnerf_core.results import normalized_error_squared, pose_error
+
+CHI2_99, CHI2_999 = 16.8, 22.5  # of six degrees of freedom
+
+
+def answer(T: SE3 | None = None, outcome: Outcome = Outcome.CONVERGED, **changes: Any) -> Localization:
+    """Return an answer, accepted by default."""
+    pose = SE3.identity() if T is None else T
+    fields = {
+        "reason": "as the search has it", "steps": 0, "seconds": 1.0, "loss": 0.0, "method": "auto", "poses": pose[None],
+        "losses": torch.zeros(0, dtype=torch.float64),
+    }  # fmt: skip
+    return Localization(pose, outcome, **(fields | changes))
+
+
+def assert_near(T: SE3, truth: SE3, metres: float, degrees: float) -> None:
+    error = pose_error(T, truth)
+    assert float(error.translation) < metres
+    assert float(error.rotation_deg) < degrees
+
+
+def assert_covered(T: SE3, truth: SE3, covariance: torch.Tensor | None, most: float = CHI2_99) -> None:
+    """Assert that a pose is as near the truth as its covariance says."""
+    assert covariance is not None
+    assert float(normalized_error_squared(T, truth, covariance)) < most
+
+
+def colour_only(view: View) -> View:
+    """Return a view without its depth."""
+    return View(without_depth(view.frame), view.T_ref_camera)
+
+
+def without_depth(frame: Frame) -> Frame:
+    return replace(frame, depth=None)
