@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,3 +62,10 @@ def _pose_row(frame: Recorded, turn: np.ndarray, shift: np.ndarray, after: float
     rotation = Rotation.from_matrix(T.rotation.numpy()) * Rotation.from_rotvec(turn)
     numbers = [*(T.translation.numpy() + shift), *rotation.as_quat()]
     return " ".join([f"{frame.time + after:.6f}", *(f"{number:.12f}" for number in numbers)]) + "\n"
+
+
+def edit_rows(file: Path, change: Callable[[list[str]], list[str]]) -> None:
+    """Change the rows of a list; comments before them stay."""
+    lines = file.read_text().splitlines()
+    head = [line for line in lines if line.startswith("#")]
+    file.write_text("\n".join([*head, *change([line for line in lines if not line.startswith("#")])]) + "\n")
