@@ -177,9 +177,9 @@ def write_video(file: Path, images: Sequence[np.ndarray], rate: int = 4) -> None
 # Data sets
 
 
-def write_tum(folder: Path, views: Sequence[View]) -> Path:
+def write_tum(folder: Path, views: Sequence[View], start: float = START, period: float = PERIOD) -> Path:
     """A recording of the TUM RGB-D benchmark whose folder has its camera."""
-    write_recording(folder, [Recorded(START + PERIOD * number, view) for number, view in enumerate(views)])
+    write_recording(folder, [Recorded(start + period * number, view) for number, view in enumerate(views)])
     (folder / "camera.json").write_text(json.dumps(camera_keys(views[0].frame.intrinsics)))
     return folder
 
