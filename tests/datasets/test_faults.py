@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
 import os
 import shutil
 import sys
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,18 @@ from PIL import Image
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.io import archives
-from scan_layouts import LAYOUTS, every_frame, message, opengl, packed, read_all, record3d_files, small_views
+from scan_layouts import (
+    LAYOUTS,
+    edit_frame,
+    edit_keys,
+    every_frame,
+    message,
+    opengl,
+    packed,
+    read_all,
+    record3d_files,
+    small_views,
+)
 from tum_folder import edit_rows
 
 COUNT = 6
@@ -52,24 +63,11 @@ def content(new: bytes | str) -> Edit:
 
 
 def keys(**changes: Any) -> Edit:
-    """Set keys of a JSON object; None takes them away."""
-
-    def edit(file: Path) -> None:
-        new = json.loads(file.read_text()) | changes
-        file.write_text(json.dumps({key: value for key, value in new.items() if value is not None}))
-
-    return edit
+    return partial(edit_keys, **changes)
 
 
 def frame(number: int = 1, **changes: Any) -> Edit:
-    """Set keys of a frame of ``transforms.json``; None takes them away."""
-
-    def edit(file: Path) -> None:
-        frames = json.loads(file.read_text())["frames"]
-        frames[number] = {k: v for k, v in (frames[number] | changes).items() if v is not None}
-        keys(frames=frames)(file)
-
-    return edit
+    return partial(edit_frame, number=number, **changes)
 
 
 POSE = opengl(small_views(2)[1]).tolist()

@@ -283,10 +283,8 @@ def write_euroc(folder: Path, views: Sequence[View]) -> Path:
 # What other programs write
 
 
-def write_nerfstudio(
-    folder: Path, views: Sequence[View], edit: Callable[[dict[str, Any]], object] = lambda content: None
-) -> Path:
-    """Write images, depth, and one ``transforms.json``, whose content ``edit`` may change after all images are written."""
+def write_nerfstudio(folder: Path, views: Sequence[View]) -> Path:
+    """Write images, depth, and one ``transforms.json``."""
     content: dict[str, Any] = {
         "camera_model": "OPENCV",
         **camera_keys(views[0].frame.intrinsics),
@@ -299,9 +297,21 @@ def write_nerfstudio(
             frame["depth_file_path"] = f"depth/{view.frame.name}.png"
             write_image(folder / frame["depth_file_path"], millimetres(view))
         content["frames"].append(frame)
-    edit(content)
     (folder / "transforms.json").write_text(json.dumps(content))
     return folder
+
+
+def edit_keys(file: Path, **changes: Any) -> None:
+    """Set keys of a JSON object; None takes them away."""
+    new = json.loads(file.read_text()) | changes
+    file.write_text(json.dumps({key: value for key, value in new.items() if value is not None}))
+
+
+def edit_frame(file: Path, number: int = 1, **changes: Any) -> None:
+    """Set keys of a frame of ``transforms.json``; None takes them away."""
+    frames = json.loads(file.read_text())["frames"]
+    frames[number] = {k: v for k, v in (frames[number] | changes).items() if v is not None}
+    edit_keys(file, frames=frames)
 
 
 def write_colmap(folder: Path, views: Sequence[View], binary: bool = False) -> Path:
