@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
-from bidnerf_core.depth.registration import DepthCamera, register_depth
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.geometry.se3 import SE3
 
@@ -180,17 +180,3 @@ def test_another_calibration_moves_depth_and_poses(scene: Path) -> None:
     for view, other in zip(found, stored, strict=True):
         assert torch.equal(view.T_ref_camera.matrix(), other.T_ref_camera.matrix())
         torch.testing.assert_close(view.frame.depth, other.frame.depth)
-
-
-def test_registration_hides_what_lies_behind() -> None:
-    """A near pixel moves further to the side than the far ones around it and covers one of them."""
-    camera = Intrinsics(10.0, 10.0, 4.0, 3.0, 8, 6)
-    depth = torch.full((6, 8), 10.0)
-    depth[3, 5] = 1.0
-    shift = SE3(torch.eye(3, dtype=torch.float64), torch.tensor([-0.2, 0.0, 0.0], dtype=torch.float64))
-    moved = register_depth(depth, camera, camera, shift)
-    assert float(moved[3, 3]) == pytest.approx(1.0)
-    assert torch.equal(
-        moved == 1.0, torch.zeros(6, 8).index_put((torch.tensor(3), torch.tensor(3)), torch.tensor(1.0)) > 0
-    )
-    assert torch.equal(register_depth(depth, camera, camera, SE3.identity()), depth)
