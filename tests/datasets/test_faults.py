@@ -145,7 +145,10 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         ("frame-000000.pose.txt", rows(lambda r: [*r[:3], "0 0 0 2"]), "last row"),
         ("frame-000000.depth.png", image((8, 8)), ("depth is 8x8", "aspect ratio")),
     ],
-    "reality-capture": [("cameras.csv", replaced(",f,", ",focal,"), ("no column f", "Internal/External"))],
+    "reality-capture": [
+        ("cameras.csv", replaced(",f,", ",focal,"), ("no column f", "Internal/External")),
+        ("cameras.csv", lambda file: file.write_bytes(file.read_bytes() + b"6.png,0\r7"), ("line 8", "comma-separated")),
+    ],
     "kitti": [("../../poses/07.txt", Path.unlink, "poses.txt")],
     "euroc": [("mav0/cam0/sensor.yaml", fisheye, ("equidistant", "radial-tangential"))],
     "colmap": [
