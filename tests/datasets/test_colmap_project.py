@@ -120,15 +120,7 @@ def test_the_largest_of_several_models_is_used(binary: bool, project: Path) -> N
     assert len(open_sequence(project)) == 10
 
 
-def test_missing_images_and_photos_that_are_not_registered_are_counted(project: Path) -> None:
-    (project / "images/left/2.png").rename(project / "images/left/99.png")
-    said = remarks_of(project)
-    assert any("images: 1 of 10 images is missing and left out, first: left/2.png" in text for text in said)
-    assert any(
-        "1 of 10 photos are not registered in the model and are left out, first: left/99.png" in text
-        for text in said
-    )
-    assert len(said) == 2
+def test_a_project_without_images_is_refused(project: Path) -> None:
     shutil.rmtree(project / "images")
     with pytest.raises(InputError, match=r"images/.*/\d+\.png: no such file, although .* lists that image"):
         open_dataset(project)

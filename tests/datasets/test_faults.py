@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.io import archives
 from scan_layouts import (
@@ -239,6 +239,8 @@ def test_a_fault_is_named_in_one_line(case: str, sound: dict[str, tuple[Path, Pa
     for read in (read_all,) if said in NEEDED_BY_DATASETS else (read_all, every_frame):
         text = message(copied, read, **LAYOUTS[kind].options)
         assert all(part in text for part in ((said,) if isinstance(said, str) else said)), text
+    if said in NEEDED_BY_DATASETS:
+        assert all(timed.truth is None for timed in open_sequence(copied))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -21,18 +22,20 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.testing.textured_field import training_views
 from scan_layouts import (
+    LAYOUTS,
+    edit_keys,
     metres,
     packed,
+    read_all,
     record3d_files,
     remarks_of,
-    write_euroc,
-    write_kitti,
+    small_views,
     write_polycam,
-    write_reality_capture,
     write_stray_scanner,
     write_twelve_scenes,
     write_video,
 )
+from tum_folder import edit_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::bidnerf_core.errors.InputWarning")
 
@@ -40,6 +43,76 @@ pytestmark = pytest.mark.filterwarnings("ignore::bidnerf_core.errors.InputWarnin
 @pytest.fixture(scope="module")
 def views() -> list[View]:
     return list(training_views())[:4]
+
+
+def unlinked(*names: str) -> Callable[[Path], None]:
+    return lambda root: [next(root.rglob(name)).unlink() for name in names] and None
+
+
+def lost_pose(root: Path) -> None:
+    poses = json.loads((root / "metadata").read_text())["poses"]
+    poses[3] = [float("nan")] * 7
+    edit_keys(root / "metadata", poses=poses)
+    unlinked("rgbd/1.jpg", "rgbd/2.depth")(root)
+
+
+def lost_tracking(root: Path) -> None:
+    (root / "data/frame-000002.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
+
+
+def zero_pose(root: Path) -> None:
+    edit_rows(
+        root / "groundtruth.txt",
+        lambda r: [r[0].replace(" ", " nan ", 1), f"{r[1].split()[0]} 1 2 3 0 0 0 0", *r[2:]],
+    )
+
+
+INCOMPLETE: dict[str, tuple[Callable[[Path], None], int, list[int], list[int], list[str]]] = {
+    # What happens to six frames; how many a sequence has then, which of them have no pose and no depth; the remarks.
+    "record3d, unpacked": (lost_pose, 4, [], [1], [
+        "1 of 6 images is missing and left out, first: rgbd/1.jpg", "1 of 5 frames have no depth",
+        "1 of 5 frames have no pose and are left out",
+    ]),
+    "polycam": (
+        unlinked("corrected_cameras/1000250000.json", "depth/1000500000.png", "corrected_images/1000750000.jpg"), 4, [], [1], [
+        "1 of 5 photos is missing and left out", "1 of 5 photos have no camera in corrected_cameras",
+        "1 of 4 photos have no depth",
+    ]),
+    "polycam, not corrected": (unlinked(), 6, [], [], ["no corrected_cameras, so the poses are ARKit's, which drift"]),
+    "tum": (zero_pose, 6, [0], [], [
+        "2 poses of 12 not finite or zero, left out (first: line 4)", "1 of 6 images have no pose",
+    ]),
+    "seven-scenes": (unlinked("frame-000001.pose.txt", "frame-000002.depth.png"), 6, [1], [2], [
+        "1 of 6 poses is missing and left out, first: frame-000001.pose.txt",
+    ]),
+    "twelve-scenes": (lost_tracking, 6, [2], [], ["1 of 6 images have no pose and are left out"]),
+    "reality-capture": (unlinked("2.png"), 5, [], [*range(5)], [
+        "cameras.csv: 1 of 6 photos is missing and left out, first: 2.png",
+    ]),
+    "kitti": (unlinked("image_2/000001.png"), 5, [], [*range(5)], ["1 of 6 images are missing, first: number 1"]),
+    "euroc": (unlinked("cam0/data/*.png"), 5, [], [*range(5)], ["1 of 6 images is missing and left out"]),
+    "colmap": (lambda root: (root / "images/r_2.png").rename(root / "images/r_9.png") and None, 5, [], [*range(5)], [
+        "images: 1 of 6 images is missing and left out, first: r_2.png",
+        "1 of 6 photos are not registered in the model and are left out, first: r_9.png",
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", INCOMPLETE)
+def test_what_is_missing_is_left_out_and_counted(kind: str, tmp_path: Path) -> None:
+    edit, count, without_pose, without_depth, expected = INCOMPLETE[kind]
+    folder, options = LAYOUTS[kind].write(tmp_path, small_views(6)), LAYOUTS[kind].options
+    edit(tmp_path)
+    said = remarks_of(folder, **options)
+    assert len(said) == len(expected)
+    for remark in expected:
+        assert sum(remark in text for text in said) == 1, said
+    frames = list(open_sequence(folder, **options))
+    assert len(frames) == count
+    assert [n for n, timed in enumerate(frames) if timed.truth is None] == without_pose
+    assert [n for n, timed in enumerate(frames) if timed.frame.depth is None] == without_depth
+    posed = sorted(timed.frame.name for timed in frames if timed.truth is not None)
+    assert sorted(read_all(folder, **options)) == posed
 
 
 # Record3D
@@ -77,19 +150,6 @@ def test_intrinsics_of_the_first_frame_hold_for_all_where_there_are_no_others(
         )
 
 
-def test_a_recording_that_lacks_frames(views: list[View], tmp_path: Path) -> None:
-    files = record3d_files(views)
-    poses = json.loads(files["metadata"])["poses"]
-    poses[3] = [float("nan")] * 7
-    files = metadata(files, poses=poses)
-    del files["rgbd/1.jpg"], files["rgbd/2.depth"]
-    said = remarks_of(packed(tmp_path, files))
-    assert any("1 of 4 images is missing and left out, first: rgbd/1.jpg" in text for text in said)
-    assert any("1 of 3 frames have no depth" in text for text in said)
-    assert any("1 of 3 frames have no pose and are left out" in text for text in said)
-    assert len(said) == 3
-
-
 def test_confidence_that_removes_all_depth_is_said_once_with_its_values(
     views: list[View], tmp_path: Path
 ) -> None:
@@ -120,27 +180,13 @@ def test_undistorted_photos_hide_their_border(views: list[View], tmp_path: Path)
             assert int((~hidden).sum()) == (hidden.shape[0] - 30) * (hidden.shape[1] - 30)
 
 
-def test_cameras_without_a_size_and_photos_without_a_camera(views: list[View], tmp_path: Path) -> None:
+def test_cameras_without_a_size(views: list[View], tmp_path: Path) -> None:
     folder = write_polycam(tmp_path, views)
-    cameras = sorted((folder / "keyframes/corrected_cameras").iterdir())
-    for file in cameras:
+    for file in (folder / "keyframes/corrected_cameras").iterdir():
         content = json.loads(file.read_text())
         del content["width"], content["height"]
         file.write_text(json.dumps(content))
     assert open_dataset(folder).views("test")[0].frame.intrinsics == views[0].frame.intrinsics
-    cameras[1].unlink()
-    (folder / "keyframes/depth" / f"{cameras[2].stem}.png").unlink()
-    (folder / "keyframes/corrected_images" / f"{cameras[3].stem}.jpg").unlink()
-    said = remarks_of(folder)
-    assert any("1 of 3 photos is missing and left out" in text for text in said)
-    assert any("1 of 3 photos have no camera in corrected_cameras" in text for text in said)
-    assert any("1 of 2 photos have no depth" in text for text in said)
-    assert len(said) == 3
-
-
-def test_poses_that_drift_are_said_to(views: list[View], tmp_path: Path) -> None:
-    (said,) = remarks_of(write_polycam(tmp_path, views, corrected=False))
-    assert "has no corrected_cameras, so the poses are ARKit's, which drift" in said
 
 
 # Stray Scanner
@@ -203,15 +249,6 @@ def test_five_frames_a_second_are_kept() -> None:
 # Data sets
 
 
-def test_frames_of_twelve_scenes_whose_tracking_failed(views: list[View], tmp_path: Path) -> None:
-    folder = write_twelve_scenes(tmp_path, views)
-    (folder / "data/frame-000002.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
-    assert any("1 of 4 images have no pose and are left out" in text for text in remarks_of(folder))
-    assert open_dataset(folder).frame_names("test") == ["frame-000000", "frame-000001"]
-    assert [timed.truth is None for timed in open_sequence(folder)] == [False, False, True, False]
-    assert len(open_sequence(folder / "data")) == 4
-
-
 def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path) -> None:
     """The depth camera sees twice as much: what it sees in the middle is what the photo shows."""
     folder = write_twelve_scenes(tmp_path, views)
@@ -222,21 +259,3 @@ def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path
     depth = open_dataset(folder).views("test", ["frame-000000"])[0].frame.depth
     assert depth is not None
     assert depth.unique().tolist() == pytest.approx([1.5])
-
-
-def test_lists_of_photos_that_are_not_there(views: list[View], tmp_path: Path) -> None:
-    folder = write_reality_capture(tmp_path, views)
-    (folder / "2.png").unlink()
-    (said,) = remarks_of(folder)
-    assert "cameras.csv: 1 of 4 photos is missing and left out, first: 2.png" in said
-
-
-def test_sequences_without_poses_and_with_missing_images(views: list[View], tmp_path: Path) -> None:
-    folder = write_kitti(tmp_path / "kitti", views)
-    (folder / "image_2/000001.png").unlink()
-    assert any("1 of 4 images are missing, first: number 1" in text for text in remarks_of(folder))
-    (tmp_path / "kitti/poses/07.txt").unlink()
-    assert [timed.truth for timed in open_sequence(folder)] == [None] * 3
-    folder = write_euroc(tmp_path / "euroc", views)
-    next(iter(sorted((folder / "mav0/cam0/data").iterdir()))).unlink()
-    assert any("1 of 4 images is missing and left out" in text for text in remarks_of(folder))
