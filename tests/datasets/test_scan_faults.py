@@ -45,8 +45,8 @@ def views() -> list[View]:
     return list(training_views())[:4]
 
 
-def unlinked(*names: str) -> Callable[[Path], None]:
-    return lambda root: [next(root.rglob(name)).unlink() for name in names] and None
+def unlinked(*names: str) -> Callable[[Path], object]:
+    return lambda root: [next(root.rglob(name)).unlink() for name in names]
 
 
 def lost_pose(root: Path) -> None:
@@ -67,7 +67,7 @@ def zero_pose(root: Path) -> None:
     )
 
 
-INCOMPLETE: dict[str, tuple[Callable[[Path], None], int, list[int], list[int], list[str]]] = {
+INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int], list[str]]] = {
     # What happens to six frames; how many a sequence has then, which of them have no pose and no depth; the remarks.
     "record3d, unpacked": (lost_pose, 4, [], [1], [
         "1 of 6 images is missing and left out, first: rgbd/1.jpg", "1 of 5 frames have no depth",
@@ -91,7 +91,7 @@ INCOMPLETE: dict[str, tuple[Callable[[Path], None], int, list[int], list[int], l
     ]),
     "kitti": (unlinked("image_2/000001.png"), 5, [], [*range(5)], ["1 of 6 images are missing, first: number 1"]),
     "euroc": (unlinked("cam0/data/*.png"), 5, [], [*range(5)], ["1 of 6 images is missing and left out"]),
-    "colmap": (lambda root: (root / "images/r_2.png").rename(root / "images/r_9.png") and None, 5, [], [*range(5)], [
+    "colmap": (lambda root: (root / "images/r_2.png").rename(root / "images/r_9.png"), 5, [], [*range(5)], [
         "images: 1 of 6 images is missing and left out, first: r_2.png",
         "1 of 6 photos are not registered in the model and are left out, first: r_9.png",
     ]),
