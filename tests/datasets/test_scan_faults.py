@@ -259,3 +259,9 @@ def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path
     depth = open_dataset(folder).views("test", ["frame-000000"])[0].frame.depth
     assert depth is not None
     assert depth.unique().tolist() == pytest.approx([1.5])
+
+
+def test_the_frames_of_twelve_scenes_are_a_sequence_without_their_parent(tmp_path: Path) -> None:
+    folder = write_twelve_scenes(tmp_path, small_views(4))
+    assert len(open_sequence(folder / "data")) == 4
+    assert open_dataset(folder).frame_names("test") == ["frame-000000", "frame-000001"]
