@@ -104,7 +104,10 @@ def _photos(path: Path, file: Path) -> list[_Photo]:
     for row in rows:
         if not row.text:
             continue
-        (words,) = csv.reader([row.text])
+        try:
+            (words,) = csv.reader([row.text])
+        except csv.Error as error:  # such as a carriage return inside a field
+            raise row.error(f" is no row of comma-separated values ({error})") from error
         if len(words) < len(names):
             raise row.error(f" has {len(words)} of {len(names)} entries")
         values = dict(zip(names, words, strict=False))

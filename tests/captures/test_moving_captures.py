@@ -47,31 +47,24 @@ from bidnerf_core.mapping import (
 )
 from bidnerf_core.testing import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.training import RayBank
+from inaccurate_captures import VIEWS, capture, refined, turned, updates
 from landmark_scene import PINHOLE, Points, looking_in
 
-VIEWS, NOISE = 16, 0.3
+NOISE = 0.3
 METRES, RADIANS = 0.01, 0.008  # what a hand does in a few hundredths of a second: about three pixels
 
 
 def motions(scale: float) -> Tensor:
-    size = scale * torch.tensor([METRES] * 3 + [RADIANS] * 3, dtype=torch.float64)
-    return size * torch.randn(VIEWS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    return updates(scale * METRES, scale * RADIANS, seed=4)
 
 
-def capture(moved: Tensor, pose_error: float = 0.0) -> tuple[Points, list[View], SE3]:
+def moving(moved: Tensor, pose_error: float = 0.0) -> tuple[Points, list[View], SE3]:
     """Views of a ring of cameras that moved, with errors of the given poses (metres, and as many radians), and the true ones."""
-    points = Points(noise=NOISE)
-    poses = SE3.stack([looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(VIEWS)])
-    generator = torch.Generator().manual_seed(3)
-    given = poses.retract(pose_error * torch.randn(VIEWS, 6, dtype=torch.float64, generator=generator))
-    views = [points.view(poses[i], T_ref_camera=given[i], seed=i, motion=moved[i]) for i in range(VIEWS)]
-    named = [replace(v, frame=replace(v.frame, name=f"{i}")) for i, v in enumerate(views)]
-    return points, named, poses
+    return capture(NOISE, updates(pose_error, pose_error, seed=3), moved)
 
 
-def refined(moved: Tensor, pose_error: float = 0.004) -> tuple[TrainingPoses, list[View], SE3]:
-    points, views, true = capture(moved, pose_error)
-    return training_poses(tracked_views(views, points), views), views, true
+def corrected(moved: Tensor, pose_error: float = 0.004) -> tuple[TrainingPoses, list[View], SE3]:
+    return refined(NOISE, updates(pose_error, pose_error, seed=3), moved)
 
 
 def evidence_prior(tracked: TrackedViews) -> object:
@@ -83,32 +76,26 @@ def last_row(T: SE3, motion: Tensor) -> Tensor:
     return PINHOLE.project((T @ SE3.exp(0.5 * motion))[:, None].inverse().apply(Points().positions))
 
 
-def turned(T: SE3, true: SE3) -> Tensor:
-    """The error (radians) of each rotation relative to the one before, which no common rotation changes."""
-    steps = [x[:-1].inverse() @ x[1:] for x in (T, true)]
-    return (steps[1].inverse() @ steps[0]).log()[:, 3:].norm(dim=-1)
-
-
 def test_cameras_that_moved_are_told_from_those_at_rest() -> None:
     for scale, expected in ((0.0, True), (1.0, False)):
-        points, views, _ = capture(motions(scale))
+        points, views, _ = moving(motions(scale))
         assert (evidence_prior(tracked_views(views, points)) == STILL) == expected
 
 
 def test_one_image_is_no_evidence_against_all_others() -> None:
     moved = torch.zeros(VIEWS, 6, dtype=torch.float64)
     moved[5] = 3 * motions(1.0)[5]
-    points, views, _ = capture(moved)
+    points, views, _ = moving(moved)
     assert evidence_prior(tracked_views(views, points)) == STILL
 
 
 def test_few_images_are_no_evidence() -> None:
-    points, views, _ = capture(motions(1.0))
+    points, views, _ = moving(motions(1.0))
     assert evidence_prior(tracked_views(views[:5], points)) == STILL
 
 
 def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
-    found, views, poses = refined(motions(1.0))
+    found, views, poses = corrected(motions(1.0))
     assert found.refined
     assert found.consistency is not None
     assert found.consistency.noise_after == pytest.approx(NOISE, rel=0.15)
@@ -122,7 +109,7 @@ def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
 
 def test_motions_are_noticed_though_the_poses_are_right() -> None:
     """Structure from motion gives such poses for the frames of a video; the keypoints alone contradict a camera at rest."""
-    found, _, _ = refined(motions(1.0), pose_error=0.0)
+    found, _, _ = corrected(motions(1.0), pose_error=0.0)
     assert found.refined
     assert bool((found.tracked.motion != 0).any())
 
@@ -133,7 +120,7 @@ def test_motions_are_noticed_though_the_poses_are_right() -> None:
     "wrong", [{"fy": 1.05 * PINHOLE.fy}, {"cx": PINHOLE.cx + 10}, {"distortion": (0.2, 0, 0, 0)}]
 )
 def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float) -> None:
-    points, views, _ = capture(motions(0.0), pose_error)
+    points, views, _ = moving(motions(0.0), pose_error)
     camera = replace(PINHOLE, **wrong)
     views = [replace(view, frame=replace(view.frame, intrinsics=camera)) for view in views]
     found = training_poses(tracked_views(views, points), views)
@@ -142,7 +129,7 @@ def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float
 
 @pytest.mark.slow
 def test_cameras_at_rest_get_no_motion() -> None:
-    found, _, _ = refined(motions(0.0))
+    found, _, _ = corrected(motions(0.0))
     assert found.refined
     assert bool((found.tracked.motion == 0).all())
 
@@ -150,7 +137,7 @@ def test_cameras_at_rest_get_no_motion() -> None:
 def test_known_motions_leave_only_the_noise_of_keypoints() -> None:
     """What is built from the same tracks, landmarks and the scatter of poses, takes the motions into account."""
     moved = motions(1.0)
-    points, views, true = capture(moved)
+    points, views, true = moving(moved)
     tracked = tracked_views(views, points)
     known = tracked.at(true, moved)
     seen, positions = known.triangulated(LandmarkConfig())
@@ -164,14 +151,14 @@ def test_known_motions_leave_only_the_noise_of_keypoints() -> None:
 
 
 def test_views_with_a_motion_are_tracked_with_it() -> None:
-    points, views, _ = capture(motions(1.0))
-    moving = [replace(view, motion=motion) for view, motion in zip(views, motions(1.0), strict=True)]
-    assert torch.equal(tracked_views(moving, points).motion, motions(1.0))
+    points, views, _ = moving(motions(1.0))
+    known = [replace(view, motion=motion) for view, motion in zip(views, motions(1.0), strict=True)]
+    assert torch.equal(tracked_views(known, points).motion, motions(1.0))
 
 
 @pytest.mark.slow
 def test_the_motion_is_stored_with_the_pose() -> None:
-    found, views, _ = refined(motions(1.0))
+    found, views, _ = corrected(motions(1.0))
     poses, moved = found.tracked.T_world_camera, found.tracked.motion
     trained = [replace(v, T_ref_camera=poses[i], motion=moved[i]) for i, v in enumerate(views)]
     cameras = moved_from(views, stored_cameras(trained), found.pixels.tolist())
@@ -191,16 +178,16 @@ def test_the_motion_is_stored_with_the_pose() -> None:
 
 @pytest.mark.slow
 def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
-    points, views, _ = capture(motions(1.0), 0.004)
+    points, views, _ = moving(motions(1.0), 0.004)
     monkeypatch.setattr(
         training_views,
         "tracked_views",
         lambda given, features, progress: tracked_views(given, points, progress=progress),
     )
     found = training_views.prepared(views)
-    moving = [view.motion is not None and bool(view.motion.any()) for view in found.views]
-    assert sum(moving) >= VIEWS - 1  # an image whose keypoints are all left out keeps its pose
-    assert [camera.motion is not None and any(camera.motion) for camera in found.cameras] == moving
+    moved = [view.motion is not None and bool(view.motion.any()) for view in found.views]
+    assert sum(moved) >= VIEWS - 1  # an image whose keypoints are all left out keeps its pose
+    assert [camera.motion is not None and any(camera.motion) for camera in found.cameras] == moved
     assert stored_cameras(views) != found.cameras
 
 
@@ -259,7 +246,7 @@ def test_a_trial_finds_the_motions_that_the_map_knows() -> None:
 def test_landmarks_tell_how_many_of_their_images_moved() -> None:
     moved = motions(1.0)
     moved[:4] = 0
-    points, views, true = capture(moved)
+    points, views, true = moving(moved)
     landmarks = tracked_views(views, points).at(true, moved).landmarks(LandmarkConfig())
     assert landmarks.moving == 0.75
     assert landmarks_from_tensors(landmark_tensors(landmarks)).moving == 0.75
@@ -272,7 +259,7 @@ def test_landmarks_tell_how_many_of_their_images_moved() -> None:
 
 def test_weaker_motions_are_believed_where_the_map_moved() -> None:
     """Images whose motion is about as probable as none are judged by either prior probability."""
-    points, views, true = capture(motions(0.35))
+    points, views, true = moving(motions(0.35))
     seen, positions = tracked_views(views, points).at(true).triangulated(LandmarkConfig())
     taken, sure = {SHARE_MOVING: 0, 0.8: 0}, torch.full((4,), 1e-4, dtype=torch.float64)
     for number in range(VIEWS):
@@ -289,7 +276,7 @@ def test_weaker_motions_are_believed_where_the_map_moved() -> None:
 
 def test_slow_motions_are_taken_from_queries_of_a_moving_map() -> None:
     moved = motions(0.2)
-    points, views, true = capture(moved)
+    points, views, true = moving(moved)
     landmarks = tracked_views(views, points).at(true, moved).landmarks(LandmarkConfig())
     sure = torch.full((4,), 1e-4, dtype=torch.float64)
     landmarks = replace(landmarks, correlation=1.0, calibration_scatter=sure)

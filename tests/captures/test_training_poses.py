@@ -24,32 +24,18 @@ from bidnerf_core.captures.pose_refinement import adjusted_poses
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.mapping import LandmarkConfig, Sift, tracked_views
+from inaccurate_captures import VIEWS, refined, turned, updates
 from landmark_scene import Points, looking_in, ring
 
-VIEWS, WRONG = 16, 7
+WRONG = 7
 METRES, RADIANS = 0.01, 0.004  # together about two pixels
 
 
+NOTHING = torch.zeros(VIEWS, 6, dtype=torch.float64)
+
+
 def errors(scale: float = 1.0) -> Tensor:
-    size = scale * torch.tensor([METRES] * 3 + [RADIANS] * 3, dtype=torch.float64)
-    return size * torch.randn(VIEWS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-
-
-def capture(noise: float, updates: Tensor) -> tuple[Points, list[View], SE3]:
-    """Views whose given poses are off by right updates, and the true poses."""
-    points = Points(noise=noise)
-    true = ring(points, VIEWS)
-    poses = SE3.stack([view.T_ref_camera for view in true])
-    given = poses.retract(updates)
-    named = [
-        replace(v, frame=replace(v.frame, name=f"{i}"), T_ref_camera=given[i]) for i, v in enumerate(true)
-    ]
-    return points, named, poses
-
-
-def refined(noise: float, updates: Tensor, least: float = 0.25) -> tuple[TrainingPoses, list[View], SE3]:
-    points, views, poses = capture(noise, updates)
-    return training_poses(tracked_views(views, points), views, least), views, poses
+    return updates(scale * METRES, scale * RADIANS, seed=3)
 
 
 @functools.cache
@@ -57,14 +43,8 @@ def inaccurate() -> tuple[TrainingPoses, list[View], SE3]:
     return refined(0.4, errors())
 
 
-def off(found: SE3, true: SE3) -> Tensor:
-    """The rotation (radians) of each pose relative to the one before, which no common motion changes."""
-    steps = [T[:-1].inverse() @ T[1:] for T in (found, true)]
-    return (steps[1].inverse() @ steps[0]).log()[:, 3:].norm(dim=-1)
-
-
 def test_exact_poses_do_not_move_at_all() -> None:
-    found, views, _ = refined(0.0, torch.zeros(VIEWS, 6, dtype=torch.float64), least=0.0)
+    found, views, _ = refined(0.0, NOTHING, least=0.0)
     moved = torch.cat(
         [(found.tracked.T_world_camera[i].inverse() @ v.T_ref_camera).log() for i, v in enumerate(views)]
     )
@@ -74,7 +54,7 @@ def test_exact_poses_do_not_move_at_all() -> None:
 
 
 def test_poses_that_fit_are_kept() -> None:
-    found, views, _ = refined(0.4, torch.zeros(VIEWS, 6, dtype=torch.float64))
+    found, views, _ = refined(0.4, NOTHING)
     assert not found.refined
     assert found.replaced == []
     for i, view in enumerate(views):
@@ -90,7 +70,9 @@ def test_known_errors_are_taken_back() -> None:
     assert found.consistency is not None
     assert found.consistency.inconsistency > 0.5
     assert found.consistency.noise_after == pytest.approx(0.4, rel=0.2)
-    assert float(off(found.tracked.T_world_camera, true).median()) < 0.4 * float(off(given, true).median())
+    assert float(turned(found.tracked.T_world_camera, true).median()) < 0.4 * float(
+        turned(given, true).median()
+    )
     assert 0.5 < float(found.pixels.median()) < 4
     motion = found.tracked.T_world_camera.translation - given.translation
     assert float(motion.mean(0).norm()) < 0.2 * float(motion.norm(dim=-1).median())
@@ -103,9 +85,9 @@ def test_half_of_the_error_is_half_of_the_motion() -> None:
 
 @pytest.mark.parametrize("turn", [0.2, torch.pi])
 def test_a_wrong_pose_is_put_right_and_the_others_are_kept(turn: float) -> None:
-    updates = torch.zeros(VIEWS, 6, dtype=torch.float64)
-    updates[WRONG] = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.0, turn], dtype=torch.float64)
-    found, _, true = refined(0.4, updates)
+    off = NOTHING.clone()
+    off[WRONG] = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.0, turn], dtype=torch.float64)
+    found, _, true = refined(0.4, off)
     assert found.replaced == [WRONG]
     assert not found.refined
     again = found.tracked.matched_anew(LandmarkConfig())  # as a resumed training matches them
@@ -121,9 +103,9 @@ def test_a_wrong_pose_is_put_right_and_the_others_are_kept(turn: float) -> None:
 
 
 def test_a_wrong_pose_among_inaccurate_ones() -> None:
-    updates = errors(0.5)
-    updates[WRONG] = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.2, 0.0], dtype=torch.float64)
-    found, _, true = refined(0.4, updates)
+    off = errors(0.5)
+    off[WRONG] = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.2, 0.0], dtype=torch.float64)
+    found, _, true = refined(0.4, off)
     assert found.replaced == [WRONG]
     assert found.refined
     assert float((true[WRONG].inverse() @ found.tracked.T_world_camera[WRONG]).log()[:3].norm()) < 0.04

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +28,6 @@ from problems import FieldMap, localize
 from sparse_model import Known
 
 CHOICE = SparseChoice()
-Edit = Callable[[Path], object]
 
 
 @pytest.fixture(scope="module")
@@ -97,45 +94,24 @@ def test_an_image_that_observes_nothing_and_names_with_blanks(tmp_path: Path) ->
     assert len(points.ids) == 0
 
 
-@pytest.mark.parametrize("binary", [False, True])
-def test_a_file_that_is_cut_or_changed_never_ends_otherwise_than_in_a_line(
-    binary: bool, model: Path, tmp_path: Path, scene: Known
-) -> None:
-    if binary:
-        pycolmap = pytest.importorskip("pycolmap")
-        theirs = pycolmap.Reconstruction(str(model))
-        shutil.rmtree(model)
-        model.mkdir()
-        theirs.write_binary(str(model))
-    chance = np.random.default_rng(0)
-    refused = 0
-    for name in ("images", "points3D"):
-        file = model / f"{name}{'.bin' if binary else '.txt'}"
+def test_every_truncation_of_a_binary_model_is_refused(model: Path) -> None:
+    pytest.importorskip("pycolmap")
+    sparse_model.to_binary(model)
+    for name in ("images.bin", "points3D.bin"):
+        file = model / name
         whole = file.read_bytes()
-        for number in range(60):
-            broken = bytearray(whole)
-            if number % 2:
-                broken = broken[: chance.integers(len(whole))]
-            else:
-                for place in chance.integers(len(whole), size=3):
-                    broken[place] = chance.integers(256)
-            file.write_bytes(broken)
-            try:
-                opened(model, scene).onto(bare(scene.views[0]), "train")
-            except InputError as error:
-                refused += str(model) in str(error) and "\n" not in str(error)
-            if binary and number % 2:
-                with pytest.raises(InputError, match=r"ends too early|declares"):
-                    read_model(model)
+        for length in {*range(24), *range(0, len(whole), 53), len(whole) - 1}:
+            file.write_bytes(whole[:length])
+            with pytest.raises(InputError, match=f"{name}.*(ends too early|declares)"):
+                read_model(model)
         file.write_bytes(whole)
-    assert refused > 60
 
 
 @pytest.mark.parametrize(
     ("file", "text", "said"),
     [
         ("images.txt", "1 1 0 0 0 0 0 0 1\n\n", "line 1 has 9 entries"),
-        ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", "line 1: could not convert"),
+        ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", "line 1: .*'x'"),
         ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n", "invalid pose"),
         ("images.txt", "1 nan 0 0 0 0 0 0 1 a.png\n\n", "is not finite"),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "line 2 has 2 entries"),

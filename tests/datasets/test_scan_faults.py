@@ -1,11 +1,9 @@
-"""Scans that are cut off, incomplete, too large or of many frames, and what is said of them."""
+"""Scans and data sets that are incomplete or state less than usual: what is read of them, and the remarks that say so."""
 
 from __future__ import annotations
 
 import json
-import sys
 import warnings
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,21 +20,24 @@ from bidnerf_core.datasets.posed_images import ImageFrame
 from bidnerf_core.datasets.video_frames import VideoFrames
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
-from bidnerf_core.io import archives
 from bidnerf_core.testing import training_views
 from scan_layouts import (
+    LAYOUTS,
+    edit_keys,
     metres,
+    packed,
+    read_all,
     record3d_files,
-    write_euroc,
-    write_kitti,
+    remarks_of,
+    small_views,
     write_polycam,
-    write_reality_capture,
     write_stray_scanner,
     write_twelve_scenes,
     write_video,
 )
+from tum_folder import edit_rows
 
-Files = dict[str, bytes]
+pytestmark = pytest.mark.filterwarnings("ignore::bidnerf_core.errors.InputWarning")
 
 
 @pytest.fixture(scope="module")
@@ -44,38 +45,81 @@ def views() -> list[View]:
     return list(training_views())[:4]
 
 
-def remarks_of(path: Path) -> list[str]:
-    """Return the remarks that opening and reading a capture causes."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        dataset = open_dataset(path)
-        for split in dataset.splits:
-            dataset.views(split)
-    return [str(warning.message) for warning in caught]
+def unlinked(*names: str) -> Callable[[Path], object]:
+    return lambda root: [next(root.rglob(name)).unlink() for name in names]
 
 
-def message(path: Path) -> str:
-    """Return the one line that is said of a capture that cannot be read."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(InputError) as caught:
-            list(open_sequence(path))
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+def lost_pose(root: Path) -> None:
+    poses = json.loads((root / "metadata").read_text())["poses"]
+    poses[3] = [float("nan")] * 7
+    edit_keys(root / "metadata", poses=poses)
+    unlinked("rgbd/1.jpg", "rgbd/2.depth")(root)
 
 
-def packed(folder: Path, files: Files, compression: int = zipfile.ZIP_STORED) -> Path:
-    with zipfile.ZipFile(folder / "scan.r3d", "w", compression) as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
-    return folder / "scan.r3d"
+def lost_tracking(root: Path) -> None:
+    (root / "data/frame-000002.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
 
 
-def metadata(files: Files, **changes: object) -> Files:
-    return {**files, "metadata": json.dumps({**json.loads(files["metadata"]), **changes}).encode()}
+def zero_pose(root: Path) -> None:
+    edit_rows(
+        root / "groundtruth.txt",
+        lambda r: [r[0].replace(" ", " nan ", 1), f"{r[1].split()[0]} 1 2 3 0 0 0 0", *r[2:]],
+    )
+
+
+INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int], list[str]]] = {
+    # What happens to six frames; how many a sequence has then, which of them have no pose and no depth; the remarks.
+    "record3d, unpacked": (lost_pose, 4, [], [1], [
+        "1 of 6 images is missing and left out, first: rgbd/1.jpg", "1 of 5 frames have no depth",
+        "1 of 5 frames have no pose and are left out",
+    ]),
+    "polycam": (
+        unlinked("corrected_cameras/1000250000.json", "depth/1000500000.png", "corrected_images/1000750000.jpg"), 4, [], [1], [
+        "1 of 5 photos is missing and left out", "1 of 5 photos have no camera in corrected_cameras",
+        "1 of 4 photos have no depth",
+    ]),
+    "polycam, not corrected": (unlinked(), 6, [], [], ["no corrected_cameras, so the poses are ARKit's, which drift"]),
+    "tum": (zero_pose, 6, [0], [], [
+        "2 poses of 12 not finite or zero, left out (first: line 4)", "1 of 6 images have no pose",
+    ]),
+    "seven-scenes": (unlinked("frame-000001.pose.txt", "frame-000002.depth.png"), 6, [1], [2], [
+        "1 of 6 poses is missing and left out, first: frame-000001.pose.txt",
+    ]),
+    "twelve-scenes": (lost_tracking, 6, [2], [], ["1 of 6 images have no pose and are left out"]),
+    "reality-capture": (unlinked("2.png"), 5, [], [*range(5)], [
+        "cameras.csv: 1 of 6 photos is missing and left out, first: 2.png",
+    ]),
+    "kitti": (unlinked("image_2/000001.png"), 5, [], [*range(5)], ["1 of 6 images are missing, first: number 1"]),
+    "euroc": (unlinked("cam0/data/*.png"), 5, [], [*range(5)], ["1 of 6 images is missing and left out"]),
+    "colmap": (lambda root: (root / "images/r_2.png").rename(root / "images/r_9.png"), 5, [], [*range(5)], [
+        "images: 1 of 6 images is missing and left out, first: r_2.png",
+        "1 of 6 photos are not registered in the model and are left out, first: r_9.png",
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", INCOMPLETE)
+def test_what_is_missing_is_left_out_and_counted(kind: str, tmp_path: Path) -> None:
+    edit, count, without_pose, without_depth, expected = INCOMPLETE[kind]
+    folder, options = LAYOUTS[kind].write(tmp_path, small_views(6)), LAYOUTS[kind].options
+    edit(tmp_path)
+    said = remarks_of(folder, **options)
+    assert len(said) == len(expected)
+    for remark in expected:
+        assert sum(remark in text for text in said) == 1, said
+    frames = list(open_sequence(folder, **options))
+    assert len(frames) == count
+    assert [n for n, timed in enumerate(frames) if timed.truth is None] == without_pose
+    assert [n for n, timed in enumerate(frames) if timed.frame.depth is None] == without_depth
+    posed = sorted(timed.frame.name for timed in frames if timed.truth is not None)
+    assert sorted(read_all(folder, **options)) == posed
 
 
 # Record3D
+
+
+def metadata(files: dict[str, bytes], **changes: object) -> dict[str, bytes]:
+    return {**files, "metadata": json.dumps({**json.loads(files["metadata"]), **changes}).encode()}
 
 
 def test_depth_of_low_confidence_far_away_and_not_finite_is_dropped(
@@ -106,19 +150,6 @@ def test_intrinsics_of_the_first_frame_hold_for_all_where_there_are_no_others(
         )
 
 
-def test_a_recording_that_lacks_frames(views: list[View], tmp_path: Path) -> None:
-    files = record3d_files(views)
-    poses = json.loads(files["metadata"])["poses"]
-    poses[3] = [float("nan")] * 7
-    files = metadata(files, poses=poses)
-    del files["rgbd/1.jpg"], files["rgbd/2.depth"]
-    said = remarks_of(packed(tmp_path, files))
-    assert any("1 of 4 images is missing and left out, first: rgbd/1.jpg" in text for text in said)
-    assert any("1 of 3 frames have no depth" in text for text in said)
-    assert any("1 of 3 frames have no pose and are left out" in text for text in said)
-    assert len(said) == 3
-
-
 def test_confidence_that_removes_all_depth_is_said_once_with_its_values(
     views: list[View], tmp_path: Path
 ) -> None:
@@ -136,118 +167,26 @@ def test_confidence_that_removes_all_depth_is_said_once_with_its_values(
     assert "rgbd/1.conf: has the values 0 and 1, expected 2 where depth is sure" in said_of_one
 
 
-def without_poses(files: Files) -> Files:
-    return metadata(files, poses=[])
-
-
-def without_photos(files: Files) -> Files:
-    return {name: content for name, content in files.items() if not name.endswith(".jpg")}
-
-
-def cut_depth(files: Files) -> Files:
-    return {**files, "rgbd/0.depth": files["rgbd/0.depth"][:50]}
-
-
-def long_depth(files: Files) -> Files:
-    return {**files, "rgbd/0.depth": lzfse.compress(bytes(10**7))}
-
-
-def random_depth(files: Files) -> Files:
-    return {**files, "rgbd/0.depth": bytes(range(256)) * 1000}
-
-
-RECORDINGS: dict[str, tuple[Callable[[Files], Files], str]] = {
-    "no poses": (without_poses, "scan.r3d/metadata: no poses, expected a list of qx qy qz qw tx ty tz"),
-    "pose of 6": (lambda f: metadata(f, poses=[[0] * 6] * 4), "pose 0: is not 7 numbers"),
-    "quaternion": (lambda f: metadata(f, poses=[[1, 1, 0, 0, 0, 0, 0]] * 4), "pose 0: the quaternion has length 1.41"),
-    "no photos": (without_photos, "rgbd/0.jpg: no such photo"),
-    "no metadata": (lambda f: {"icon": b""}, "scan.r3d/metadata: not found in the archive, which holds 1 file"),
-    "no size": (lambda f: metadata(f, w=None), "no w and h"),
-    "no K": (lambda f: metadata(f, K=None, perFrameIntrinsicCoeffs=None), "no K with 9 numbers"),
-    "metadata": (lambda f: {**f, "metadata": b"{"}, "scan.r3d/metadata: not JSON"),
-    "cut depth": (cut_depth, "rgbd/0.depth: "),
-    "long depth": (long_depth, "rgbd/0.depth: "),
-    "random depth": (random_depth, "rgbd/0.depth: has 256000 bytes, expected at most"),
-    "cut photo": (lambda f: {**f, "rgbd/0.jpg": f["rgbd/0.jpg"][:900]}, "rgbd/0.jpg: not readable as an image"),
-    "empty photo": (lambda f: {**f, "rgbd/0.jpg": b""}, "(the file is empty)"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", RECORDINGS)
-def test_bad_recordings(case: str, views: list[View], tmp_path: Path) -> None:
-    change, expected = RECORDINGS[case]
-    assert expected in message(packed(tmp_path, change(record3d_files(views))))
-
-
-def test_an_archive_cut_in_half_and_one_that_is_none(views: list[View], tmp_path: Path) -> None:
-    file = packed(tmp_path, record3d_files(views))
-    content = file.read_bytes()
-    file.write_bytes(content[: len(content) // 2])
-    assert "scan.r3d: ends too early, probably an incomplete copy" in message(file)
-    file.write_bytes(b"no zip at all")
-    assert "scan.r3d: is not a zip archive" in message(file)
-
-
-def test_members_that_unpack_to_too_much(
-    views: list[View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The size that the archive states is checked first, and what comes out of it as well."""
-    file = packed(tmp_path, {**record3d_files(views), "metadata": bytes(10**6)}, zipfile.ZIP_DEFLATED)
-    monkeypatch.setattr(archives, "LARGEST_MEMBER", 10**5)
-    assert "scan.r3d/metadata: unpacks to 1 MiB, expected at most 0 MiB" in message(file)
-    content = file.read_bytes().replace((10**6).to_bytes(4, "little"), (10**4).to_bytes(4, "little"))
-    file.write_bytes(content)
-    assert "metadata: cannot be unpacked" in message(file) or "metadata: unpacks to" in message(file)
-
-
-def test_the_missing_package_is_named(
-    views: list[View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("lzfse", "liblzfse"):
-        monkeypatch.setitem(sys.modules, name, None)
-    files = record3d_files(views)
-    text = message(packed(tmp_path, files))
-    assert "reading Record3D depth needs the package lzfse: pip install 'bidnerf[record3d]'" in text
-    colour = {name: content for name, content in files.items() if not name.endswith((".depth", ".conf"))}
-    assert all(timed.frame.depth is None for timed in open_sequence(packed(tmp_path, colour)))
-
-
 # Polycam
 
 
 def test_undistorted_photos_hide_their_border(views: list[View], tmp_path: Path) -> None:
     for corrected in (True, False):
         folder = write_polycam(tmp_path / str(corrected), views, corrected)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            hidden = next(iter(open_sequence(folder))).frame.hidden
+        hidden = next(iter(open_sequence(folder))).frame.hidden
         assert (hidden is not None) == corrected
         if hidden is not None:
             assert not bool(hidden[15:-15, 15:-15].any())
             assert int((~hidden).sum()) == (hidden.shape[0] - 30) * (hidden.shape[1] - 30)
 
 
-def test_cameras_without_a_size_and_photos_without_a_camera(views: list[View], tmp_path: Path) -> None:
+def test_cameras_without_a_size(views: list[View], tmp_path: Path) -> None:
     folder = write_polycam(tmp_path, views)
-    cameras = sorted((folder / "keyframes/corrected_cameras").iterdir())
-    for file in cameras:
+    for file in (folder / "keyframes/corrected_cameras").iterdir():
         content = json.loads(file.read_text())
         del content["width"], content["height"]
         file.write_text(json.dumps(content))
     assert open_dataset(folder).views("test")[0].frame.intrinsics == views[0].frame.intrinsics
-    cameras[1].unlink()
-    (folder / "keyframes/depth" / f"{cameras[2].stem}.png").unlink()
-    (folder / "keyframes/corrected_images" / f"{cameras[3].stem}.jpg").unlink()
-    said = remarks_of(folder)
-    assert any("1 of 3 photos is missing and left out" in text for text in said)
-    assert any("1 of 3 photos have no camera in corrected_cameras" in text for text in said)
-    assert any("1 of 2 photos have no depth" in text for text in said)
-    assert len(said) == 3
-
-
-def test_poses_that_drift_are_said_to(views: list[View], tmp_path: Path) -> None:
-    (said,) = remarks_of(write_polycam(tmp_path, views, corrected=False))
-    assert "has no corrected_cameras, so the poses are ARKit's, which drift" in said
 
 
 # Stray Scanner
@@ -259,9 +198,7 @@ def test_a_video_of_another_length_and_missing_depth(views: list[View], tmp_path
     (folder / "depth/000001.png").unlink()
     said = remarks_of(folder)
     assert any("1 of 4 frames is missing and left out, first: frame 3" in text for text in said)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert [timed.frame.depth is not None for timed in open_sequence(folder)] == [True, False, True]
+    assert [timed.frame.depth is not None for timed in open_sequence(folder)] == [True, False, True]
     with (folder / "odometry.csv").open("a") as file:
         file.write("1000.7")
     assert any("the last row is truncated and was left out" in text for text in remarks_of(folder))
@@ -312,15 +249,6 @@ def test_five_frames_a_second_are_kept() -> None:
 # Data sets
 
 
-def test_frames_of_twelve_scenes_whose_tracking_failed(views: list[View], tmp_path: Path) -> None:
-    folder = write_twelve_scenes(tmp_path, views)
-    (folder / "data/frame-000002.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
-    assert any("1 of 4 images have no pose and are left out" in text for text in remarks_of(folder))
-    assert open_dataset(folder).frame_names("test") == ["frame-000000", "frame-000001"]
-    assert [timed.truth is None for timed in open_sequence(folder)] == [False, False, True, False]
-    assert len(open_sequence(folder / "data")) == 4
-
-
 def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path) -> None:
     """The depth camera sees twice as much: what it sees in the middle is what the photo shows."""
     folder = write_twelve_scenes(tmp_path, views)
@@ -333,44 +261,7 @@ def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path
     assert depth.unique().tolist() == pytest.approx([1.5])
 
 
-def test_lists_of_photos_that_are_not_there(views: list[View], tmp_path: Path) -> None:
-    folder = write_reality_capture(tmp_path, views)
-    (folder / "2.png").unlink()
-    (said,) = remarks_of(folder)
-    assert "cameras.csv: 1 of 4 photos is missing and left out, first: 2.png" in said
-    text = (folder / "cameras.csv").read_text()
-    (folder / "cameras.csv").write_text(text.replace(",0,0,0,0,0,0\n", ",0,0,0,0.1,0,0\n").replace("\r", ""))
-    text = (folder / "cameras.csv").read_text()
-    (folder / "cameras.csv").write_text(text.replace(",f,", ",focal,"))
-    assert "has no column f, expected the export 'Internal/External camera parameters'" in message(folder)
-
-
-def test_sequences_without_poses_and_with_missing_images(views: list[View], tmp_path: Path) -> None:
-    folder = write_kitti(tmp_path / "kitti", views)
-    (folder / "image_2/000001.png").unlink()
-    assert any("1 of 4 images are missing, first: number 1" in text for text in remarks_of(folder))
-    (tmp_path / "kitti/poses/07.txt").unlink()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert [timed.truth for timed in open_sequence(folder)] == [None] * 3
-        with pytest.raises(
-            InputError, match=r"has no poses, expected poses\.txt in it, or \.\./\.\./poses/07\.txt"
-        ):
-            open_dataset(folder)
-    folder = write_euroc(tmp_path / "euroc", views)
-    next(iter(sorted((folder / "mav0/cam0/data").iterdir()))).unlink()
-    assert any("1 of 4 images is missing and left out" in text for text in remarks_of(folder))
-    sensor = folder / "mav0/cam0/sensor.yaml"
-    sensor.write_text(
-        sensor.read_text()
-        .replace("radial-tangential", "equidistant")
-        .replace("[0.0, 0.0, 0.0, 0.0]", "[0.1, 0.0, 0.0, 0.0]")
-    )
-    assert "distortion_model is equidistant, expected radial-tangential" in message(folder)
-
-
-def test_archives_are_to_be_unpacked(tmp_path: Path) -> None:
-    (tmp_path / "scan.zip").write_bytes(b"PK")
-    assert "is a file, expected the folder of a dataset; unpack the archive first" in message(
-        tmp_path / "scan.zip"
-    )
+def test_the_frames_of_twelve_scenes_are_a_sequence_without_their_parent(tmp_path: Path) -> None:
+    folder = write_twelve_scenes(tmp_path, small_views(4))
+    assert len(open_sequence(folder / "data")) == 4
+    assert open_dataset(folder).frame_names("test") == ["frame-000000", "frame-000001"]

@@ -21,6 +21,7 @@ from bidnerf_core.datasets import DepthCamera, TimedFrame, open_dataset, open_se
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
+from scan_layouts import small_views, write_nerfstudio
 from tum_folder import Recorded, write_recording
 
 COLOUR = Intrinsics(131.0, 132.0, 79.0, 61.0, 160, 120)
@@ -120,10 +121,6 @@ def write_sensor(file: Path, **changes: object) -> Path:
     return file
 
 
-def expected_of_file(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    return SENSOR.registered(depth, COLOUR, "depth")
-
-
 def test_a_folder_of_images_is_registered_from_a_file(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     depth = (seen(DEPTH, SE3.identity()) * 1000).round()
@@ -131,7 +128,7 @@ def test_a_folder_of_images_is_registered_from_a_file(tmp_path: Path) -> None:
     iio.imwrite(tmp_path / "photos" / "a.depth.png", depth.numpy().astype(np.uint16))
     sensor = write_sensor(tmp_path / "sensor.json")
     (timed,) = open_sequence(tmp_path / "photos", camera=COLOUR, register_depth=sensor)
-    torch.testing.assert_close(timed.frame.depth, expected_of_file(depth / 1000))
+    torch.testing.assert_close(timed.frame.depth, SENSOR.registered(depth / 1000, COLOUR, "depth"))
     (plain,) = open_sequence(tmp_path / "photos", camera=COLOUR, register_depth=False)
     torch.testing.assert_close(plain.frame.depth, depth / 1000)
 
@@ -154,7 +151,7 @@ def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_
     assert stored is not None
     sensor = write_sensor(tmp_path / "sensor.json")
     found = first(recording, camera=COLOUR, register_depth=str(sensor))
-    torch.testing.assert_close(found.frame.depth, expected_of_file(stored))
+    torch.testing.assert_close(found.frame.depth, SENSOR.registered(stored, COLOUR, "depth"))
     (view,) = open_dataset(recording, camera=COLOUR, register_depth=SENSOR).views("test")
     assert found.frame.depth is not None
     assert torch.equal(view.frame.depth, found.frame.depth)  # type: ignore[arg-type]
@@ -163,44 +160,29 @@ def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_
     assert torch.equal(first(recording, camera=COLOUR, register_depth=False).frame.depth, stored)  # type: ignore[arg-type]
 
 
-def test_no_registration_where_there_is_none_to_do(recording: Path, data_folder: Path) -> None:
+def test_no_registration_where_there_is_none_to_do(recording: Path, tmp_path: Path) -> None:
+    posed = write_nerfstudio(tmp_path / "posed", small_views(2))
     with pytest.raises(InputError, match=r"its depth sensor is not known, expected the file"):
         open_sequence(recording, register_depth=True)
-    assert open_dataset(data_folder, register_depth=False).splits
+    assert open_dataset(posed, register_depth=False).splits
     with pytest.raises(InputError, match=r"depth is already registered to its images"):
-        open_dataset(data_folder, register_depth=SENSOR)
-
-
-@pytest.fixture
-def data_folder(tmp_path: Path) -> Path:
-    folder = tmp_path / "posed"
-    folder.mkdir()
-    iio.imwrite(folder / "a.png", np.zeros((6, 8, 3), np.uint8))
-    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
-    (folder / "transforms.json").write_text(json.dumps({"fl_x": 9.0, "w": 8, "h": 6, "frames": frames}))
-    return folder
+        open_dataset(posed, register_depth=SENSOR)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"T_colour_depth": None},
-            r"sensor\.json: no T_colour_depth, expected the 4x4 pose of the depth camera",
-        ),
-        ({"T_colour_depth": [[1, 2], [3, 4]]}, r"sensor\.json: T_colour_depth is not 3x4 or 4x4"),
-        (
-            {"T_colour_depth": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]},
-            r"rotation of T_colour_depth is off",
-        ),
-        ({"w": None}, r"sensor\.json: no w and h, expected the size of the depth images"),
-        ({"fl_x": None}, r"sensor\.json: no focal length"),
+        ({"T_colour_depth": None}, "no T_colour_depth, expected the 4x4 pose"),
+        ({"T_colour_depth": [[1, 2], [3, 4]]}, "T_colour_depth is not 3x4 or 4x4"),
+        ({"T_colour_depth": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "rotation of T_colour_depth is off"),
+        ({"w": None}, "no w and h, expected the size"),
+        ({"fl_x": None}, "no focal length"),
     ],
 )
 def test_broken_files_of_sensors_are_refused(
     changes: dict[str, object], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=rf"sensor\.json: .*{message}"):
         DepthCamera.read(write_sensor(tmp_path / "sensor.json", **changes))
 
 

@@ -40,14 +40,8 @@ def format_checks(part: Callable[[Path, Path], Iterator[Check]]) -> Kind:
 
 def finding_checks(work: Path, scale: float) -> Iterator[Check]:
     prepared = findings.Work(work)
-    for number, finding in enumerate(findings.FINDINGS, start=1):
-        for check in finding(prepared):
-            yield Check(f"{number}: {check.name}", check.wrong)
-
-
-def fuzz_checks(work: Path, scale: float) -> Iterator[Check]:
-    cases = fuzz.checks(work, iter(range(round(2000 * scale))), minutes=10 * scale)
-    return (check for check, _ in cases)
+    for finding in findings.FINDINGS:
+        yield from (Check(f"{finding.__name__}: {check.name}", check.wrong) for check in finding(prepared))
 
 
 KINDS: dict[str, Kind] = {
@@ -59,18 +53,8 @@ KINDS: dict[str, Kind] = {
     "kills": stopping("kills"),
     "full disks": stopping("disks"),
     "crowds": stopping("crowds"),
-    "fuzz": fuzz_checks,
+    "fuzz": lambda work, scale: fuzz.checks(work, round(2000 * scale), 10 * scale),
 }
-
-
-def groups(kind: str, found: list[Check]) -> Iterator[tuple[str, list[Check]]]:
-    """Yield the checks of a kind, the findings by their numbers."""
-    if kind != "findings":
-        yield kind, found
-        return
-    for number, finding in enumerate(findings.FINDINGS, start=1):
-        text = (finding.__doc__ or "").rstrip(".")
-        yield f"finding {text}", [check for check in found if check.name.startswith(f"{number}: ")]
 
 
 def main() -> None:
@@ -87,10 +71,9 @@ def main() -> None:
         with TemporaryDirectory() as place:
             Path(place).chmod(0o755)
             found = list(KINDS[kind](Path(place), given.scale))
-        for name, some in groups(kind, found):
-            bad = {check.name: list(check.wrong) for check in some if check.wrong}
-            wrong += len(bad)
-            table.append({"kind": name, "cases": len(some), "sound": len(some) - len(bad), "defects": bad})
+        bad = {check.name: list(check.wrong) for check in found if check.wrong}
+        wrong += len(bad)
+        table.append({"kind": kind, "cases": len(found), "sound": len(found) - len(bad), "defects": bad})
         print(f"{kind}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
     print(f"bidnerf {version('bidnerf')}\n\n| kind | cases | sound | defects |\n| --- | --- | --- | --- |")
     for row in table:

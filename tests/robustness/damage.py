@@ -1,12 +1,10 @@
-"""Malformed files, drawn at random: JSON, images, arrays, points, tensors, COLMAP's binary files.
+"""Malformed files as strategies of hypothesis: JSON, images, arrays, points, tensors, COLMAP's binary files.
 
-Each table maps the name of a kind of damage to a function of a ``random.Random`` and of the sound content, which returns the
-damaged content.
+Each function takes sound content and returns, by the kinds of damage, strategies that draw damaged content.
 """
 
 from __future__ import annotations
 
-import copy
 import io
 import json
 import struct
@@ -14,13 +12,13 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from functools import partial
-from random import Random
 from typing import Any, TypeAlias
 
 import numpy as np
+from hypothesis import strategies as st
 from PIL import Image
 
-Damage: TypeAlias = Callable[[Random, bytes], bytes]
+Damages: TypeAlias = dict[str, st.SearchStrategy[bytes]]
 
 TERMINAL = "\x1b[2J\x1b]0;owned\x07\x9b31m\x00\r\u202e\ud800\u2028"
 """Text that clears a terminal, sets its title, and colours and reverses what follows; it has half of a surrogate pair."""
@@ -35,35 +33,40 @@ NUMBERS = (
 OTHER_VALUES: tuple[Any, ...] = (None, True, [], {}, "text", 0, -1, 1.5, [[]], [None], {"": {}}, [1, 2, 3])
 LARGE = 100_000
 """Columns and rows of images and arrays that are too large for any memory."""
+NOISE = st.binary(min_size=1, max_size=7) | st.integers(0, 99).map(lambda seed: noise(seed, 4096))
 
 
-def cut(chance: Random, content: bytes) -> bytes:
-    return content[: chance.randrange(max(1, len(content)))]
+def noise(seed: int, count: int) -> bytes:
+    return np.random.default_rng(seed).bytes(count)
 
 
-def flipped(chance: Random, content: bytes) -> bytes:
-    changed = bytearray(content or b"\0")
-    for _ in range(chance.choice((1, 1, 2, 8, 64))):
-        changed[chance.randrange(len(changed))] = chance.randrange(256)
-    return bytes(changed)
+def drawn(damages: Damages) -> st.SearchStrategy[tuple[str, bytes]]:
+    """Draw a kind of damage, and content that has it."""
+    return st.sampled_from(sorted(damages)).flatmap(lambda name: st.tuples(st.just(name), damages[name]))
 
 
-def noise(chance: Random, content: bytes) -> bytes:
-    return chance.randbytes(chance.choice((1, 7, 100, 4096)))
+def of_bytes(content: bytes) -> Damages:
+    place = st.integers(0, max(0, len(content) - 1))
 
+    def flipped(changes: list[tuple[int, int]]) -> bytes:
+        changed = bytearray(content or b"\0")
+        for where, value in changes:
+            changed[where] = value
+        return bytes(changed)
 
-BYTES: dict[str, Damage] = {
-    "cut": cut,
-    "flipped": flipped,
-    "noise": noise,
-    "empty": lambda chance, content: b"",
-    "appended": lambda chance, content: content + noise(chance, content),
-}
+    return {
+        "cut": place.map(lambda end: content[:end]),
+        "flipped": st.lists(st.tuples(place, st.integers(0, 255)), min_size=1, max_size=64).map(flipped),
+        "noise": NOISE,
+        "empty": st.just(b""),
+        "appended": NOISE.map(lambda more: content + more),
+    }
 
 
 # JSON. A marker replaces a value, and is itself replaced in the text, since Python's JSON does not write 1e400.
 
 MARKER = "@marker@"
+ROOTS = (b"[]", b"null", b"{}", b"1", b'"x"', b"\xff\xfe{\0}\0", b"\xef\xbb\xbf{}", b"{,}", b"'a'")
 
 
 def places_of(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
@@ -80,89 +83,78 @@ def at(value: Any, path: tuple[Any, ...]) -> Any:
 
 def replaced_at(content: bytes, place: tuple[Any, ...], text: str) -> bytes:
     """Put JSON ``text`` in the place of a value."""
-    whole = json.loads(content)
-    *outer, last = place
+    whole = [json.loads(content)]
+    *outer, last = (0, *place)
     at(whole, tuple(outer))[last] = MARKER
-    return json.dumps(whole).replace(json.dumps(MARKER), text).encode(errors="surrogatepass")
+    return json.dumps(whole)[1:-1].replace(json.dumps(MARKER), text).encode(errors="surrogatepass")
 
 
-def replaced(chance: Random, content: bytes, text: str, kinds: type | tuple[type, ...] = object) -> bytes:
-    """Put JSON ``text`` in the place of a random value of one of ``kinds``."""
+def nested(depth: int, opening: str, closing: str) -> str:
+    return opening * depth + "1" + closing * depth
+
+
+def of_json(content: bytes) -> Damages:
     whole = json.loads(content)
-    places = [place for place in places_of(whole) if isinstance(at(whole, place), kinds)]
-    return (
-        replaced_at(content, chance.choice(places), text) if places else text.encode(errors="surrogatepass")
-    )
+    places = places_of(whole)
 
+    def put(text: st.SearchStrategy[str], kinds: Any = object) -> st.SearchStrategy[bytes]:
+        """Put JSON in the place of any value of one of ``kinds``."""
+        some = [place for place in places if isinstance(at(whole, place), kinds)] or [()]
+        return st.builds(partial(replaced_at, content), st.sampled_from(some), text)
 
-def deep(chance: Random, content: bytes) -> bytes:
-    depth = chance.choice((50, 900, 5000, LARGE))
-    opening, closing = chance.choice((("[", "]"), ('{"a":', "}")))
-    return replaced(chance, content, opening * depth + "1" + closing * depth)
+    def edited(kind: type, edit: Callable[[Any, Any, int], object]) -> st.SearchStrategy[bytes]:
+        """Change an entry of any object or list, which ``edit`` gets with the key and a number."""
+        some = [place for place in places if isinstance(at(whole, place[:-1]), kind)]
 
+        def change(place: tuple[Any, ...], number: int) -> bytes:
+            new = json.loads(content)
+            edit(at(new, place[:-1]), place[-1], number)
+            return json.dumps(new).encode()
 
-def with_key(change: Callable[[Random, dict[str, Any], str], None]) -> Damage:
-    """Return a damage that changes the entry of one key of one object."""
+        return st.builds(change, st.sampled_from(some), st.integers(0, 3)) if some else st.just(content)
 
-    def damage(chance: Random, content: bytes) -> bytes:
-        whole = json.loads(content)
-        places = [place for place in places_of(whole) if isinstance(place[-1], str)]
-        if places:
-            *outer, last = chance.choice(places)
-            change(chance, at(whole, tuple(outer)), last)
-        return json.dumps(whole).encode()
+    def renamed(record: dict[str, Any], key: str, number: int) -> None:
+        record[(TERMINAL, key + "s", key.upper(), "")[number]] = record.pop(key)
 
-    return damage
+    def twice(key: str, value: Any) -> bytes:
+        return f"{json.dumps(whole)[:-1]}, {json.dumps(key)}: {json.dumps(value)}}}".encode()
 
-
-def renamed(chance: Random, record: dict[str, Any], key: str) -> None:
-    """Rename a key, to a name with control characters or a typing error."""
-    record[chance.choice((TERMINAL, key + "s", key.upper(), ""))] = record.pop(key)
-
-
-def twice(chance: Random, content: bytes) -> bytes:
-    """Give a key two values."""
-    whole = json.loads(content)
-    if not isinstance(whole, dict) or not whole:
-        return content
-    key, more = chance.choice(list(whole)), json.dumps(chance.choice(OTHER_VALUES))
-    return f"{json.dumps(whole)[:-1]}, {json.dumps(key)}: {more}}}".encode()
-
-
-def short_list(chance: Random, content: bytes) -> bytes:
-    whole = json.loads(content)
-    lists = [place for place in places_of(whole) if isinstance(at(whole, place), list) and at(whole, place)]
-    if lists:
-        found = at(whole, chance.choice(lists))
-        found.pop(chance.randrange(len(found))) if chance.random() < 0.5 else found.append(found[0])
-    return json.dumps(whole).encode()
-
-
-ROOTS = (b"[]", b"null", b"{}", b"1", b'"x"', b"\xff\xfe{\0}\0", b"\xef\xbb\xbf{}", b"{,}", b"'a'")
-JSON: dict[str, Damage] = BYTES | {
-    "wrong type": lambda c, content: replaced(c, content, json.dumps(c.choice(OTHER_VALUES))),
-    "odd number": lambda c, content: replaced(c, content, c.choice(NUMBERS), (int, float)),
-    "odd text": lambda c, content: replaced(c, content, json.dumps(c.choice(TEXTS)), str),
-    "deep nesting": deep,
-    "missing key": with_key(lambda chance, record, key: record.pop(key)),
-    "other key": with_key(renamed),
-    "key twice": twice,
-    "list of another length": short_list,
-    "another root": lambda chance, content: chance.choice(ROOTS),
-}
+    values = st.sampled_from(OTHER_VALUES)
+    damages = of_bytes(content) | {
+        "wrong type": put(values.map(json.dumps)),
+        "odd number": put(st.sampled_from(NUMBERS), (int, float)),
+        "odd text": put(st.sampled_from(TEXTS).map(json.dumps), str),
+        "deep nesting": put(
+            st.builds(nested, st.sampled_from((50, 900, 5000, LARGE)), st.just("["), st.just("]"))
+            | st.builds(nested, st.sampled_from((50, 900, 5000, LARGE)), st.just('{"a":'), st.just("}"))
+        ),
+        "missing key": edited(dict, lambda record, key, number: record.pop(key)),
+        "other key": edited(dict, renamed),
+        "longer list": edited(list, lambda found, key, number: found.append(found[0])),
+        "shorter list": edited(list, lambda found, key, number: found.pop(key)),
+        "another root": st.sampled_from(ROOTS),
+    }
+    if isinstance(whole, dict) and whole:
+        damages["key twice"] = st.builds(twice, st.sampled_from(sorted(whole)), values)
+    return damages
 
 
 # Images.
+
+SIZES = (
+    (LARGE, LARGE), (2**31 - 1, 1), (1, 2**31 - 1), (0, 5), (12_000, 12_000), (9000, 9000), (25, 24),
+)  # fmt: skip
+MODES = (
+    ("L", "PNG"), ("LA", "PNG"), ("P", "PNG"), ("P", "GIF"), ("1", "PNG"), ("CMYK", "JPEG"), ("F", "TIFF"), ("I", "TIFF"),
+    ("I;16", "PNG"), ("YCbCr", "JPEG"), ("LAB", "TIFF"), ("RGB", "BMP"), ("RGB", "WEBP"), ("L", "PPM"),
+)  # fmt: skip
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\n{} loop\n"
 
 
 def saved(image: Image.Image, kind: str, **more: Any) -> bytes:
     file = io.BytesIO()
     image.save(file, kind, **more)
     return file.getvalue()
-
-
-def opened(content: bytes) -> Image.Image:
-    return Image.open(io.BytesIO(content)).convert("RGB")
 
 
 def chunk(name: bytes, body: bytes) -> bytes:
@@ -175,74 +167,50 @@ def png(side: int, bits: int, colour: int, data: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-SIZES = (
-    (LARGE, LARGE), (2**31 - 1, 1), (1, 2**31 - 1), (0, 5), (12_000, 12_000), (9000, 9000), (25, 24),
-)  # fmt: skip
-MODES = (
-    ("L", "PNG"), ("LA", "PNG"), ("P", "PNG"), ("P", "GIF"), ("1", "PNG"), ("CMYK", "JPEG"), ("F", "TIFF"), ("I", "TIFF"),
-    ("I;16", "PNG"), ("YCbCr", "JPEG"), ("LAB", "TIFF"), ("RGB", "BMP"), ("RGB", "WEBP"), ("L", "PPM"),
-)  # fmt: skip
-
-
-def size_in_header(chance: Random, content: bytes) -> bytes:
-    """Return a PNG with another size in its header, and a correct checksum."""
-    header = struct.pack(">II", *chance.choice(SIZES)) + content[24:29]
-    return content[:8] + chunk(b"IHDR", header) + content[33:]
-
-
-def of_mode(chance: Random, content: bytes) -> bytes:
-    """Return an image of another kind: grey, palette, CMYK, of 1 or 32 bits, floating point, YCbCr."""
-    mode, kind = chance.choice(MODES)
-    image = opened(content)
-    return saved((image.convert("I") if mode == "I;16" else image).convert(mode), kind)
-
-
-def sixteen_bits(chance: Random, content: bytes) -> bytes:
-    """Return a PNG of 16 bits per channel with 2 to 4 channels."""
-    colour, count = chance.choice(((2, 3), (4, 2), (6, 4)))
-    return png(
-        24, 16, colour, zlib.compress(b"".join(b"\0" + chance.randbytes(48 * count) for _ in range(24)))
-    )
-
-
-def animated(chance: Random, content: bytes) -> bytes:
-    images = [Image.new("RGB", (24, 24), (i, 0, 0)) for i in range(3)]
-    kind = chance.choice(("GIF", "PNG", "WEBP", "TIFF"))
-    return saved(images[0], kind, save_all=True, append_images=images[1:])
-
-
-def one_pixel(chance: Random, content: bytes) -> bytes:
-    return saved(Image.new("RGB", chance.choice(((1, 1), (1, 24), (24, 1)))), chance.choice(("PNG", "JPEG")))
-
-
 def zeros_png(side: int, colour: int = 0, channels: int = 1) -> bytes:
     """Return a PNG of ``side`` squared black pixels, a thousandth of their size."""
     return png(side, 8, colour, zlib.compress(b"\0" * (side * (side * channels + 1)), 9))
 
 
-def exif_noise(chance: Random, content: bytes) -> bytes:
-    exif = b"Exif\0\0II*\0\x08\0\0\0" + chance.randbytes(chance.choice((2, 40, 400)))
-    return saved(opened(content), "JPEG", exif=exif)
+def of_image(content: bytes) -> Damages:
+    image = Image.open(io.BytesIO(content)).convert("RGB")
+    frames = [Image.new("RGB", (24, 24), (i, 0, 0)) for i in range(3)]
+    of_jpeg = of_bytes(saved(image, "JPEG"))
 
+    def size_in_header(size: tuple[int, int]) -> bytes:
+        """Return a PNG with another size in its header, and a correct checksum."""
+        return content[:8] + chunk(b"IHDR", struct.pack(">II", *size) + content[24:29]) + content[33:]
 
-def long_text(chance: Random, content: bytes) -> bytes:
-    """Return a PNG whose compressed text is a thousand times as long as the file."""
-    return content[:33] + chunk(b"zTXt", b"k\0\0" + zlib.compress(b"a" * 50_000_000)) + content[33:]
+    def of_mode(mode: str, kind: str) -> bytes:
+        return saved((image.convert("I") if mode == "I;16" else image).convert(mode), kind)
 
+    def sixteen_bits(colour: int, channels: int) -> bytes:
+        rows = b"".join(b"\0" + noise(row, 48 * channels) for row in range(24))
+        return png(24, 16, colour, zlib.compress(rows))
 
-POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\n{} loop\n"
-IMAGES: dict[str, Damage] = BYTES | {
-    "size in the header": size_in_header,
-    "another mode": of_mode,
-    "16 bits per channel": sixteen_bits,
-    "animated": animated,
-    "one pixel or line": one_pixel,
-    "compressed zeros": lambda chance, content: zeros_png(chance.choice((4000, 12_000))),
-    "part of a JPEG": lambda c, content: c.choice((cut, flipped))(c, saved(opened(content), "JPEG")),
-    "EXIF of noise": exif_noise,
-    "long compressed text": long_text,
-    "PostScript": lambda chance, content: POSTSCRIPT,
-}
+    def long_text() -> bytes:
+        """Return a PNG whose compressed text is a thousand times as long as the file."""
+        return content[:33] + chunk(b"zTXt", b"k\0\0" + zlib.compress(b"a" * 50_000_000)) + content[33:]
+
+    return of_bytes(content) | {
+        "size in the header": st.sampled_from(SIZES).map(size_in_header),
+        "another mode": st.sampled_from(MODES).map(lambda mode: of_mode(*mode)),
+        "16 bits per channel": st.sampled_from(((2, 3), (4, 2), (6, 4))).map(lambda kind: sixteen_bits(*kind)),
+        "animated": st.sampled_from(("GIF", "PNG", "WEBP", "TIFF")).map(
+            lambda kind: saved(frames[0], kind, save_all=True, append_images=frames[1:])
+        ),
+        "one pixel or line": st.builds(
+            lambda size, kind: saved(Image.new("RGB", size), kind),
+            st.sampled_from(((1, 1), (1, 24), (24, 1))), st.sampled_from(("PNG", "JPEG")),
+        ),
+        "compressed zeros": st.sampled_from((4000, 12_000)).map(zeros_png),
+        "part of a JPEG": of_jpeg["cut"] | of_jpeg["flipped"],
+        "EXIF of noise": st.sampled_from((2, 40, 400)).map(
+            lambda count: saved(image, "JPEG", exif=b"Exif\0\0II*\0\x08\0\0\0" + noise(count, count))
+        ),
+        "long compressed text": st.builds(long_text),
+        "PostScript": st.just(POSTSCRIPT),
+    }  # fmt: skip
 
 
 # Arrays of numpy, as depth and as points.
@@ -253,69 +221,66 @@ VALUES = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e10, 3.4e38, 1e308, 1e-320, 65.53
 HEADER_SHAPES = (
     "(100000, 100000)", "(1000000000000,)", "(-1, 24)", "(24, 24)" * 3, "(" * 500, f"({'9' * 50}, 3)", "(1, 2",
 )  # fmt: skip
+ROWS = (
+    b"1 2\n3 4\n", b"1,5 2,5\n", b"nan inf 1\n", b"a b c\n", b"1 2 3\n4 5\n", b"# \x1b[2J\n", b"1e400 0 1\n", b"0 0 0\n",
+    b"1 2 3 " * 20_000, b"1_0 2 3\n", b"\xff\xfe1 2 3\n", b"1;2;3\n", b"-1 -2 -3\n", b"\0\0\0",
+)  # fmt: skip
 
 
-def array_bytes(array: Any, allow_pickle: bool = False) -> bytes:
+def array_bytes(array: Any) -> bytes:
     file = io.BytesIO()
-    np.save(file, array, allow_pickle=allow_pickle)
+    np.save(file, array, allow_pickle=True)
     return file.getvalue()
 
 
-def array_file(kind: str, shape: str, content: bytes) -> bytes:
+def array_file(kind: str, shape: str, content: bytes = b"\0" * 100) -> bytes:
     """Return an array file with any header."""
     header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
     return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header + content
 
 
-def another_array(chance: Random, content: bytes) -> bytes:
-    shape, kind = chance.choice(SHAPES), chance.choice(KINDS)
-    return array_bytes(np.zeros(shape, kind) if kind == "f4,i4" else np.ones(shape).astype(kind))
-
-
-def odd_values(chance: Random, content: bytes) -> bytes:
-    values = np.full((24, 24), chance.choice(VALUES))
-    return array_bytes(values if chance.random() < 0.5 else values.reshape(-1, 3))
-
-
-def pickled(chance: Random, content: bytes) -> bytes:
-    return array_bytes(np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
-
-
-def array_header(chance: Random, content: bytes) -> bytes:
-    """Return an array file whose header promises more than any memory holds, or is no header."""
-    kind = chance.choice(("<f8", "<f4", "O", "V1000000000", "x", "\\x1b[31m"))
-    return array_file(kind, chance.choice(HEADER_SHAPES), b"\0" * 100)
-
-
-def archive(chance: Random, content: bytes) -> bytes:
+def archive_of(name: str, content: bytes, sensor: bytes | None, bomb: bool) -> bytes:
     file = io.BytesIO()
-    name = chance.choice(("points.npy", "points", "other.npy", "T_camera_sensor.npy", PLAIN_TERMINAL))
-    damage = chance.choice((another_array, odd_values, pickled, array_header, noise))
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as parts:
-        parts.writestr(name, damage(chance, content))
-        if chance.random() < 0.3:
-            parts.writestr("T_camera_sensor.npy", another_array(chance, content))
-        if chance.random() < 0.2:
-            bomb = array_file("<f8", "(100000000, 3)", b"\0" * 40_000_000)
-            parts.writestr("points.npy" if name != "points.npy" else "more.npy", bomb)
+        parts.writestr(name, content)
+        if sensor is not None:
+            parts.writestr("T_camera_sensor.npy", sensor)
+        if bomb:
+            large = array_file("<f8", "(100000000, 3)", b"\0" * 40_000_000)
+            parts.writestr("points.npy" if name != "points.npy" else "more.npy", large)
     return file.getvalue()
 
 
-ARRAYS: dict[str, Damage] = BYTES | {
-    "another array": another_array,
-    "odd values": odd_values,
-    "pickled": pickled,
-    "header of an array": array_header,
-    "archive": archive,
-}
-ROWS = (
-    b"1 2\n3 4\n", b"1,5 2,5\n", b"nan inf 1\n", b"a b c\n", b"1 2 3\n4 5\n", b"# \x1b[2J\n", b"1e400 0 1\n", b"0 0 0\n",
-    b"1 2 3 " * 20_000, b"1_0 2 3\n", b"\xff\xfe1 2 3\n", b"1;2;3\n", b"-1 -2 -3\n", b"\0\0\0",
-)  # fmt: skip
-POINTS: dict[str, Damage] = BYTES | {"odd points": lambda chance, content: chance.choice(ROWS)}
+def of_array(content: bytes) -> Damages:
+    def array(shape: tuple[int, ...], kind: str) -> bytes:
+        return array_bytes(np.zeros(shape, kind) if kind == "f4,i4" else np.ones(shape).astype(kind))
+
+    arrays = st.builds(array, st.sampled_from(SHAPES), st.sampled_from(KINDS))
+    damages: Damages = {
+        "another array": arrays,
+        "odd values": st.sampled_from(VALUES).map(lambda value: array_bytes(np.full((24, 24), value)))
+        | st.sampled_from(VALUES).map(lambda value: array_bytes(np.full((192, 3), value))),
+        "pickled": st.just(array_bytes(np.array([{"a": 1}, None], dtype=object))),
+        "header of an array": st.builds(
+            array_file,
+            st.sampled_from(("<f8", "<f4", "O", "V1000000000", "x", "\\x1b[31m")), st.sampled_from(HEADER_SHAPES),
+        ),
+    }  # fmt: skip
+    names = ("points.npy", "points", "other.npy", "T_camera_sensor.npy", PLAIN_TERMINAL)
+    inside = st.one_of(NOISE, *damages.values())
+    archive = st.builds(
+        archive_of, st.sampled_from(names), inside, st.none() | arrays, st.sampled_from([False] * 4 + [True])
+    )
+    return of_bytes(content) | damages | {"archive": archive}
+
+
+def of_points(content: bytes) -> Damages:
+    return of_bytes(content) | {"odd points": st.sampled_from(ROWS)}
 
 
 # Tensors, in the format of safetensors: the length of a header, a header of JSON, numbers.
+
+TYPES = ("F8_E4M3", "F64", "BF16", "I32", "U8", "BOOL", "F4", "C64", "X", "\x1b[2J")
 
 
 def parts_of(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -328,66 +293,47 @@ def joined(header: bytes | dict[str, Any], numbers: bytes) -> bytes:
     return struct.pack("<Q", len(text)) + text + numbers
 
 
-def header_length(chance: Random, content: bytes) -> bytes:
-    return struct.pack("<Q", chance.choice((0, 1, 2**63, 2**64 - 1, 10**8, len(content)))) + content[8:]
-
-
-def damaged_header(chance: Random, content: bytes) -> bytes:
+def of_tensors(content: bytes) -> Damages:
     header, numbers = parts_of(content)
-    damage = chance.choice([damage for name, damage in JSON.items() if name not in ("deep nesting", "empty")])
-    return joined(damage(chance, json.dumps(header).encode()), numbers)
+    names = st.sampled_from([name for name in header if name != "__metadata__"])
+    headers = of_json(json.dumps(header).encode())
+    del headers["deep nesting"], headers["empty"]
 
+    def with_entry(name: str, changes: dict[str, Any]) -> bytes:
+        return joined(header | {name: header[name] | changes}, numbers)
 
-TYPES = ("F8_E4M3", "F64", "BF16", "I32", "U8", "BOOL", "F4", "C64", "X", "\x1b[2J")
+    def another_shape(name: str, number: int) -> bytes:
+        shape = header[name]["shape"]
+        shapes = ([*shape, 1], shape[::-1], [], [-1], [2**62, 4], [0], [int(np.prod(shape))])
+        return with_entry(name, {"shape": shapes[number]})
 
+    def another_name(name: str, other: str) -> bytes:
+        return joined({other if key == name else key: entry for key, entry in header.items()}, numbers)
 
-def another_type(chance: Random, header: dict[str, Any], numbers: bytes, name: str) -> bytes:
-    header[name]["dtype"] = chance.choice(TYPES)
-    return joined(header, numbers)
+    def not_finite(name: str) -> bytes:
+        """Fill a tensor with NaN, whatever its type: all bits set."""
+        begin, end = header[name]["data_offsets"]
+        return joined(header, numbers[:begin] + b"\xff" * (end - begin) + numbers[end:])
 
+    def random_numbers(begin: int, count: int) -> bytes:
+        new = noise(begin, min(count, len(numbers) - begin))
+        return joined(header, numbers[:begin] + new + numbers[begin + len(new) :])
 
-def another_shape(chance: Random, header: dict[str, Any], numbers: bytes, name: str) -> bytes:
-    shape = header[name]["shape"]
-    shapes = ([*shape, 1], shape[::-1], [], [-1], [2**62, 4], [0], [int(np.prod(shape))])
-    header[name]["shape"] = chance.choice(shapes)
-    return joined(header, numbers)
-
-
-def not_finite(chance: Random, header: dict[str, Any], numbers: bytes, name: str) -> bytes:
-    """Fill a tensor with NaN, whatever its type: all bits set."""
-    begin, end = header[name]["data_offsets"]
-    return joined(header, numbers[:begin] + b"\xff" * (end - begin) + numbers[end:])
-
-
-def another_name(chance: Random, header: dict[str, Any], numbers: bytes, name: str) -> bytes:
-    header[chance.choice((TERMINAL.replace("\ud800", ""), "other", ""))] = header.pop(name)
-    return joined(header, numbers)
-
-
-def random_numbers(chance: Random, header: dict[str, Any], numbers: bytes, name: str) -> bytes:
-    begin = chance.randrange(len(numbers))
-    end = min(len(numbers), begin + chance.choice((1, 4, 1000)))
-    return joined(header, numbers[:begin] + chance.randbytes(end - begin) + numbers[end:])
-
-
-def _of_tensor(damage: Callable[[Random, dict[str, Any], bytes, str], bytes]) -> Damage:
-    def damaged(chance: Random, content: bytes) -> bytes:
-        header, numbers = parts_of(content)
-        name = chance.choice([name for name in header if name != "__metadata__"])
-        return damage(chance, copy.deepcopy(header), numbers, name)
-
-    return damaged
-
-
-TENSORS: dict[str, Damage] = BYTES | {
-    "length of the header": header_length,
-    "header of tensors": damaged_header,
-    "another type": _of_tensor(another_type),
-    "another shape": _of_tensor(another_shape),
-    "not finite": _of_tensor(not_finite),
-    "another name": _of_tensor(another_name),
-    "random numbers": _of_tensor(random_numbers),
-}
+    return of_bytes(content) | {
+        "length of the header": st.sampled_from((0, 1, 2**63, 2**64 - 1, 10**8, len(content))).map(
+            lambda length: struct.pack("<Q", length) + content[8:]
+        ),
+        "header of tensors": st.one_of(*headers.values()).map(lambda changed: joined(changed, numbers)),
+        "another type": st.builds(with_entry, names, st.sampled_from([{"dtype": kind} for kind in TYPES])),
+        "another shape": st.builds(another_shape, names, st.integers(0, 6)),
+        "not finite": st.builds(not_finite, names),
+        "another name": st.builds(
+            another_name, names, st.sampled_from((TERMINAL.replace("\ud800", ""), "other", ""))
+        ),
+        "random numbers": st.builds(
+            random_numbers, st.integers(0, len(numbers) - 1), st.sampled_from((1, 4, 1000))
+        ),
+    }
 
 
 # COLMAP's binary files, which begin with a count of 64 bits.
@@ -398,13 +344,20 @@ def with_count(count: int, content: bytes, place: int = 0) -> bytes:
     return content[:place] + struct.pack("<Q", count % 2**64) + content[place + 8 :]
 
 
-def counts(content: bytes) -> dict[str, Damage]:
-    """Return the false counts of a file: of more than it holds, of fewer, negative, and of more than any memory."""
+def false_counts(content: bytes) -> dict[str, bytes]:
+    """Return files with counts of more than they hold, of fewer, negative, and of more than any memory."""
     held = struct.unpack_from("<Q", content)[0]
-    false = {
-        "2^63": 2**63, "-1": -1, "2^31": 2**31, "10^6": 10**6, "more than it holds": held + 1, "fewer": held - 1, "none": 0,
-    }  # fmt: skip
-    return {
-        f"count {name}": partial(lambda number, c, content: with_count(number, content), number)
-        for name, number in false.items()
+    numbers = {
+        "2^63": 2**63,
+        "-1": -1,
+        "2^31": 2**31,
+        "10^6": 10**6,
+        "one more": held + 1,
+        "one less": held - 1,
+        "none": 0,
     }
+    return {f"count {name}": with_count(number, content) for name, number in numbers.items()}  # fmt: skip
+
+
+def of_colmap(content: bytes) -> Damages:
+    return of_bytes(content) | {name: st.just(bad) for name, bad in false_counts(content).items()}

@@ -1,38 +1,35 @@
-"""Every count of a COLMAP model and every field of a saved tracker state, damaged one at a time.
-
-python tests/robustness/formats.py
-"""
+"""Every count of a COLMAP model and every field of a saved tracker state, damaged one at a time."""
 
 from __future__ import annotations
 
 import json
 import shutil
 import struct
-import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from bidnerf_core.datasets import open_sequence
-from damage import OTHER_VALUES, at, counts, joined, parts_of, places_of, replaced_at, with_count
-from harness import SMALL_FIELD, Check, Checks, Door, defects, run, sound_folder, tracker, views_of
+from damage import OTHER_VALUES, at, false_counts, joined, parts_of, places_of, replaced_at, with_count
+from harness import SMALL_FIELD, Check, Checks, Door, defects, run, tracker, views_of
 
 LARGE_NUMBERS = ("1e400", "-1e308", "NaN", "1" + "0" * 400)
+
+
+INNER_COUNTS = {  # of the keypoints of an image, and of the track of a point
+    "images.bin": 8 + struct.calcsize("<I7dI") + len("1.png\0"),
+    "points3D.bin": 8 + struct.calcsize("<q3d3Bd"),
+}
 
 
 def colmap_counts(sound: Path, work: Path) -> Checks:
     """Give false counts to the files of a model, and to the keypoints of an image and the track of a point."""
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         content = (sound / "colmap" / "sparse" / "0" / name).read_bytes()
-        damaged = {kind: damage(None, content) for kind, damage in counts(content).items()}  # type: ignore[arg-type]
-        place = {
-            "images.bin": 8 + struct.calcsize("<I7dI") + len("1.png\0"),
-            "points3D.bin": 8 + struct.calcsize("<q3d3Bd"),
-        }
-        if name in place:
+        damaged = false_counts(content)
+        if name in INNER_COUNTS:
             for number in (2**63, -1, 2**31, 10**6, 0):
-                damaged[f"inner count {number}"] = with_count(number, content, place[name])
+                damaged[f"inner count {number}"] = with_count(number, content, INNER_COUNTS[name])
         if name == "images.bin":
             damaged["name without an end"] = content.replace(b"\0", b"x")
         if name == "cameras.bin":
@@ -45,13 +42,7 @@ def colmap_counts(sound: Path, work: Path) -> Checks:
             doors: dict[str, Door] = {
                 "views": partial(views_of, here),
                 "train": ["train", here, *new],
-                "localize": [
-                    "localize",
-                    sound / "map",
-                    sound / "data",
-                    "--depth-points",
-                    here / "sparse" / "0",
-                ],
+                "localize": ["localize", sound / "map", sound / "data", "--depth-points", here / "sparse/0"],
             }
             for door, call in doors.items():
                 yield Check(f"{name}, {kind}: {door}", tuple(defects(run(call, work / "case"))))
@@ -108,27 +99,3 @@ def tracker_states(sound: Path, work: Path) -> Checks:
     for name, bad in [("sound", content), *states(content)]:
         path.write_bytes(bad)
         yield Check(f"tracker state, {name}", tuple(defects(run(restored, work / "case"))))
-
-
-def checks(work: Path) -> Iterator[Check]:
-    work.chmod(0o755)
-    sound = work / "sound"
-    sound.mkdir()
-    sound_folder(sound, test=6)
-    yield from colmap_counts(sound, work)
-    yield from tracker_states(sound, work)
-
-
-def main() -> None:
-    count = wrong = 0
-    with TemporaryDirectory() as place:
-        for check in checks(Path(place)):
-            count, wrong = count + 1, wrong + bool(check.wrong)
-            if check.wrong:
-                print(check.name, *check.wrong, sep="\n  ", flush=True)
-    print(f"{count} cases, {wrong} with defects")
-    sys.exit(wrong > 0)
-
-
-if __name__ == "__main__":
-    main()

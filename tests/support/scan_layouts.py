@@ -2,23 +2,46 @@
 
 from __future__ import annotations
 
-import csv
 import json
+import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import imageio.v3 as iio
 import lzfse
 import numpy as np
+import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.frames import View
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import open_dataset, open_sequence
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from sparse_model import to_binary, write_model
+from tum_folder import Recorded, write_recording
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 START = 1000.0  # seconds
 PERIOD = 0.25  # seconds from one frame to the next
+SMALL = Intrinsics(20.0, 21.0, 8.5, 6.25, 16, 12)
+
+
+def small_views(count: int) -> list[View]:
+    """Views of noise, with depth of 0.5 to 3 m in whole millimetres and random poses."""
+    generator = torch.Generator().manual_seed(7)
+    found = []
+    for number in range(count):
+        rgb = torch.randint(0, 256, (SMALL.height, SMALL.width, 3), generator=generator) / 255
+        depth = torch.randint(500, 3000, (SMALL.height, SMALL.width), generator=generator) / 1000
+        pose = SE3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
+        found.append(View(Frame(f"r_{number}", rgb, SMALL, depth), pose))
+    return found
 
 
 def pixels(view: View) -> np.ndarray:
@@ -52,6 +75,21 @@ def centre(view: View) -> tuple[float, float]:
     return view.frame.intrinsics.cx - 0.5, view.frame.intrinsics.cy - 0.5
 
 
+def camera_keys(camera: Intrinsics) -> dict[str, float]:
+    """The camera in the keys of ``transforms.json`` and ``camera.json``."""
+    keys = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    lens = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False)
+    return {**keys, "w": camera.width, "h": camera.height, **dict(lens)}
+
+
+def write_image(file: Path, image: np.ndarray) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(file, image, **({"quality": 97} if file.suffix == ".jpg" else {}))
+
+
+# Phone apps
+
+
 def record3d_files(views: Sequence[View]) -> dict[str, bytes]:
     """The members of a ``.r3d`` archive by name."""
     camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
@@ -71,12 +109,16 @@ def record3d_files(views: Sequence[View]) -> dict[str, bytes]:
     return files
 
 
-def write_record3d(folder: Path, views: Sequence[View]) -> Path:
+def packed(folder: Path, files: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(folder / "scan.r3d", "w") as archive:
-        for name, content in record3d_files(views).items():
+    with zipfile.ZipFile(folder / "scan.r3d", "w", compression) as archive:
+        for name, content in files.items():
             archive.writestr(name, content)
     return folder / "scan.r3d"
+
+
+def write_record3d(folder: Path, views: Sequence[View]) -> Path:
+    return packed(folder, record3d_files(views))
 
 
 def write_unpacked_record3d(folder: Path, views: Sequence[View]) -> Path:
@@ -87,46 +129,29 @@ def write_unpacked_record3d(folder: Path, views: Sequence[View]) -> Path:
 
 
 def write_polycam(folder: Path, views: Sequence[View], corrected: bool = True) -> Path:
-    prefix = "corrected_" if corrected else ""
-    for kind in (f"{prefix}images", f"{prefix}cameras", "depth", "confidence"):
-        (folder / "keyframes" / kind).mkdir(parents=True, exist_ok=True)
+    base, prefix = folder / "keyframes", "corrected_" if corrected else ""
+    (base / f"{prefix}cameras").mkdir(parents=True, exist_ok=True)
     for number, view in enumerate(views):
-        stem, base, pose = str(round((START + PERIOD * number) * 1e6)), folder / "keyframes", opengl(view)
+        stem, pose = str(round((START + PERIOD * number) * 1e6)), opengl(view)
         camera, (cx, cy) = view.frame.intrinsics, centre(view)
-        description = {
-            "fx": camera.fx,
-            "fy": camera.fy,
-            "cx": cx,
-            "cy": cy,
-            "width": camera.width,
-            "height": camera.height,
-        }
-        description |= {
-            f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)
-        }
-        (base / f"{prefix}cameras" / f"{stem}.json").write_text(
-            json.dumps(description | {"blur_score": 90.0})
-        )
-        iio.imwrite(base / f"{prefix}images" / f"{stem}.jpg", pixels(view), quality=97)
-        iio.imwrite(base / "depth" / f"{stem}.png", millimetres(view))
-        iio.imwrite(base / "confidence" / f"{stem}.png", np.full(metres(view).shape, 255, np.uint8))
+        description: dict[str, float] = {"fx": camera.fx, "fy": camera.fy, "cx": cx, "cy": cy}
+        description |= {"width": camera.width, "height": camera.height, "blur_score": 90.0}
+        description |= {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        (base / f"{prefix}cameras" / f"{stem}.json").write_text(json.dumps(description))
+        write_image(base / f"{prefix}images" / f"{stem}.jpg", pixels(view))
+        write_image(base / "depth" / f"{stem}.png", millimetres(view))
+        write_image(base / "confidence" / f"{stem}.png", np.full(metres(view).shape, 255, np.uint8))
     return folder
 
 
-def write_arkit_polycam(folder: Path, views: Sequence[View]) -> Path:
-    return write_polycam(folder, views, corrected=False)
-
-
 def write_stray_scanner(folder: Path, views: Sequence[View]) -> Path:
-    for kind in ("depth", "confidence"):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
-    write_video(folder / "rgb.mp4", [pixels(view) for view in views])
     rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
     for number, view in enumerate(views):
         numbers = [*matrix(view)[:3, 3].tolist(), *quaternion(matrix(view))]
         rows.append(", ".join([repr(START + PERIOD * number), f"{number:06d}", *map(repr, numbers)]))
-        iio.imwrite(folder / "depth" / f"{number:06d}.png", millimetres(view))
-        iio.imwrite(folder / "confidence" / f"{number:06d}.png", np.full(metres(view).shape, 2, np.uint8))
+        write_image(folder / "depth" / f"{number:06d}.png", millimetres(view))
+        write_image(folder / "confidence" / f"{number:06d}.png", np.full(metres(view).shape, 2, np.uint8))
+    write_video(folder / "rgb.mp4", [pixels(view) for view in views])
     (folder / "odometry.csv").write_text("\n".join(rows) + "\n")
     camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
     (folder / "camera_matrix.csv").write_text(
@@ -145,14 +170,29 @@ def write_video(file: Path, images: Sequence[np.ndarray], rate: int = 4) -> None
         stream.pix_fmt, stream.codec_context.gop_size = "yuv420p", 5
         stream.codec_context.qmin = stream.codec_context.qmax = 1
         for image in images:
-            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+# Data sets
+
+
+def write_tum(folder: Path, views: Sequence[View], start: float = START, period: float = PERIOD) -> Path:
+    """A recording of the TUM RGB-D benchmark whose folder has its camera."""
+    write_recording(folder, [Recorded(start + period * number, view) for number, view in enumerate(views)])
+    (folder / "camera.json").write_text(json.dumps(camera_keys(views[0].frame.intrinsics)))
+    return folder
+
+
+def write_seven_scenes(folder: Path, views: Sequence[View]) -> Path:
+    """A sequence whose depth is that of the colour camera."""
+    write_frames(folder, views, "png")
+    (folder / "camera.json").write_text(json.dumps(camera_keys(views[0].frame.intrinsics)))
+    return folder
 
 
 def write_twelve_scenes(folder: Path, views: Sequence[View]) -> Path:
-    (folder / "data").mkdir(parents=True, exist_ok=True)
+    write_frames(folder / "data", views, "jpg")
     camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
     calibration = f"{camera.fx} 0 {cx} 0 0 {camera.fy} {cy} 0 0 0 1 0 0 0 0 1"
     lines = ["m_versionNumber = 4", "m_sensorName = StructureSensor"]
@@ -164,70 +204,37 @@ def write_twelve_scenes(folder: Path, views: Sequence[View]) -> Path:
     (folder / "split.txt").write_text(
         f"sequence0 [frames=2]  [start=0 ; end=1]\nsequence1 [frames={last - 1}]  [start=2 ; end={last}]\n"
     )
-    for number, view in enumerate(views):
-        base = folder / "data" / f"frame-{number:06d}"
-        iio.imwrite(f"{base}.color.jpg", pixels(view), quality=97)
-        iio.imwrite(f"{base}.depth.png", millimetres(view))
-        np.savetxt(f"{base}.pose.txt", matrix(view), fmt="%.12g")
     return folder
+
+
+def write_frames(folder: Path, views: Sequence[View], suffix: str) -> None:
+    for number, view in enumerate(views):
+        stem = f"frame-{number:06d}"
+        write_image(folder / f"{stem}.color.{suffix}", pixels(view))
+        write_image(folder / f"{stem}.depth.png", millimetres(view))
+        np.savetxt(folder / f"{stem}.pose.txt", matrix(view), fmt="%.17g")
 
 
 def write_reality_capture(folder: Path, views: Sequence[View]) -> Path:
     """The rotation is Rz(-heading) Rx(pitch) Ry(roll) of a camera with OpenGL axes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "cameras.csv").open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(
-            [
-                "#name",
-                "x",
-                "y",
-                "alt",
-                "heading",
-                "pitch",
-                "roll",
-                "f",
-                "px",
-                "py",
-                "k1",
-                "k2",
-                "k3",
-                "k4",
-                "t1",
-                "t2",
-            ]
-        )
-        for number, view in enumerate(views):
-            camera = view.frame.intrinsics
-            yaw, pitch, roll = Rotation.from_matrix(opengl(view)[:3, :3]).as_euler("ZXY", degrees=True)
-            longer = max(camera.width, camera.height)
-            shift = [(camera.cx - camera.width / 2) / longer, (camera.cy - camera.height / 2) / longer]
-            place = matrix(view)[:3, 3].tolist()
-            rows.writerow(
-                [
-                    f"{number}.png",
-                    *place,
-                    -yaw,
-                    pitch,
-                    roll,
-                    36 * camera.fx / longer,
-                    *shift,
-                    0,
-                    0,
-                    0,
-                    0,
-                    0,
-                    0,
-                ]
-            )
-            iio.imwrite(folder / f"{number}.png", pixels(view))
+    rows = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for number, view in enumerate(views):
+        camera = view.frame.intrinsics
+        yaw, pitch, roll = Rotation.from_matrix(opengl(view)[:3, :3]).as_euler("ZXY", degrees=True)
+        longer = max(camera.width, camera.height)
+        shift = [(camera.cx - camera.width / 2) / longer, (camera.cy - camera.height / 2) / longer]
+        numbers = [*matrix(view)[:3, 3], -yaw, pitch, roll, 36 * camera.fx / longer, *shift, *[0] * 6]
+        rows.append(",".join([f"{number}.png", *map(str, numbers)]))
+        write_image(folder / f"{number}.png", pixels(view))
+    (folder / "cameras.csv").write_text("\n".join(rows) + "\n", newline="\r\n")
     return folder
 
 
 def write_kitti(folder: Path, views: Sequence[View]) -> Path:
     """Sequence 07, whose colour camera is 6 cm to the right of camera 0."""
     sequence = folder / "sequences" / "07"
-    (sequence / "image_2").mkdir(parents=True, exist_ok=True)
+    for number, view in enumerate(views):
+        write_image(sequence / "image_2" / f"{number:06d}.png", pixels(view))
     (folder / "poses").mkdir()
     camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
     shift = np.eye(4)
@@ -240,8 +247,6 @@ def write_kitti(folder: Path, views: Sequence[View]) -> Path:
     (sequence / "times.txt").write_text("".join(f"{PERIOD * number:e}\n" for number in range(len(views))))
     poses = [(matrix(view) @ np.linalg.inv(shift))[:3].ravel() for view in views]
     np.savetxt(folder / "poses" / "07.txt", poses, fmt="%.12g")
-    for number, view in enumerate(views):
-        iio.imwrite(sequence / "image_2" / f"{number:06d}.png", pixels(view))
     return sequence
 
 
@@ -250,8 +255,20 @@ def write_euroc(folder: Path, views: Sequence[View]) -> Path:
     body = np.eye(4)
     body[:3, :3], body[:3, 3] = Rotation.from_euler("xyz", [0.2, -0.1, 1.5]).as_matrix(), [0.1, -0.02, 0.03]
     cam, truth = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
-    (cam / "data").mkdir(parents=True)
+    images = ["#timestamp [ns],filename"]
+    poses = ["#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x []"]
+    for number, view in enumerate(views):
+        stamp = 1403636579763555584 + round(PERIOD * number * 1e9)
+        images.append(f"{stamp},{stamp}.png")
+        write_image(cam / "data" / f"{stamp}.png", pixels(view))
+        pose = matrix(view) @ np.linalg.inv(body)
+        x, y, z, w = quaternion(pose)
+        for offset in (-3_000_000, 3_000_000):
+            numbers = [*pose[:3, 3].tolist(), w, x, y, z, *[0.0] * 9]
+            poses.append(",".join([str(stamp + offset), *map(repr, numbers)]))
     truth.mkdir()
+    (cam / "data.csv").write_text("\n".join(images) + "\n", newline="\r\n")
+    (truth / "data.csv").write_text("\n".join(poses) + "\n")
     camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
     rows = ",\n         ".join(", ".join(map(repr, row)) for row in body.tolist())
     (cam / "sensor.yaml").write_text(
@@ -260,33 +277,114 @@ def write_euroc(folder: Path, views: Sequence[View]) -> Path:
         f"intrinsics: [{camera.fx}, {camera.fy}, {cx}, {cy}] #fu, fv, cu, cv\n"
         "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
     )
-    images, poses = (
-        ["#timestamp [ns],filename"],
-        ["#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x []"],
-    )
-    for number, view in enumerate(views):
-        stamp = 1403636579763555584 + round(PERIOD * number * 1e9)
-        images.append(f"{stamp},{stamp}.png")
-        iio.imwrite(cam / "data" / f"{stamp}.png", pixels(view))
-        pose = matrix(view) @ np.linalg.inv(body)
-        x, y, z, w = quaternion(pose)
-        for offset in (-3_000_000, 3_000_000):
-            numbers = [*pose[:3, 3].tolist(), w, x, y, z, *[0.0] * 9]
-            poses.append(",".join([str(stamp + offset), *map(repr, numbers)]))
-    (cam / "data.csv").write_text("\r\n".join(images) + "\r\n")
-    (truth / "data.csv").write_text("\n".join(poses) + "\n")
     return folder
 
 
-LAYOUTS: dict[str, tuple[str, Callable[[Path, Sequence[View]], Path], bool, bool]] = {
-    "record3d": ("record3d", write_record3d, True, True),
-    "record3d, unpacked": ("record3d", write_unpacked_record3d, True, True),
-    "polycam": ("polycam", write_polycam, True, True),
-    "polycam, not corrected": ("polycam", write_arkit_polycam, True, True),
-    "stray-scanner": ("stray-scanner", write_stray_scanner, True, True),
-    "twelve-scenes": ("twelve-scenes", write_twelve_scenes, True, False),
-    "reality-capture": ("reality-capture", write_reality_capture, False, False),
-    "kitti": ("kitti", write_kitti, False, True),
-    "euroc": ("euroc", write_euroc, False, True),
-}
-"""The reader, what writes the layout, and whether it has depth and times."""
+# What other programs write
+
+
+def write_nerfstudio(folder: Path, views: Sequence[View]) -> Path:
+    """Write images, depth, and one ``transforms.json``."""
+    content: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        **camera_keys(views[0].frame.intrinsics),
+        "frames": [],
+    }
+    for view in views:
+        frame = {"file_path": f"images/{view.frame.name}.png", "transform_matrix": opengl(view).tolist()}
+        write_image(folder / frame["file_path"], pixels(view))
+        if view.frame.depth is not None:
+            frame["depth_file_path"] = f"depth/{view.frame.name}.png"
+            write_image(folder / frame["depth_file_path"], millimetres(view))
+        content["frames"].append(frame)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def edit_keys(file: Path, **changes: Any) -> None:
+    """Set keys of a JSON object; None takes them away."""
+    new = json.loads(file.read_text()) | changes
+    file.write_text(json.dumps({key: value for key, value in new.items() if value is not None}))
+
+
+def edit_frame(file: Path, number: int = 1, **changes: Any) -> None:
+    """Set keys of a frame of ``transforms.json``; None takes them away."""
+    frames = json.loads(file.read_text())["frames"]
+    frames[number] = {k: v for k, v in (frames[number] | changes).items() if v is not None}
+    edit_keys(file, frames=frames)
+
+
+def write_colmap(folder: Path, views: Sequence[View], binary: bool = False) -> Path:
+    """A project without points."""
+    camera, names = views[0].frame.intrinsics, [f"{view.frame.name}.png" for view in views]
+    for name, view in zip(names, views, strict=True):
+        write_image(folder / "images" / name, pixels(view))
+    lens = [*camera.distortion, 0, 0, 0, 0][:4]
+    numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *lens]
+    posed = [(name, 1, view.T_ref_camera, "1.5 2.5 -1") for name, view in zip(names, views, strict=True)]
+    write_model(folder / "sparse/0", [f"1 OPENCV {' '.join(map(str, numbers))}"], posed)
+    if binary:
+        to_binary(folder / "sparse/0")
+    return folder
+
+
+class Layout(NamedTuple):
+    reader: str
+    write: Callable[[Path, Sequence[View]], Path]
+    depth: bool = True
+    times: bool = False
+    lossless: bool = True  # 8 bits of colour come back as they were
+    unit: str | None = "metres"
+    options: Mapping[str, Any] = MappingProxyType({})  # of ``open_dataset``
+
+
+LAYOUTS = {
+    "record3d": Layout("record3d", write_record3d, times=True, lossless=False),
+    "record3d, unpacked": Layout("record3d", write_unpacked_record3d, times=True, lossless=False),
+    "polycam": Layout("polycam", write_polycam, times=True, lossless=False),
+    "polycam, not corrected": Layout("polycam", partial(write_polycam, corrected=False), times=True, lossless=False),
+    "stray-scanner": Layout("stray-scanner", write_stray_scanner, times=True, lossless=False),
+    "tum": Layout("tum", write_tum, times=True),
+    "seven-scenes": Layout("seven-scenes", write_seven_scenes, options={"register_depth": False}),
+    "twelve-scenes": Layout("twelve-scenes", write_twelve_scenes, lossless=False),
+    "reality-capture": Layout("reality-capture", write_reality_capture, depth=False, unit=None),
+    "kitti": Layout("kitti", write_kitti, depth=False, times=True),
+    "euroc": Layout("euroc", write_euroc, depth=False, times=True),
+    "transforms": Layout("transforms", write_nerfstudio, unit=None),
+    "colmap": Layout("colmap", write_colmap, depth=False, unit=None),
+    "colmap, binary": Layout("colmap", partial(write_colmap, binary=True), depth=False, unit=None),
+}  # fmt: skip
+
+
+# What is said of them
+
+
+def read_all(folder: Path, **options: Any) -> dict[str, View]:
+    """Return all views of a dataset by name."""
+    dataset = open_dataset(folder, **options)
+    return {view.frame.name: view for split in dataset.splits for view in dataset.views(split)}
+
+
+def every_frame(folder: Path, **options: Any) -> object:
+    return list(open_sequence(folder, **options))
+
+
+def remarks_of(folder: Path, **options: Any) -> list[str]:
+    """Return the remarks that opening and reading a dataset causes."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read_all(folder, **options)
+    said = [str(warning.message) for warning in caught]
+    assert not any("\n" in text for text in said)
+    return said
+
+
+def message(folder: Path, read: Callable[..., object] = read_all, **options: Any) -> str:
+    """Return the one line that is said of a capture that cannot be read, which names it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(InputError) as caught:
+            read(folder, **options)
+    assert "\n" not in str(caught.value)
+    assert str(folder) in str(caught.value)
+    return str(caught.value)

@@ -26,12 +26,8 @@ class Known:
     views: Sequence[View]
     names: Sequence[str]  # of the model's images
     points: torch.Tensor  # (p 3)
-    seen: list[
-        torch.Tensor
-    ]  # for each view, which of the points it observes, and of the wrong ones that follow them
-    wrong: (
-        int  # how many of the last points are wrong: a good one moved towards the origin, with a large error
-    )
+    seen: list[torch.Tensor]  # for each view, which of the points it observes
+    wrong: int  # of the last points: a good one moved towards the origin, with a large error
 
     def truth(self, view: int) -> torch.Tensor:
         """The good points that a view observes, in its camera's frame."""
@@ -57,8 +53,7 @@ def known(
     points = torch.cat(found)
     seen = [_sees(view, points, agree) for view in views]
     twice = (torch.stack(seen).sum(0) > 1).nonzero()[:, 0]
-    false = torch.full((wrong,), True)
-    seen = [torch.cat([s[twice], false]).nonzero()[:, 0] for s in seen]
+    seen = [torch.cat([s[twice], torch.full((wrong,), True)]).nonzero()[:, 0] for s in seen]
     return Known(views, names, torch.cat([points[twice], 0.3 * points[twice][:wrong]]), seen, wrong)
 
 
@@ -73,34 +68,59 @@ def _sees(view: View, points: torch.Tensor, agree: float) -> torch.Tensor:
 
 
 def write(folder: Path, what: Known) -> Path:
-    """Write a model in the format of COLMAP's documentation and return its folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    camera = what.views[0].frame.intrinsics
+    """Write the model of what is known, in its own world and unit, and return its folder."""
+    camera, images = what.views[0].frame.intrinsics, []
     size = f"{camera.width} {camera.height} {camera.fx} {camera.fy} {camera.cx} {camera.cy}"
-    (folder / "cameras.txt").write_text(f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE {size}\n")
-    images, tracks = ["# two lines an image\n"], [list[str]() for _ in what.points]
+    tracks = [list[str]() for _ in what.points]
     for number, (view, name, seen) in enumerate(zip(what.views, what.names, what.seen, strict=True), start=1):
-        T = _camera_model(view)
-        x, y, z, w = Rotation.from_matrix(T.rotation.numpy()).as_quat()
-        pose = " ".join(repr(float(v)) for v in (w, x, y, z, *T.translation))
-        images.append(f"{number} {pose} 1 {name}\n")
         there = view.T_ref_camera.inverse().apply(what.points[seen])
         pixels = camera.project(there).nan_to_num(1.0).tolist()
         observed = [f"{u} {v} {p + 1}" for (u, v), p in zip(pixels, seen.tolist(), strict=True)]
-        images.append(" ".join(["1.5 2.5 -1", *observed]) + "\n")  # a key point that became no point
         for place, p in enumerate(seen.tolist(), start=1):
             tracks[p].append(f"{number} {place}")
-    (folder / "images.txt").write_text("".join(images))
-    points = T_MODEL_WORLD.apply(what.points) / UNIT
+        T_model_camera = T_MODEL_WORLD @ view.T_ref_camera.to(torch.float64)
+        T_model_camera = SE3(T_model_camera.rotation, T_model_camera.translation / UNIT)
+        keypoints = " ".join(["1.5 2.5 -1", *observed])  # the first became no point
+        images.append((name, 1, T_model_camera, keypoints))
     rows = []
+    points = T_MODEL_WORLD.apply(what.points) / UNIT
     for p, (point, track) in enumerate(zip(points.tolist(), tracks, strict=True)):
         error = GOOD if p < what.good else BAD
-        rows.append(" ".join([str(p + 1), *map(repr, point), "9 8 7", str(error), *track]) + "\n")
-    (folder / "points3D.txt").write_text("".join(rows))
+        rows.append(" ".join([str(p + 1), *map(repr, point), "9 8 7", str(error), *track]))
+    return write_model(folder, [f"1 PINHOLE {size}"], images, rows)
+
+
+def write_model(
+    folder: Path,
+    cameras: Sequence[str],
+    images: Sequence[tuple[str, int, SE3, str]],
+    points: Sequence[str] = (),
+) -> Path:
+    """Write a model in the text format of COLMAP's documentation and return its folder.
+
+    An image is its name, the number of its camera, ``T_model_camera``, and its row of keypoints.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
+    for number, (name, camera, T_model_camera, keypoints) in enumerate(images, start=1):
+        T = T_model_camera.inverse()
+        x, y, z, w = Rotation.from_matrix(T.rotation.numpy()).as_quat()
+        pose = " ".join(repr(float(v)) for v in (w, x, y, z, *T.translation))
+        rows += [f"{number} {pose} {camera} {name}", keypoints]
+    for file, lines in (
+        ("cameras", ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *cameras]),
+        ("images", rows),
+        ("points3D", ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", *points]),
+    ):
+        (folder / f"{file}.txt").write_text("\n".join(lines) + "\n")
     return folder
 
 
-def _camera_model(view: View) -> SE3:
-    """Return the transform from the model's frame to the camera's, both in the model's unit."""
-    T_model_camera = T_MODEL_WORLD @ view.T_ref_camera.to(torch.float64)
-    return SE3(T_model_camera.rotation, T_model_camera.translation / UNIT).inverse()
+def to_binary(model: Path) -> Path:
+    """Replace the text files of a model by the binary ones that pycolmap writes, and return its folder."""
+    import pycolmap
+
+    pycolmap.Reconstruction(str(model)).write_binary(str(model))
+    for file in model.glob("*.txt"):
+        file.unlink()
+    return model

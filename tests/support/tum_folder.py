@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,15 +21,15 @@ class Recorded:
 
     time: float
     view: View  # whose pose is the truth at ``time``
-    depth_late: float = 0.004  # seconds by which the depth image is later than the colour image
 
 
-def write_recording(folder: Path, frames: Sequence[Recorded], seed: int = 0) -> Path:
+def write_recording(folder: Path, frames: Sequence[Recorded]) -> Path:
     """Write images, lists, and a ground truth that passes through the poses of the frames at constant velocities.
 
-    No sample of the ground truth is at the time of an image: each frame has one 3 ms before and one 6 ms after.
+    Depth is 4 ms later than colour. No sample of the ground truth is at the time of an image: each frame has one 3 ms before
+    and one 6 ms after.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     rows: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
@@ -38,15 +38,15 @@ def write_recording(folder: Path, frames: Sequence[Recorded], seed: int = 0) -> 
         rows["rgb"].append(_write(folder, "rgb", frame.time, rgb))
         if frame.view.frame.depth is not None:
             steps = (frame.view.frame.depth.double().numpy() * 5000).round().astype(np.uint16)
-            rows["depth"].append(_write(folder, "depth", frame.time + frame.depth_late, steps))
+            rows["depth"].append(_write(folder, "depth", frame.time + 0.004, steps))
         turn, shift = generator.normal(size=(2, 3))
         for after in (-0.003, 0.006):
             rows["groundtruth"].append(_pose_row(frame, turn * after, shift * after, after))
-    for name, columns in (
-        ("rgb", "filename"),
-        ("depth", "filename"),
-        ("groundtruth", "tx ty tz qx qy qz qw"),
-    ):
+    for name, columns in {
+        "rgb": "filename",
+        "depth": "filename",
+        "groundtruth": "tx ty tz qx qy qz qw",
+    }.items():
         (folder / f"{name}.txt").write_text(HEAD.format(name, columns) + "".join(rows[name]))
     return folder
 
@@ -62,3 +62,10 @@ def _pose_row(frame: Recorded, turn: np.ndarray, shift: np.ndarray, after: float
     rotation = Rotation.from_matrix(T.rotation.numpy()) * Rotation.from_rotvec(turn)
     numbers = [*(T.translation.numpy() + shift), *rotation.as_quat()]
     return " ".join([f"{frame.time + after:.6f}", *(f"{number:.12f}" for number in numbers)]) + "\n"
+
+
+def edit_rows(file: Path, change: Callable[[list[str]], list[str]]) -> None:
+    """Change the rows of a list; comments before them stay."""
+    lines = file.read_text().splitlines()
+    head = [line for line in lines if line.startswith("#")]
+    file.write_text("\n".join([*head, *change([line for line in lines if not line.startswith("#")])]) + "\n")
