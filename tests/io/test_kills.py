@@ -96,6 +96,7 @@ def test_a_disk_that_is_full_at_the_second_write_leaves_whole_files(
     assert bidnerf(*words).status == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_report_killed_before_its_page_begins_anew(bidnerf: Run, tmp_path: Path) -> None:
     out = tmp_path / "report"
