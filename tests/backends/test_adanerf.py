@@ -346,7 +346,7 @@ def test_training_resumes_in_any_phase(at: int) -> None:
 @pytest.mark.parametrize("depth", [True, False])
 def test_samples_become_fewer_and_the_picture_stays(depth: bool) -> None:
     views = [v if depth else replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views()]
-    config = replace(SMALL, steps=300, sparsity_weight=0.2)
+    config = replace(SMALL, steps=150, sparsity_weight=0.2)
     field, report = backend.build(config, BOUNDS), Recorder()
     before = colour_error(field)
     backend.train(field, views, config, report)

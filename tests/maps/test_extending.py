@@ -16,20 +16,15 @@ from bidnerf_core.testing.textured_field import training_views, view
 from commands import Run
 from photo_files import write_photo
 
-STEPS = 12
-BAKE = bn.BakeConfig(rays=20_000, measured=60_000, cells=20_000)
+STEPS = 6
+BAKE = bn.BakeConfig(rays=10_000, measured=30_000, cells=10_000)
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of seven of ten images of the textured ground."""
     folder = tmp_path_factory.mktemp("extend") / "map"
-    bn.train(
-        list(training_views()[:7]),
-        out=folder,
-        config=tiny.config(25),
-        bake=BAKE,
-    )
+    bn.train(list(training_views()[:7]), out=folder, config=tiny.config(25), bake=BAKE)
     return folder
 
 

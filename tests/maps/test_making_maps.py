@@ -25,7 +25,7 @@ from bidnerf_core.maps.description import load_info
 from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
 
-BAKE = BakeConfig(cells=20_000)
+BAKE = BakeConfig(cells=5000)
 DESCENT = bn.settings_of("bid", {"rays": 64, "max_steps": 3})
 
 
@@ -52,6 +52,12 @@ def assert_same_field(one: bn.Map, other: bn.Map) -> None:
 def scene() -> bn.Map:
     """A map in memory, trained and baked."""
     return trained(bake=BAKE)
+
+
+@pytest.fixture(scope="module")
+def whole() -> bn.Map:
+    """A map in memory, trained without an interruption."""
+    return trained()
 
 
 def test_a_map_in_memory_answers_as_the_one_that_is_saved_and_loaded(scene: bn.Map, tmp_path: Path) -> None:
@@ -83,8 +89,7 @@ def test_a_folder_a_path_a_dataset_and_views_give_the_same_map(tmp_path: Path) -
         assert_same_field(stored, other)
 
 
-def test_an_incomplete_map_is_saved_with_what_resuming_needs(tmp_path: Path) -> None:
-    whole = trained()
+def test_an_incomplete_map_is_saved_with_what_resuming_needs(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled):
         trained(tmp_path / "map", cancel=after(5))
     half = bn.load_map(tmp_path / "map").save(tmp_path / "copy")
@@ -106,8 +111,7 @@ def names_of_callers() -> set[str]:
     return names
 
 
-def test_cancelled_and_resumed_equals_uninterrupted(tmp_path: Path) -> None:
-    whole = trained(tmp_path / "whole")
+def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled, match=r"saved after step 5; --resume"):
         trained(tmp_path / "half", cancel=after(5))
     info = load_info(tmp_path / "half")
@@ -134,7 +138,9 @@ class Failed(Exception):
     pass
 
 
-def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(tmp_path: Path) -> None:
+def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(
+    whole: bn.Map, tmp_path: Path
+) -> None:
     def fail(now: bn.Progress) -> None:
         if now.stage == "training" and now.done == 7:
             raise Failed("the caller's own")
@@ -142,7 +148,7 @@ def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(tmp_
     with pytest.raises(Failed, match="the caller's own"):
         trained(tmp_path / "map", progress=fail, checkpoint_seconds=0)
     assert load_info(tmp_path / "map").step == 6
-    assert_same_field(bn.resume(tmp_path / "map", tiny.views(), bake=False), trained())
+    assert_same_field(bn.resume(tmp_path / "map", tiny.views(), bake=False), whole)
 
 
 def test_progress_counts_and_remarks_are_logged(
@@ -159,13 +165,13 @@ def test_progress_counts_and_remarks_are_logged(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_thread_trains_while_another_localizes(scene: bn.Map) -> None:
-    expected, whole = answer(scene), trained()
+def test_a_thread_trains_while_another_localizes(scene: bn.Map, whole: bn.Map) -> None:
+    expected = answer(scene)
     with ThreadPoolExecutor(2) as pool:
-        training = pool.submit(trained, config=tiny.config(40))
+        training = pool.submit(trained, config=tiny.config(30))
         found = [pool.submit(answer, scene).result() for _ in range(3)]
         again = pool.submit(trained)
-        assert training.result().info.step == 40
+        assert training.result().info.step == 30
         assert_same_field(again.result(), whole)
     for one in found:
         assert torch.equal(one.T_world_camera.matrix(), expected.T_world_camera.matrix())

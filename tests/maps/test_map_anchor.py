@@ -53,9 +53,10 @@ def test_any_anchor_comes_back_as_it_was(anchor: Anchor, tmp_path: Path) -> None
     assert load_anchor(tmp_path) == anchor
 
 
-@pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
 @pytest.mark.parametrize(
-    "new", [Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5), None], ids=["moved", "dropped"]
+    ("new", "error"),
+    [(Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5), Stopped()), (None, Stopped()), (None, FULL)],
+    ids=["moved", "dropped", "dropped, full"],
 )
 def test_a_save_that_stops_anywhere_leaves_a_map_with_its_own_anchor(
     new: Anchor | None, error: BaseException, tmp_path: Path, trained: Map

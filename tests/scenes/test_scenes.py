@@ -152,7 +152,7 @@ def test_moving_world_and_camera_leaves_the_depth_as_it_was() -> None:
 def test_twice_the_samples_change_little(scene: ClosedFormScene) -> None:
     """Textures are band-limited: what is left of aliasing is at contours."""
     camera = CAMERA.scaled(2.5)
-    for T in views_of(scene):
+    for T in views_of(scene, 2):
         usual, fine = scene.render(camera, T).rgb, scene.render(camera, T, supersample=4).rgb
         assert (usual - fine).square().mean().sqrt() < 0.02
 
