@@ -73,8 +73,8 @@ def record(kind: Any, **given: SearchStrategy[Any]) -> SearchStrategy[Any]:
     if kind in SPECIAL:
         return SPECIAL[kind]()
     if dataclasses.is_dataclass(kind):
-        hints = get_type_hints(kind)
-        fields = {f.name: record(hints[f.name]) for f in dataclasses.fields(kind) if f.name not in given}
+        hints, names = get_type_hints(kind), [f.name for f in dataclasses.fields(kind)]
+        fields = {name: record(hints[name]) for name in names if name not in given}
         return st.builds(kind, **(fields | given))
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Literal:
