@@ -36,7 +36,7 @@ SMALL = AdaNerfConfig(
 
 class TestAdaNerf(BackendContract):
     backend = backend
-    config = SMALL
+    config = replace(SMALL, samples_per_step=2048)
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ SMALL = VanillaConfig(
 
 class TestVanilla(BackendContract):
     backend = backend
-    config = SMALL
+    config = replace(SMALL, samples_per_step=1024)
 
 
 def built(**changes: object) -> VanillaField:

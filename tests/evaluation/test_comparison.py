@@ -20,10 +20,11 @@ from bidnerf_core.evaluation.comparison import Comparison, map_bytes, map_labels
 from bidnerf_core.evaluation.evaluate import run_comparison
 from bidnerf_core.evaluation.plots import comparison_figure
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
+from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
 from bidnerf_core.io.json import from_plain
+from trial_results import trial_result
 
 pytestmark = pytest.mark.slow
 
@@ -63,12 +64,7 @@ def compared(maps: list[Path], plan: Plan) -> Comparison:
 
 def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResult:
     """One whose distance went as ``trace`` says; one step took ``seconds`` in all."""
-    distances = tuple(times * x for x in trace)
-    errors = Trace(distances, tuple(0.0 for _ in trace))
-    return TrialResult(
-        None, True, len(trace) - 1, seconds, None, 0.0, "fog", "bid", ScalarPoseError(distances[-1], 0.0), "r_0", 0,
-        ScalarPoseError(distances[0], 0.0), errors, "", 1000, {}, "w", Trial("m", "d", ("r_0",)),
-    )  # fmt: skip
+    return trial_result(Trial("m", "d", ("r_0",)), [times * x for x in trace], seconds=seconds)
 
 
 def test_every_map_is_tried_on_the_same_frames_from_the_same_starts(compared: Comparison) -> None:
@@ -211,7 +207,7 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
 
 
 def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--trials", "1", "--rays", "32", "--max-steps", "2", "--size", "0.3", "--frame", "t_0001", "--json"]
+    words = ["--rays", "32", "--max-steps", "2", "--size", "0.3", "--frame", "t_0001", "--trials", "1", "--json"]  # fmt: skip
     assert main(["compare", str(maps[0]), str(data), *words]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["size"] == [0.3]

@@ -22,11 +22,12 @@ from bidnerf_core.evaluation.groups import grouped
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.plots import draw_faults, fault_curves
 from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
+from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import trial_views
 from bidnerf_core.evaluation.workers import InThisProcess
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes.closed_form_data import closed_form_data
+from trial_results import trial_result
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1", "--size", "0.3"]
@@ -93,10 +94,7 @@ def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: py
 def result(fault: str, seed: int, right: bool, converged: bool) -> TrialResult:
     """Return a result without a start that is right or wrong, and converged or not."""
     error = 0.001 if right else 1.0
-    return TrialResult(
-        None, converged, 1, 2.0, None, 0.1, "fog", "auto", ScalarPoseError(error, error), "0003", seed, None,
-        Trace((error,), (error,)), "done", 2**30, {}, "weights-1", trial(fault, seed),
-    )  # fmt: skip
+    return trial_result(trial(fault, seed), [error], [error], converged=converged, start_error=None)
 
 
 @pytest.fixture

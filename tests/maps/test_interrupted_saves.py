@@ -19,7 +19,7 @@ from bidnerf_core.captures.inria_cameras import write_inria_cameras
 from bidnerf_core.evaluation.comparison import Comparison
 from bidnerf_core.evaluation.provenance import note_run, provenance, read_runs, write_record
 from bidnerf_core.evaluation.results import ResultTable
-from bidnerf_core.evaluation.trial import Trace, Trial, TrialResult
+from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.io.files import is_temporary, write_file
 from bidnerf_core.localization.tracking.motion import Clock
 from bidnerf_core.localization.tracking.state import TrackerState, save_state
@@ -33,6 +33,7 @@ from bidnerf_core.results.plot_style import new_figure, write_figure
 from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage
 from interruptions import FULL, Stopped, outcomes
 from test_storage import CAMERAS, PARTS, info, names, state
+from trial_results import trial_result
 
 CAMERA = bn.Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)
 POSE = bn.SE3.identity().to("cpu", torch.float64)
@@ -78,11 +79,8 @@ def answers(path: Path, number: int) -> None:
 
 
 def results(path: Path, number: int) -> None:
-    ResultTable(tuple(
-        TrialResult(None, True, n, 1.0, None, None, "fog", "bid", None, "a", n, None, Trace((1.0,), (1.0,)), "", 0, {}, "w",
-                    Trial("m", "d", ("a",), seed=n))
-        for n in range(number)
-    )).save(path)  # fmt: skip
+    trials = [Trial("m", "d", ("a",), seed=n) for n in range(number)]
+    ResultTable(tuple(trial_result(trial, [1.0]) for trial in trials)).save(path)
 
 
 SAVERS: dict[str, Saver] = {

@@ -333,7 +333,7 @@ def test_photos_to_map_to_pose_to_overlay(tmp_path: Path) -> None:
     script = """
 import bidnerf_core as bn
 data = bn.open_dataset("capture")
-scene = bn.train(data, config={"steps": 3, "samples_per_step": 2048}, bake=False)
+scene = bn.train(data, config=config, bake=False)
 print(scene.describe())
 view = data.views("test", ["t_0000"])[0]
 start = bn.perturb(view.T_ref_camera, translation=0.1, rotation_deg=5, seed=0)
@@ -342,7 +342,7 @@ print(found.outcome, bn.pose_error(found.T_world_camera, view.T_ref_camera))
 picture = bn.overlay(scene, view.frame, found)
 """
     assert len(script.strip().splitlines()) <= 12
-    names: dict[str, Any] = {}
+    names: dict[str, Any] = {"config": tiny.config(3)}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         exec(script, names)

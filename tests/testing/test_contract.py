@@ -39,7 +39,7 @@ CHECKS = [name for name in dir(BackendContract) if name.startswith("test_")]
 
 class TestHashGrid(BackendContract):
     backend = hashgrid
-    config = tiny.config(steps=60, learning_rate=0.05)
+    config = tiny.config(steps=60, learning_rate=0.05, samples_per_step=1024)
 
 
 @dataclass(frozen=True)
