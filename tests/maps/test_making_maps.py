@@ -6,7 +6,6 @@ import logging
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -91,29 +90,24 @@ def test_a_folder_a_path_a_dataset_and_views_give_the_same_map(tmp_path: Path) -
 
 def test_an_incomplete_map_is_saved_with_what_resuming_needs(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled):
-        trained(tmp_path / "map", cancel=after(5))
+        trained(tmp_path / "map", **after(5))
     half = bn.load_map(tmp_path / "map").save(tmp_path / "copy")
     assert not half.info.complete
     assert_same_field(bn.resume(tmp_path / "copy", tiny.views(), bake=False), whole)
 
 
-def after(steps: int) -> Callable[[], bool]:
-    """Return a ``cancel`` that is True once it was asked ``steps`` times in the training itself."""
-    asked = iter(range(10**6))
-    return lambda: "fit" in names_of_callers() and next(asked) >= steps - 1
-
-
-def names_of_callers() -> set[str]:
-    frame, names = sys._getframe(1), set()
-    while frame is not None:
-        names.add(frame.f_code.co_name)
-        frame = frame.f_back  # type: ignore[assignment]
-    return names
+def after(steps: int) -> dict[str, Any]:
+    """Return the options of a training that is cancelled in that step."""
+    seen = list[bn.Progress]()
+    return {
+        "progress": seen.append,
+        "cancel": lambda: any(now.stage == "training" and now.done >= steps for now in seen),
+    }
 
 
 def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled, match=r"saved after step 5; --resume"):
-        trained(tmp_path / "half", cancel=after(5))
+        trained(tmp_path / "half", **after(5))
     info = load_info(tmp_path / "half")
     assert (info.step, info.complete) == (5, False)
     resumed = bn.resume(tmp_path / "half", tiny.views(), bake=False)
@@ -131,7 +125,7 @@ def test_cancelling_before_training_leaves_nothing(tmp_path: Path) -> None:
         trained(tmp_path / "map", cancel=lambda: True)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(bn.Cancelled, match="nothing is stored"):
-        trained(cancel=after(3))
+        trained(**after(3))
 
 
 class Failed(Exception):
