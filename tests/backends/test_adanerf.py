@@ -349,11 +349,11 @@ def test_samples_become_fewer_and_the_picture_stays(depth: bool) -> None:
 
 def test_rooms_are_learnt_from_within() -> None:
     """Seen from its middle."""
-    room = demo_room()
+    room, config = demo_room(), replace(SMALL, steps=100)
     camera = Intrinsics(16.0, 16.0, 12.0, 12.0, 24, 24)
     views: list[View] = seen_from(room, camera, look_around(room.bounds, 8))
-    field, report = backend.build(replace(SMALL, steps=150), room.bounds), Recorder()
-    backend.train(field, views, replace(SMALL, steps=150), report)
+    field, report = backend.build(config, room.bounds), Recorder()
+    backend.train(field, views, config, report)
     losses = [p.psnr for p in report.steps]
     assert sum(losses[-20:]) / 20 > sum(losses[:20]) / 20 + 2
     batch = RayBank(views, room.bounds).draw(256, torch.Generator().manual_seed(1))
