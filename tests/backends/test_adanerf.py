@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -19,18 +18,10 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, render, rendering_weights
 from bidnerf_core.frames import View
-from bidnerf_core.scenes import demo_object, demo_room, look_around
+from bidnerf_core.scenes import demo_room, look_around
 from bidnerf_core.scenes import views as seen_from
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import (
-    SIDE,
-    BackendContract,
-    Recorder,
-    awkward_rays,
-    colour_error,
-    points,
-    rgbd_views,
-)
+from bidnerf_core.testing import BackendContract, Recorder, awkward_rays, colour_error, rgbd_views
 from bidnerf_core.training import RayBank, TrainingBatch
 from tiny import black_batch
 
@@ -42,7 +33,7 @@ SMALL = AdaNerfConfig(
 
 class TestAdaNerf(BackendContract):
     backend = backend
-    config = SMALL
+    config = replace(SMALL, samples_per_step=2048)
 
 
 @pytest.fixture
@@ -120,15 +111,6 @@ def test_the_best_bins_are_chosen_nearest_first() -> None:
     assert chosen(samples, scores, threshold=0.85, most=3).valid.sum() == 1
     few = chosen(samples, scores, threshold=0.95, most=3)
     assert few.starts[few.valid].tolist() == [1.0]
-
-
-def test_no_bin_is_chosen_beyond_the_limits_of_a_ray(field: AdaNerfField, rays: Rays) -> None:
-    near = rays.near + 0.4 * (rays.far - rays.near)
-    narrow = replace(rays, near=near, far=near + 0.3 * (rays.far - rays.near))
-    found = field.sampler(narrow)
-    assert bool((found.starts >= narrow.near[:, None] - 1e-5)[found.valid].all())
-    assert bool((found.ends <= narrow.far[:, None] + 1e-5)[found.valid].all())
-    assert int(found.valid.sum(-1)[hit(narrow)].min()) >= 1
 
 
 def test_the_oracle_is_asked_once_a_call(field: AdaNerfField, rays: Rays) -> None:
@@ -335,7 +317,7 @@ def test_phases_advance_by_schedule_and_the_oracle_is_frozen_in_the_last() -> No
     assert learned == [True] * 12 + [False] * 8
 
 
-@pytest.mark.parametrize("at", [3, 6, 9, 12, 16])
+@pytest.mark.parametrize("at", [3, 9, 16])
 def test_training_resumes_in_any_phase(at: int) -> None:
     config = replace(SMALL, steps=20, dense_part=0.3, soft_part=0.3)
     whole, report = backend.build(config, BOUNDS), Recorder(due=[at])
@@ -351,7 +333,7 @@ def test_training_resumes_in_any_phase(at: int) -> None:
 @pytest.mark.parametrize("depth", [True, False])
 def test_samples_become_fewer_and_the_picture_stays(depth: bool) -> None:
     views = [v if depth else replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views()]
-    config = replace(SMALL, steps=300, sparsity_weight=0.2)
+    config = replace(SMALL, steps=150, sparsity_weight=0.2)
     field, report = backend.build(config, BOUNDS), Recorder()
     before = colour_error(field)
     backend.train(field, views, config, report)
@@ -364,11 +346,11 @@ def test_samples_become_fewer_and_the_picture_stays(depth: bool) -> None:
 
 def test_rooms_are_learnt_from_within() -> None:
     """Seen from its middle."""
-    room = demo_room()
+    room, config = demo_room(), replace(SMALL, steps=100)
     camera = Intrinsics(16.0, 16.0, 12.0, 12.0, 24, 24)
     views: list[View] = seen_from(room, camera, look_around(room.bounds, 8))
-    field, report = backend.build(replace(SMALL, steps=150), room.bounds), Recorder()
-    backend.train(field, views, replace(SMALL, steps=150), report)
+    field, report = backend.build(config, room.bounds), Recorder()
+    backend.train(field, views, config, report)
     losses = [p.psnr for p in report.steps]
     assert sum(losses[-20:]) / 20 > sum(losses[:20]) / 20 + 2
     batch = RayBank(views, room.bounds).draw(256, torch.Generator().manual_seed(1))
@@ -392,22 +374,3 @@ def test_settings_are_judged() -> None:
 def test_presets() -> None:
     paper = AdaNerfConfig.paper()
     assert (paper.width, paper.layers, paper.bins) == (256, 8, 128)
-
-
-def test_no_unit_of_length_matters(rays: Rays) -> None:
-    """A scene twice as large has densities half as high and looks the same."""
-    double = replace(
-        BOUNDS,
-        lower=tuple(2 * x for x in BOUNDS.lower),
-        upper=tuple(2 * x for x in BOUNDS.upper),
-        near=2 * BOUNDS.near,
-        far=2 * BOUNDS.far,
-    )
-    small, large = backend.build(SMALL, BOUNDS), backend.build(SMALL, double)
-    positions, directions = points(50)
-    a, b = small.query(positions, directions), large.query(2 * positions, directions)
-    torch.testing.assert_close(a.density, 2 * b.density)
-    seen = render(large, Rays(2 * rays.origins, rays.directions, 2 * rays.near, 2 * rays.far))
-    torch.testing.assert_close(render(small, rays).rgb, seen.rgb, atol=1e-4, rtol=0)
-    assert math.isclose(large.side, 2 * SIDE)
-    assert max(demo_object().bounds.size) == SIDE

@@ -11,7 +11,9 @@ from torch import nn
 
 from bidnerf_adanerf import backend as adanerf
 from bidnerf_core.backend import Backend, QuickConfig, RecipeBackend, quick_config
+from bidnerf_core.fields import Rays, SceneBounds, render
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf_core.testing import awkward_rays, points
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
@@ -57,7 +59,31 @@ def test_the_recipe_gets_what_train_was_given() -> None:
     assert given == [field, [], config, report]
 
 
-@pytest.mark.parametrize("backend", [vanilla, adanerf, hashgrid], ids=lambda b: b.config_type.__name__)
+bundled = pytest.mark.parametrize(
+    "backend", [vanilla, adanerf, hashgrid], ids=lambda backend: backend.config_type.__name__
+)
+
+
+@bundled
+@pytest.mark.parametrize("scale", [0.01, 1000.0])
+def test_neither_unit_nor_origin_of_the_world_matters(backend: Any, scale: float) -> None:
+    """A scaled and moved world has the same colours at the same places and along the same rays, and absorbs as much."""
+    shift = torch.tensor([3.0, -2.0, 5.0]) * scale
+    lower, upper = (tuple((torch.tensor(c) * scale + shift).tolist()) for c in (BOUNDS.lower, BOUNDS.upper))
+    bounds = SceneBounds(lower, upper, BOUNDS.near * scale, BOUNDS.far * scale)  # type: ignore[arg-type]
+    here, there = (
+        backend.build(quick_config(backend), box).requires_grad_(False) for box in (BOUNDS, bounds)
+    )
+    positions, directions = points(50)
+    one, other = here.query(positions, directions), there.query(positions * scale + shift, directions)
+    torch.testing.assert_close(other.density * scale, one.density, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(other.rgb, one.rgb, rtol=1e-3, atol=1e-3)
+    rays = awkward_rays()["rays from outside"]
+    moved = Rays(rays.origins * scale + shift, rays.directions, rays.near * scale, rays.far * scale)
+    torch.testing.assert_close(render(there, moved).rgb, render(here, rays).rgb, rtol=0, atol=1e-4)
+
+
+@bundled
 def test_bundled_backends_are_backends(backend: Any) -> None:
     assert isinstance(backend, Backend)
     assert isinstance(quick_config(backend), backend.config_type)

@@ -113,7 +113,7 @@ def test_agrees_with_the_reference(features: int, interpolation: Interpolation, 
 
 
 @both_interpolations
-@pytest.mark.parametrize("features", [1, 2, 4])
+@pytest.mark.parametrize("features", [1, 4])
 @pytest.mark.parametrize("log2_table_size", [4, 7, 16])  # all levels hashed, one dense, all dense
 @pytest.mark.parametrize(
     "most_entries", [2**23, 2**7]
@@ -318,15 +318,6 @@ def test_threads_do_not_disturb_each_other() -> None:
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda batch: position_gradient(encoding, batch), batches))
     assert all(map(torch.equal, alone, together))
-
-
-def test_state_dict_round_trip() -> None:
-    first, second = make(), make()
-    second.load_state_dict(first.state_dict())
-    positions = torch.rand(30, 3, dtype=torch.float64)
-    assert torch.equal(first(positions), second(positions))
-    for ours, theirs in zip(first.tables, second.tables, strict=True):
-        assert torch.equal(ours, theirs)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

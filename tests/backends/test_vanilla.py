@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
@@ -21,22 +18,18 @@ from bidnerf_core.fields import (
     RadianceField,
     RaySampler,
     RaySamples,
-    SceneBounds,
     Stratified,
     VoxelGrid,
     encoded_width,
     frequency_encoding,
     levels,
     octaves,
-    query_samples,
     render,
 )
 from bidnerf_core.frames import View
-from bidnerf_core.io import from_plain, to_plain
-from bidnerf_core.maps import MapInfo, load_map, save_map
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf_core.testing import SIDE, BackendContract, Recorder, points, rgb_views, rgbd_views
-from bidnerf_core.training import RayBank, Supervision, TrainingState, ray_termination, supervised_loss
+from bidnerf_core.training import RayBank, Supervision, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from bidnerf_vanilla.recipe import step_outcome
@@ -50,7 +43,7 @@ SMALL = VanillaConfig(
 
 class TestVanilla(BackendContract):
     backend = backend
-    config = SMALL
+    config = replace(SMALL, samples_per_step=1024)
 
 
 def built(**changes: object) -> VanillaField:
@@ -125,31 +118,6 @@ def test_the_paper_has_the_papers_network() -> None:
 
 
 # The field.
-
-
-@pytest.mark.parametrize("level", [0, 1])
-def test_derivatives_by_position_and_direction(level: int) -> None:
-    field = levels(built().double().requires_grad_(False))[level]
-    positions, directions = (x.double().requires_grad_() for x in points(6))
-
-    def ask(p: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        values = field.query(p, d)
-        return values.density, values.rgb
-
-    assert torch.autograd.gradcheck(ask, (positions, directions), eps=1e-7, atol=1e-5)
-
-
-@pytest.mark.parametrize("scale", [0.01, 1000.0])
-def test_neither_unit_nor_origin_of_the_world_matters(scale: float) -> None:
-    """A scaled and moved world has the same colours at the same places, and as much is absorbed on the way."""
-    shift = torch.tensor([3.0, -2.0, 5.0]) * scale
-    lower, upper = (tuple((torch.tensor(c) * scale + shift).tolist()) for c in (BOUNDS.lower, BOUNDS.upper))
-    bounds = SceneBounds(lower, upper, BOUNDS.near * scale, BOUNDS.far * scale)  # type: ignore[arg-type]
-    moved = backend.build(SMALL, bounds)
-    positions, directions = points(50)
-    here, there = built().query(positions, directions), moved.query(positions * scale + shift, directions)
-    torch.testing.assert_close(there.density * scale, here.density, rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(there.rgb, here.rgb, rtol=1e-3, atol=1e-3)
 
 
 def test_an_untrained_field_is_nearly_transparent() -> None:
@@ -329,12 +297,7 @@ def test_a_step_takes_more_rays_where_there_is_little_room() -> None:
     assert counted[0] < 0.7 * counted[1]
 
 
-# Configuration and storage.
-
-
-@pytest.mark.parametrize("config", [VanillaConfig(), VanillaConfig.paper(), SMALL])
-def test_configs_survive_json(config: VanillaConfig) -> None:
-    assert from_plain(VanillaConfig, json.loads(json.dumps(to_plain(config))), "config") == config
+# Configuration.
 
 
 NUMBERS = [f.name for f in fields(VanillaConfig) if type(getattr(VanillaConfig(), f.name)) is not bool]
@@ -354,15 +317,3 @@ def test_a_learning_rate_of_zero_is_refused() -> None:
 def test_an_encoding_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="expected one of them"):
         VanillaConfig(position_frequencies=0, include_input=False)
-
-
-def test_a_stored_map_renders_the_same(tmp_path: Path) -> None:
-    field = built()
-    backend.train(field, rgbd_views(), replace(SMALL, steps=5), Recorder())
-    info = MapInfo("vanilla", to_plain(SMALL), BOUNDS, 5, True)
-    save_map(tmp_path / "map", info, TrainingState(5, dict(field.state_dict()), {}))
-    stored = load_map(tmp_path / "map")
-    rays = rays_of_view()
-    for one, two in zip(levels(field), levels(stored.field), strict=True):
-        assert torch.equal(render(one, rays).rgb, render(two, rays).rgb)
-    assert not bool(query_samples(stored.field, rays, stored.field.sampler(rays)).rgb.requires_grad)

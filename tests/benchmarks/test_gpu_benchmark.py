@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 
+Script = Callable[[str], ModuleType]
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "gpu.py"
 PLACE = "demo:blobs"
 
@@ -26,9 +28,8 @@ def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_its_steps_leave_the_pose_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    gpu = importlib.import_module("gpu")
+def test_its_steps_leave_the_pose_where_it_is(script: Script) -> None:
+    gpu = script("gpu")
     steps = gpu.made_steps(PLACE, PLACE, 0, torch.device("cpu"), rays=32)
     start = steps.T
     steps()
@@ -38,9 +39,8 @@ def test_its_steps_leave_the_pose_where_it_is(monkeypatch: pytest.MonkeyPatch) -
     torch.testing.assert_close(steps.T.matrix(), start.matrix(), rtol=0, atol=1e-7)
 
 
-def test_a_row_that_fails_says_why_and_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    gpu = importlib.import_module("gpu")
+def test_a_row_that_fails_says_why_and_does_not_stop_the_others(script: Script) -> None:
+    gpu = script("gpu")
 
     def broken() -> None:
         raise RuntimeError("out of memory\nand a second line")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,26 +17,15 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.results import pose_error
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+Script = Callable[[str], ModuleType]
 LENS = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300, (0.1, -0.05, 0.002, -0.001, 0.01))
 BENT = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300, (0.1, -0.05, 0.002, -0.001, 0.01, 0.02, 0.01, 0.005))
 
 
 @pytest.fixture
-def modules(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a function that imports a module of the benchmarks."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-
-    def module(name: str) -> ModuleType:
-        return importlib.import_module(name)
-
-    return module
-
-
-@pytest.fixture
-def sift(modules: Any) -> ModuleType:
+def sift(script: Script) -> ModuleType:
     pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    return modules("sift")
+    return script("sift")
 
 
 class Seen:
@@ -75,13 +64,12 @@ def test_solvers_find_nothing_in_too_few_points(sift: ModuleType, solver: str) -
 
 
 def test_triangulated_points_are_those_of_the_scene_and_locate_an_image(
-    sift: ModuleType, modules: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sift: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = Points(300, noise=0.2)
-    views, made = ring(scene, 8), modules("sift")
-    monkeypatch.setattr(made, "SiftDetector", lambda: Seen(scene))
+    views = ring(scene, 8)
     monkeypatch.setattr(sift, "SiftDetector", lambda: Seen(scene))
-    points = made.sift_points(views, tmp_path)
+    points = sift.sift_points(views, tmp_path)
     nearest = torch.cdist(torch.from_numpy(points.positions), scene.positions).min(1).values
     assert len(points) > 150
     assert float(nearest.median()) < 0.01
@@ -95,11 +83,11 @@ def test_triangulated_points_are_those_of_the_scene_and_locate_an_image(
     assert float(error.translation) < 0.02
     assert found.inliers > 100
 
-    monkeypatch.setattr(made, "triangulated", None)  # a second call reads the cache
-    again = made.sift_points(views, tmp_path)
+    monkeypatch.setattr(sift, "triangulated", None)  # a second call reads the cache
+    again = sift.sift_points(views, tmp_path)
     assert np.array_equal(again.positions, points.positions)
     with pytest.raises(TypeError):
-        made.sift_points(views[:-1], tmp_path)
+        sift.sift_points(views[:-1], tmp_path)
 
 
 def row(error: float | None, accepted: bool | None = True, seconds: float = 1.0) -> dict[str, Any]:
@@ -109,8 +97,8 @@ def row(error: float | None, accepted: bool | None = True, seconds: float = 1.0)
     }  # fmt: skip
 
 
-def test_answers_are_counted_alone_and_in_pairs(modules: Any) -> None:
-    counts = modules("landmark_peers")
+def test_answers_are_counted_alone_and_in_pairs(script: Script) -> None:
+    counts = script("landmark_peers")
     ours = [row(0.001), row(0.03), row(1.0), row(0.001, accepted=False)]
     theirs = [row(0.03, seconds=3), row(None, accepted=False), row(0.001, seconds=2), row(9.0)]
     found = counts.summary(ours)

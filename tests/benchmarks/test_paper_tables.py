@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from bidnerf_core.evaluation import Plan, planned
 
+Script = Callable[[str], ModuleType]
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "paper_tables.py"
 PLACE = "demo:blobs"
 CELLS = {
@@ -24,11 +26,8 @@ CELLS = {
 
 
 @pytest.mark.parametrize("part", CELLS)
-def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(
-    part: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    plans = importlib.import_module("paper_tables").PARTS[part](
+def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(part: str, script: Script) -> None:
+    plans = script("paper_tables").PARTS[part](
         Plan(PLACE, PLACE, method="bid", seed=0), lambda method: {"rays": 8, "max_steps": 2}, None
     )
     conditions, sizes, each, methods = CELLS[part]
@@ -52,9 +51,8 @@ def test_a_part_is_recorded(tmp_path: Path) -> None:
     assert len((tmp_path / "inerf_demo_blobs.jsonl").read_text().splitlines()) == 2
 
 
-def test_each_variant_of_bid_can_be_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    module = importlib.import_module("bid_variants")
+def test_each_variant_of_bid_can_be_tried(script: Script) -> None:
+    module = script("bid_variants")
     for group, (_, variants, sizes) in module.GROUPS.items():
         found = module.plans(group, Plan(PLACE, PLACE, method="bid", trials=2, seed=0), None, None)
         trials = [planned(plan) for plan in found]  # raises where there is no such setting
@@ -62,9 +60,8 @@ def test_each_variant_of_bid_can_be_tried(monkeypatch: pytest.MonkeyPatch) -> No
         assert len({some[0].config for some in trials}) == len(variants)
 
 
-def test_presets_become_settings_of_each_method(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    settings_of_preset = importlib.import_module("paper_tables").preset_settings
+def test_presets_become_settings_of_each_method(script: Script) -> None:
+    settings_of_preset = script("paper_tables").preset_settings
     bid = settings_of_preset("paper", {"rays": 7}, "bid")
     assert bid == {
         "rays": 7, "pivot": "camera", "max_steps": 1000, "learning_rate": 0.02, "decay": 0.8, "decay_steps": 100,

@@ -326,27 +326,22 @@ def test_another_training_of_the_map_is_not_mixed_in(tmp_path: Path, evaluate: E
     assert "was made with depth_weight 0.5, expected 1.0" in evaluate("--trials", 1, "--size", 0.3)[1]
 
 
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    return tiny.write_dataset(tmp_path / "photos")
-
-
 def test_results_of_other_images_are_refused(
-    tmp_path: Path, photos: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Folders are known by name, so the content decides: a moved copy is the same data, a changed one is not."""
 
-    def run(data: Path) -> tuple[int, str]:
-        words = ["evaluate", BLOBS, str(data), "--out", str(tmp_path / "r.jsonl"), *QUICK, "--size", "0.3"]
+    def run(photos: Path) -> tuple[int, str]:
+        words = ["evaluate", BLOBS, str(photos), "--out", str(tmp_path / "r.jsonl"), *QUICK, "--size", "0.3"]
         status = main([*words, "--trials", "3"])
         return status, capsys.readouterr().err
 
-    assert run(photos)[0] == 0
+    assert run(data)[0] == 0
     before = (tmp_path / "r.jsonl").read_bytes()
-    status, err = run(Path(shutil.copytree(photos, tmp_path / "moved" / "photos")))
+    status, err = run(Path(shutil.copytree(data, tmp_path / "moved" / "data")))
     assert (status, "3 of 3 trials are already there" in err) == (0, True)
     for what in ("images", "depth", "transforms.json"):
-        changed = Path(shutil.copytree(photos, tmp_path / what / "photos"))
+        changed = Path(shutil.copytree(data, tmp_path / what / "data"))
         if what == "transforms.json":
             about = json.loads((changed / what).read_text())
             for frame in about["frames"]:
@@ -474,11 +469,8 @@ def test_ctrl_c_keeps_what_is_finished(
     ("words", "status", "said"),
     [
         (["--size", "half"], 2, "--size is half, expected numbers"),
-        (["--size", "-1"], 2, "size is -1, expected e_t"),
-        (["--trials", "0"], 2, "trials is 0"),
         (["--trials", "999999999"], 2, "trials is 999999999, expected a whole number, 1 to"),
         (["--shards", "2", "--shard", "2"], 2, "--shard is 2"),
-        (["--protocol", "none"], 1, "needs a start"),
         (["--protocol", "prallel"], 2, "did you mean 'parallel'"),
         (["--dask", "tcp://x:1", "--workers", "2"], 2, "contradict"),
     ],

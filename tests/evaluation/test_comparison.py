@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,9 +26,9 @@ from bidnerf_core.evaluation import (
 )
 from bidnerf_core.evaluation.comparison import map_bytes, map_labels, map_row, plan_comparison
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
 from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
-from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.io import from_plain
+from trial_results import trial_result
 
 pytestmark = pytest.mark.slow
 
@@ -36,17 +37,17 @@ QUICK = json.dumps({"rays": 32, "max_steps": 3})
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny.write_dataset(tmp_path_factory.mktemp("data"))
+def data(shared: Path) -> Path:
+    return shared / "data"
 
 
 @pytest.fixture(scope="module")
-def maps(data: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def maps(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two that differ in how long they were trained."""
     folder = tmp_path_factory.mktemp("maps")
     made = [folder / "short", folder / "long"]
-    for out, steps in zip(made, (4, 8), strict=True):
-        assert main(["train", str(data), "--out", str(out), *tiny.options(steps)]) == 0
+    assert main(["train", str(shared / "data"), "--out", str(made[0]), *tiny.options(4)]) == 0
+    shutil.copytree(shared / "map", made[1])
     return made
 
 
@@ -67,12 +68,7 @@ def compared(maps: list[Path], plan: Plan) -> Comparison:
 
 def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResult:
     """One whose distance went as ``trace`` says; one step took ``seconds`` in all."""
-    distances = tuple(times * x for x in trace)
-    errors = Trace(distances, tuple(0.0 for _ in trace))
-    return TrialResult(
-        None, True, len(trace) - 1, seconds, None, 0.0, "fog", "bid", ScalarPoseError(distances[-1], 0.0), "r_0", 0,
-        ScalarPoseError(distances[0], 0.0), errors, "", 1000, {}, "w", Trial("m", "d", ("r_0",)),
-    )  # fmt: skip
+    return trial_result(Trial("m", "d", ("r_0",)), [times * x for x in trace], seconds=seconds)
 
 
 def test_every_map_is_tried_on_the_same_frames_from_the_same_starts(compared: Comparison) -> None:
@@ -159,17 +155,11 @@ def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
     found = Comparison("d", "test", "none", (), "auto", {}, 0, 1, (row,), ((free,),))
     comparison_figure([tmp_path / "a.svg"], found)
     assert "<svg" in (tmp_path / "a.svg").read_text()
-    assert from_plain(Comparison, json.loads(json.dumps(to_plain(found))), "again") == found
 
 
 def test_maps_have_the_shortest_names_that_tell_them_apart() -> None:
     assert map_labels(["/x/a", "/x/b"]) == ["a", "b"]
     assert map_labels(["/x/a", "/y/a", "/y/b"]) == ["x/a", "y/a", "y/b"]
-
-
-def test_a_comparison_survives_json(compared: Comparison) -> None:
-    text = json.dumps(to_plain(compared), allow_nan=False)
-    assert from_plain(Comparison, json.loads(text), "compare.json") == compared
 
 
 def test_the_plan_is_the_protocols(plan: Plan, data: Path) -> None:
@@ -221,19 +211,7 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
 
 
 def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [
-        "--trials",
-        "1",
-        "--rays",
-        "32",
-        "--max-steps",
-        "2",
-        "--size",
-        "0.3",
-        "--frame",
-        "t_0001",
-        "--json",
-    ]
+    words = ["--rays", "32", "--max-steps", "2", "--size", "0.3", "--frame", "t_0001", "--trials", "1", "--json"]  # fmt: skip
     assert main(["compare", str(maps[0]), str(data), *words]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["size"] == [0.3]
@@ -244,11 +222,8 @@ def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.Ca
     ("words", "status", "expected"),
     [
         (["{map}"], 2, "1 folder given, expected"),
-        (["{map}", "{data}", "--trials", "0"], 2, "trials is 0"),
         (["{map}", "{data}", "--frame", "r_77"], 1, "r_77"),
         (["{map}", "{data}", "--protocol", "bib"], 2, "did you mean 'bid'"),
-        (["{map}", "{data}", "--size", "1:2"], 2, "size is 1:2"),
-        (["{map}", "{data}", "--split", "none"], 1, "no split 'none'"),
         (["{data}", "{data}"], 1, "expected a map"),
         (["{map}", "{map}", "{data}"], 1, "named twice"),
     ],

@@ -32,13 +32,14 @@ from bidnerf_core.evaluation import (
     planned,
 )
 from bidnerf_core.evaluation.plots import draw_faults, fault_curves
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
 from bidnerf_core.evaluation.trials import trial_views
 from bidnerf_core.evaluation.workers import InThisProcess
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes import closed_form_data
+from trial_results import trial_result
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1", "--size", "0.3"]
 
 
 def trial(fault: str = NO_FAULT, seed: int = 0) -> Trial:
@@ -73,19 +74,7 @@ def test_evaluate_writes_the_fault_and_resumes_by_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "r.jsonl"
-    words = [
-        "evaluate",
-        "demo:blobs",
-        "--out",
-        str(out),
-        "--method",
-        "bid",
-        "--rays",
-        "16",
-        "--max-steps",
-        "2",
-    ]
-    words += ["--workers", "1", "--size", "0.3", "--trials", "2"]
+    words = ["evaluate", "demo:blobs", "--out", str(out), *QUICK, "--trials", "2"]
     assert main([*words, "--fault", "depth-noise:0.01,0.02"]) == 0
     assert main([*words, "--fault", "none", "--fault", "depth-noise:0.01", "exposure:0.7"]) == 0
     assert "2 of 6 trials are already there" in capsys.readouterr().err
@@ -98,19 +87,8 @@ def test_evaluate_writes_the_fault_and_resumes_by_it(
 
 
 def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["evaluate", "demo:blobs", "--out", str(tmp_path / "r.jsonl"), "--method", "bid", "--rays", "16"]
-    words += [
-        "--max-steps",
-        "2",
-        "--workers",
-        "1",
-        "--size",
-        "0.3",
-        "--trials",
-        "1",
-        "--fault",
-        "exposure:0.7",
-    ]
+    words = ["evaluate", "demo:blobs", "--out", str(tmp_path / "r.jsonl"), *QUICK, "--trials", "1"]
+    words += ["--fault", "exposure:0.7"]
     assert main(words) == 0
     plan = Plan("demo:blobs", "demo:blobs", sizes=((0.3,),), trials=1, method="bid", faults=("exposure:0.7",),
                 config='{"max_steps": 2, "rays": 16}')  # fmt: skip
@@ -125,10 +103,7 @@ def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: py
 def result(fault: str, seed: int, right: bool, converged: bool) -> TrialResult:
     """Return a result without a start that is right or wrong, and converged or not."""
     error = 0.001 if right else 1.0
-    return TrialResult(
-        None, converged, 1, 2.0, None, 0.1, "fog", "auto", ScalarPoseError(error, error), "0003", seed, None,
-        Trace((error,), (error,)), "done", 2**30, {}, "weights-1", trial(fault, seed),
-    )  # fmt: skip
+    return trial_result(trial(fault, seed), [error], [error], converged=converged, start_error=None)
 
 
 @pytest.fixture
@@ -204,12 +179,10 @@ def test_a_cell_counts_silent_and_rejected_answers(script: ModuleType) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A map that was hardly trained and its dataset, as the script takes them."""
-    folder = tmp_path_factory.mktemp("faults")
-    tiny.write_dataset(folder / "data", test=12)
-    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
-    return f"{folder / 'map'}:{folder / 'data'}"
+def scene(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A map and a dataset of the same scene, as the script takes them."""
+    data = tiny.write_dataset(tmp_path_factory.mktemp("faults") / "data", train=1, test=12)
+    return f"{shared / 'map'}:{data}"
 
 
 def given(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:

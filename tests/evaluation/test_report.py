@@ -37,9 +37,10 @@ from bidnerf_core.evaluation.groups import situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.report import page
 from bidnerf_core.evaluation.summary import compare_pair
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
+from bidnerf_core.evaluation.trial import Trace
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import success_rate_by_frame
+from trial_results import trial_result
 
 STEPS = 10
 
@@ -47,16 +48,14 @@ STEPS = 10
 def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -> TrialResult:
     """Return the result of a trial that meets every criterion from step ``reached`` on, if at all."""
     far = STEPS + 1 if reached is None else reached
-    moved = (*(size for _ in range(far)), *(0.001 for _ in range(STEPS + 1 - far)))
-    turned = tuple(12.0 if x == size else 0.1 for x in moved)
+    moved = [size] * far + [0.001] * (STEPS + 1 - far)
+    turned = [12.0] * far + [0.1] * (STEPS + 1 - far)
     protocol, images = settings.pop("protocol", "bid"), settings.pop("images", 1)
-    start = None if protocol == "none" else ScalarPoseError(moved[0], turned[0])
     sizes, config = () if protocol == "none" else (size,), json.dumps(settings)
     trial = Trial("house", "photos", ("a",) * images, protocol, sizes, "bid", config, seed)
-    return TrialResult(
-        None, reached is not None, STEPS, 2.0, None, 0.1, "fog", "bid", ScalarPoseError(moved[-1], turned[-1]), "a", seed,
-        start, Trace(moved, turned), "done", 2**30, {"rays": 64, "level": 0, **settings}, "weights-1", trial,
-    )  # fmt: skip
+    found = trial_result(trial, moved, turned, converged=reached is not None)
+    start = None if protocol == "none" else found.start_error
+    return dataclasses.replace(found, start_error=start, settings={"rays": 64, "level": 0, **settings})
 
 
 def write(path: Path, *results: TrialResult) -> Path:

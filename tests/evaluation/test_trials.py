@@ -19,24 +19,16 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import Trial, TrialResult, forget_peak_memory, peak_memory_bytes, run_trial
 from bidnerf_core.evaluation.trial import Trace
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.io import to_plain
 from bidnerf_core.results import pose_error
 
 QUICK = '{"max_steps": 4, "rays": 64}'
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("trials")
-    tiny.write_dataset(folder / "data")
-    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
-    return folder
-
-
 @pytest.fixture
-def trial(folder: Path) -> Trial:
+def trial(shared: Path) -> Trial:
     return Trial(
-        str(folder / "map"), str(folder / "data"), ("t_0001",), "bid", (0.5,), "bid", config=QUICK, seed=3
+        str(shared / "map"), str(shared / "data"), ("t_0001",), "bid", (0.5,), "bid", config=QUICK, seed=3
     )
 
 
@@ -45,11 +37,11 @@ def timeless(result: TrialResult) -> TrialResult:
 
 
 def test_a_line_has_what_localize_prints_and_more(
-    trial: Trial, folder: Path, capsys: pytest.CaptureFixture[str]
+    trial: Trial, shared: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     line = to_plain(run_trial(trial))
     capsys.readouterr()
-    assert main(["localize", str(folder / "map"), str(folder / "data"), "--frame", "t_0001", "--json",
+    assert main(["localize", str(shared / "map"), str(shared / "data"), "--frame", "t_0001", "--json",
                  "--method", "bid", "--perturb", "0.1", "5", "--max-steps", "2", "--rays", "32"]) == 0  # fmt: skip
     assert json.loads(capsys.readouterr().out).keys() <= line.keys()
     assert json.loads(json.dumps(line, allow_nan=False)) == line
@@ -68,7 +60,13 @@ def test_a_line_has_what_localize_prints_and_more(
     assert line["peak_memory_bytes"] > 10**7
 
 
-def test_its_error_is_that_of_its_pose(trial: Trial, folder: Path) -> None:
+def test_its_trial_has_the_names_of_folders_alone(trial: Trial) -> None:
+    found = run_trial(trial).trial
+    assert found == trial.portable == trial.portable.portable
+    assert hash(found) == hash(trial.portable)
+
+
+def test_its_error_is_that_of_its_pose(trial: Trial, shared: Path) -> None:
     result = run_trial(trial)
     matrix = torch.tensor(result.T_world_camera, dtype=torch.float64)
     truth = tiny.views(3, seed=1)[1].T_ref_camera
@@ -87,14 +85,6 @@ def test_the_same_trial_gives_the_same_line_here_and_elsewhere(trial: Trial) -> 
     other = run_trial(dataclasses.replace(trial, seed=4))
     assert other.start_error is not None
     assert other.T_world_camera != first.T_world_camera
-
-
-def test_a_line_comes_back_from_json(trial: Trial) -> None:
-    result = run_trial(trial)
-    again = from_plain(TrialResult, json.loads(json.dumps(to_plain(result))), "line")
-    assert again == result
-    assert again.trial == trial.portable == trial.portable.portable
-    assert hash(trial.portable) == hash(again.trial)
 
 
 def test_a_rig_is_judged_by_its_last_camera(trial: Trial) -> None:

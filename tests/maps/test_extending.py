@@ -16,20 +16,15 @@ from bidnerf_core.testing import training_views, view
 from commands import Run
 from photo_files import write_photo
 
-STEPS = 12
-BAKE = bn.BakeConfig(rays=20_000, measured=60_000, cells=20_000)
+STEPS = 6
+BAKE = bn.BakeConfig(rays=10_000, measured=30_000, cells=10_000)
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of seven of ten images of the textured ground."""
     folder = tmp_path_factory.mktemp("extend") / "map"
-    bn.train(
-        list(training_views()[:7]),
-        out=folder,
-        config=tiny.config(25),
-        bake=BAKE,
-    )
+    bn.train(list(training_views()[:7]), out=folder, config=tiny.config(25), bake=BAKE)
     return folder
 
 
@@ -80,8 +75,8 @@ def test_a_photo_that_was_added_under_another_name_is_known(stored: Path) -> Non
 
 def test_another_scene_is_refused(map_folder: Path) -> None:
     before = files(map_folder)
-    others = [replace(view(each.T_ref_camera, f"x{n}", 9)) for n, each in enumerate(training_views()[:2])]
-    with pytest.raises(InputError, match="localizes 0 of 2 photos, expected photos of its scene"):
+    others = [replace(view(each.T_ref_camera, f"x{n}", 9)) for n, each in enumerate(training_views()[:1])]
+    with pytest.raises(InputError, match="localizes 0 of 1 photo"):
         bn.extend(map_folder, others, steps=STEPS, config=BAKE)
     assert files(map_folder) == before
 

@@ -25,6 +25,8 @@ from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import backend
 
+FEW = 12
+
 
 @functools.cache
 def trained() -> dict[str, Tensor]:
@@ -61,8 +63,10 @@ class TinyImporter:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file that exactly one importer reads."""
+    """A file that exactly one importer reads; where it has no photos, the field is seen from few places."""
     monkeypatch.setitem(registered, ("importers", "tiny"), TinyImporter())
+    for name, value in (("VIEWS", FEW), ("SIZE", 32), ("PLACES", 60)):
+        monkeypatch.setattr(f"bidnerf_core.maps.viewpoints.{name}", value)
     path = tmp_path / "field.tiny"
     path.touch()
     return path
@@ -74,7 +78,7 @@ def test_a_file_becomes_a_map(file: Path, tmp_path: Path, caplog: pytest.LogCapt
     assert "3 things" in caplog.text
     assert "its unit is not stored" in caplog.text
     assert scene.unit == "units"
-    assert f"{VIEWS} viewpoints" in caplog.text
+    assert f"{FEW} viewpoints" in caplog.text
     again = load_map(tmp_path / "MAP")
     assert again.info.complete
     assert again.info.data == "field.tiny"
@@ -82,13 +86,11 @@ def test_a_file_becomes_a_map(file: Path, tmp_path: Path, caplog: pytest.LogCapt
     assert all(torch.equal(value, trained()[name]) for name, value in again.field.state_dict().items())  # type: ignore[attr-defined]
 
 
-def test_without_photos_it_is_baked_from_renderings(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.maps.viewpoints.SIZE", 32)
-    monkeypatch.setattr("bidnerf_core.maps.viewpoints.VIEWS", 12)
+def test_without_photos_it_is_baked_from_renderings(file: Path) -> None:
     scene = import_map(file)
     assert scene.surface is not None
     assert scene.folder is None
-    assert len(scene.info.cameras) == 12
+    assert len(scene.info.cameras) == FEW
 
 
 def test_photos_give_the_cameras(file: Path) -> None:
@@ -112,7 +114,7 @@ def test_photos_that_the_file_names(
         )
         with caplog.at_level(logging.INFO, "bidnerf"):
             found = [camera.name for camera in import_map(file, bake=False).info.cameras]
-        assert found == names or (names is None and len(found) == VIEWS)
+        assert found == names or (names is None and len(found) == FEW)
     assert "its training images cannot be read" in caplog.text
 
 

@@ -6,7 +6,6 @@ import logging
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from bidnerf_core.maps import load_info
 from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
 
-BAKE = BakeConfig(cells=20_000)
+BAKE = BakeConfig(cells=5000)
 DESCENT = bn.settings_of("bid", {"rays": 64, "max_steps": 3})
 
 
@@ -51,6 +50,12 @@ def assert_same_field(one: bn.Map, other: bn.Map) -> None:
 def scene() -> bn.Map:
     """A map in memory, trained and baked."""
     return trained(bake=BAKE)
+
+
+@pytest.fixture(scope="module")
+def whole() -> bn.Map:
+    """A map in memory, trained without an interruption."""
+    return trained()
 
 
 def test_a_map_in_memory_answers_as_the_one_that_is_saved_and_loaded(scene: bn.Map, tmp_path: Path) -> None:
@@ -82,33 +87,26 @@ def test_a_folder_a_path_a_dataset_and_views_give_the_same_map(tmp_path: Path) -
         assert_same_field(stored, other)
 
 
-def test_an_incomplete_map_is_saved_with_what_resuming_needs(tmp_path: Path) -> None:
-    whole = trained()
+def test_an_incomplete_map_is_saved_with_what_resuming_needs(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled):
-        trained(tmp_path / "map", cancel=after(5))
+        trained(tmp_path / "map", **after(5))
     half = bn.load_map(tmp_path / "map").save(tmp_path / "copy")
     assert not half.info.complete
     assert_same_field(bn.resume(tmp_path / "copy", tiny.views(), bake=False), whole)
 
 
-def after(steps: int) -> Callable[[], bool]:
-    """Return a ``cancel`` that is True once it was asked ``steps`` times in the training itself."""
-    asked = iter(range(10**6))
-    return lambda: "fit" in names_of_callers() and next(asked) >= steps - 1
+def after(steps: int) -> dict[str, Any]:
+    """Return the options of a training that is cancelled in that step."""
+    seen = list[bn.Progress]()
+    return {
+        "progress": seen.append,
+        "cancel": lambda: any(now.stage == "training" and now.done >= steps for now in seen),
+    }
 
 
-def names_of_callers() -> set[str]:
-    frame, names = sys._getframe(1), set()
-    while frame is not None:
-        names.add(frame.f_code.co_name)
-        frame = frame.f_back  # type: ignore[assignment]
-    return names
-
-
-def test_cancelled_and_resumed_equals_uninterrupted(tmp_path: Path) -> None:
-    whole = trained(tmp_path / "whole")
+def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled, match=r"saved after step 5; --resume"):
-        trained(tmp_path / "half", cancel=after(5))
+        trained(tmp_path / "half", **after(5))
     info = load_info(tmp_path / "half")
     assert (info.step, info.complete) == (5, False)
     resumed = bn.resume(tmp_path / "half", tiny.views(), bake=False)
@@ -126,14 +124,16 @@ def test_cancelling_before_training_leaves_nothing(tmp_path: Path) -> None:
         trained(tmp_path / "map", cancel=lambda: True)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(bn.Cancelled, match="nothing is stored"):
-        trained(cancel=after(3))
+        trained(**after(3))
 
 
 class Failed(Exception):
     pass
 
 
-def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(tmp_path: Path) -> None:
+def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(
+    whole: bn.Map, tmp_path: Path
+) -> None:
     def fail(now: bn.Progress) -> None:
         if now.stage == "training" and now.done == 7:
             raise Failed("the caller's own")
@@ -141,7 +141,7 @@ def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(tmp_
     with pytest.raises(Failed, match="the caller's own"):
         trained(tmp_path / "map", progress=fail, checkpoint_seconds=0)
     assert load_info(tmp_path / "map").step == 6
-    assert_same_field(bn.resume(tmp_path / "map", tiny.views(), bake=False), trained())
+    assert_same_field(bn.resume(tmp_path / "map", tiny.views(), bake=False), whole)
 
 
 def test_progress_counts_and_remarks_are_logged(
@@ -158,13 +158,13 @@ def test_progress_counts_and_remarks_are_logged(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_thread_trains_while_another_localizes(scene: bn.Map) -> None:
-    expected, whole = answer(scene), trained()
+def test_a_thread_trains_while_another_localizes(scene: bn.Map, whole: bn.Map) -> None:
+    expected = answer(scene)
     with ThreadPoolExecutor(2) as pool:
-        training = pool.submit(trained, config=tiny.config(40))
+        training = pool.submit(trained, config=tiny.config(30))
         found = [pool.submit(answer, scene).result() for _ in range(3)]
         again = pool.submit(trained)
-        assert training.result().info.step == 40
+        assert training.result().info.step == 30
         assert_same_field(again.result(), whole)
     for one in found:
         assert torch.equal(one.T_world_camera.matrix(), expected.T_world_camera.matrix())
@@ -326,7 +326,7 @@ def test_photos_to_map_to_pose_to_overlay(tmp_path: Path) -> None:
     script = """
 import bidnerf_core as bn
 data = bn.open_dataset("capture")
-scene = bn.train(data, config={"steps": 3, "samples_per_step": 2048}, bake=False)
+scene = bn.train(data, config=config, bake=False)
 print(scene.describe())
 view = data.views("test", ["t_0000"])[0]
 start = bn.perturb(view.T_ref_camera, translation=0.1, rotation_deg=5, seed=0)
@@ -335,7 +335,7 @@ print(found.outcome, bn.pose_error(found.T_world_camera, view.T_ref_camera))
 picture = bn.overlay(scene, view.frame, found)
 """
     assert len(script.strip().splitlines()) <= 12
-    names: dict[str, Any] = {}
+    names: dict[str, Any] = {"config": tiny.config(3)}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         exec(script, names)

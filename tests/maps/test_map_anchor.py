@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import nn
 
 import tiny
@@ -19,6 +21,7 @@ from bidnerf_core.maps.anchor import anchor_bytes, load_anchor, save_anchor
 from bidnerf_core.maps.files import save_capture
 from bidnerf_core.progress import Progress
 from bidnerf_core.training import TrainingState
+from drawn import poses, record, shares
 from interruptions import FULL, Stopped, outcomes
 
 
@@ -37,13 +40,22 @@ def names(folder: Path) -> set[str]:
     return {file.name for file in folder.iterdir()}
 
 
-def written(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
+@given(
+    anchor=record(
+        Anchor, latitude=st.floats(-89, 89), longitude=st.floats(-180, 180), metres_per_unit=st.floats(1e-3, 1e3),
+        T_enu_world=poses().map(lambda T: tuple(map(tuple, T.matrix().tolist()))), position_sigma=shares,
+        orientation_sigma=shares,
+    )
+)  # fmt: skip
+def test_any_anchor_comes_back_as_it_was(anchor: Anchor, tmp_path: Path) -> None:
+    save_anchor(tmp_path, anchor)
+    assert load_anchor(tmp_path) == anchor
 
 
-@pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
 @pytest.mark.parametrize(
-    "new", [Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5), None], ids=["moved", "dropped"]
+    ("new", "error"),
+    [(Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5), Stopped()), (None, Stopped()), (None, FULL)],
+    ids=["moved", "dropped", "dropped, full"],
 )
 def test_a_save_that_stops_anywhere_leaves_a_map_with_its_own_anchor(
     new: Anchor | None, error: BaseException, tmp_path: Path, trained: Map
@@ -56,9 +68,9 @@ def test_a_save_that_stops_anywhere_leaves_a_map_with_its_own_anchor(
         nonlocal folder
         folder = next(places)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(files, "write_file", written)  # not counted
+            patch.setattr(files, "write_file", Path.write_bytes)  # not counted
             save(folder, trained, 5)
-            written(folder / "anchor.json", anchor_bytes(old))
+            (folder / "anchor.json").write_bytes(anchor_bytes(old))
         save(folder, trained, 6, anchor=new)
 
     for number, raised in enumerate(outcomes(attempt, error, ((Path, "unlink"),))):
@@ -84,14 +96,8 @@ def test_a_map_does_not_take_over_the_anchor_of_the_one_before(tmp_path: Path) -
     save_anchor(tmp_path / "a", anchor := Anchor(47.0, 19.0, 100.0))
     trained.save(tmp_path / "b")
     assert load_map(tmp_path / "b").anchor == anchor
-    train(
-        tiny.views(3),
-        out=tmp_path / "a",
-        config=tiny.config(3),
-        bake=False,
-        overwrite=True,
-        checkpoint_seconds=0,
-    )
+    again = {"bake": False, "overwrite": True, "checkpoint_seconds": 0}
+    train(tiny.views(3), out=tmp_path / "a", config=tiny.config(3), **again)  # type: ignore[arg-type]
     assert names(tmp_path / "a") == {"map.json", load_info(tmp_path / "a").weights}
     load_map(tmp_path / "a").save(tmp_path / "b", overwrite=True)
     assert load_map(tmp_path / "b").anchor is None
@@ -102,15 +108,9 @@ def test_a_training_that_goes_on_keeps_the_anchor(tmp_path: Path) -> None:
         if progress.stage == "training" and progress.done == 2:
             raise Stopped
 
+    options = {"bake": False, "progress": stop, "checkpoint_seconds": 0}
     with pytest.raises(Stopped):
-        train(
-            tiny.views(3),
-            out=tmp_path,
-            config=tiny.config(4),
-            bake=False,
-            progress=stop,
-            checkpoint_seconds=0,
-        )
+        train(tiny.views(3), out=tmp_path, config=tiny.config(4), **options)  # type: ignore[arg-type]
     save_anchor(tmp_path, anchor := Anchor(47.0, 19.0, 100.0))
     assert resume(tmp_path, tiny.views(3), bake=False).info.complete
     assert load_map(tmp_path).anchor == anchor

@@ -2,37 +2,44 @@
 
 from __future__ import annotations
 
-import errno
 import functools
 import itertools
 import json
 import math
+import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
 import baked
 import tiny
 from bidnerf_core.backend import load_backend
-from bidnerf_core.captures import stored_cameras
+from bidnerf_core.captures import CaptureReport, PoseRefinement, StoredCamera, stored_cameras
+from bidnerf_core.captures.report import CoverageRecord
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
-from bidnerf_core.mapping import SurfaceMap, surface_tensors
-from bidnerf_core.maps import MapInfo, files, load_info, load_map, save_map
+from bidnerf_core.mapping import LandmarkMap, build_landmarks, landmark_tensors, surface_tensors
+from bidnerf_core.maps import Map, MapInfo, files, load_info, load_map, save_map
 from bidnerf_core.maps import map as map_module
-from bidnerf_core.maps.files import load_state, save_surface
+from bidnerf_core.maps.description import FieldFrame
+from bidnerf_core.maps.files import load_state, save_capture, save_landmarks, save_surface
 from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
+from commands import Run
+from drawn import poses, record, shares
 from interruptions import FULL, Stopped, outcomes, striking
+from landmark_scene import Points, ring
 
 BOUNDS = SceneBounds((-0.1, -1 / 3, -1.0), (1.0, 2 / 3, 1e-17), 0.1, 5.0, (1.0, 0.5, 0.0))
 
@@ -72,20 +79,31 @@ def assert_equal(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
         assert torch.equal(found[name], value), name
 
 
+def assert_holds(loaded: Map, expected: TrainingState) -> None:
+    assert isinstance(loaded.field, nn.Module)
+    assert_equal(loaded.field.state_dict(), expected.field)
+
+
 def names(folder: Path) -> set[str]:
     return {file.name for file in folder.iterdir()}
+
+
+def described(folder: Path, **changes: Any) -> None:
+    """Write a map whose description has these entries."""
+    save_map(folder, info(), state())
+    path = folder / "map.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 @pytest.mark.parametrize("complete", [True, False])
 def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None:
     saved = save_map(tmp_path / "a" / "map", info(complete=complete), state())
     assert replace(saved, weights="", training=None) == info(complete=complete)
-    assert load_info(tmp_path / "a" / "map") == saved
     loaded = load_map(tmp_path / "a" / "map")
     assert loaded.info == saved
     assert loaded.bounds == BOUNDS
+    assert_holds(loaded, state())
     assert isinstance(loaded.field, nn.Module)
-    assert_equal(loaded.field.state_dict(), state().field)
     assert not any(parameter.requires_grad for parameter in loaded.field.parameters())
     assert not loaded.field.training
     if complete:
@@ -96,6 +114,25 @@ def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None
         assert resumed.step == 5
         assert_equal(resumed.field, state().field)
         assert_equal(resumed.optimizer, state().optimizer)
+
+
+rows = poses().map(lambda T: tuple(map(tuple, T.matrix().tolist())))
+descriptions = record(
+    MapInfo,
+    cameras=st.lists(record(StoredCamera, T_world_camera=rows, given_T_world_camera=st.none() | rows), max_size=2).map(tuple),
+    pose_refinement=st.none() | record(PoseRefinement, noise_before=shares, noise_after=shares),
+    field_frame=st.none() | record(FieldFrame, scale=st.floats(1e-3, 1e3)),
+    **{name: st.just(getattr(info(), name)) for name in ("landmark_source", "colour_noise", "format", "version")},
+)  # fmt: skip
+
+
+@settings(max_examples=20)
+@given(given_info=descriptions)
+def test_any_description_comes_back_as_it_was(given_info: MapInfo, tmp_path: Path) -> None:
+    saved = save_map(tmp_path, given_info, TrainingState(5, {"w": torch.ones(1)}, {}))
+    assert load_info(tmp_path) == saved
+    parts = ("weights", "training", "surface", "landmarks", "capture", "anchor")
+    assert replace(saved, **{p: getattr(given_info, p) for p in parts}) == given_info
 
 
 def test_what_follows_from_the_occupancy_is_brought_up_to_date_on_loading(tmp_path: Path) -> None:
@@ -113,9 +150,7 @@ def test_views_of_shared_or_strided_memory_are_saved(tmp_path: Path) -> None:
     weight = tensors["geometry.0.weight"]
     tensors["geometry.0.weight"] = weight.t().contiguous().t()
     save_map(tmp_path, info(), TrainingState(5, tensors, {}))
-    loaded = load_map(tmp_path).field
-    assert isinstance(loaded, nn.Module)
-    assert_equal(loaded.state_dict(), state().field)
+    assert_holds(load_map(tmp_path), state())
 
 
 def test_nothing_on_disk_can_run(tmp_path: Path) -> None:
@@ -158,7 +193,7 @@ def test_a_save_that_stops_anywhere_leaves_a_whole_map(
         folder.mkdir()
         if before:
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(files, "write_file", _written)  # not counted
+                patch.setattr(files, "write_file", Path.write_bytes)  # not counted
                 save_map(folder, info(step=5), state(5))
         save_map(folder, info(step=6, complete=complete), state(6))
 
@@ -177,15 +212,9 @@ def test_a_save_that_stops_anywhere_leaves_a_whole_map(
     assert all(step == 5 for raised, step in steps if isinstance(raised, OSError))
 
 
-def _written(path: Path, content: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(content)
-
-
 def assert_whole(folder: Path) -> int:
     loaded = load_map(folder)
-    assert isinstance(loaded.field, nn.Module)
-    assert_equal(loaded.field.state_dict(), state(loaded.info.step).field)
+    assert_holds(loaded, state(loaded.info.step))
     assert names(folder) == {"map.json", loaded.info.weights, loaded.info.training} - {None}
     return loaded.info.step
 
@@ -206,8 +235,7 @@ def test_a_map_that_a_training_replaces_while_it_is_read(
     monkeypatch.setattr(map_module, "read_tensors", late)
     loaded = load_map(tmp_path)
     assert loaded.info.step == 6
-    assert isinstance(loaded.field, nn.Module)
-    assert_equal(loaded.field.state_dict(), state(6).field)
+    assert_holds(loaded, state(6))
 
 
 def test_a_damaged_description_makes_no_save_remove_anything(
@@ -229,22 +257,6 @@ def test_what_json_cannot_hold_is_told_before_anything_is_written(tmp_path: Path
     assert not (tmp_path / "map").exists()
 
 
-@pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
-def test_a_file_is_written_whole_or_not_at_all(error: BaseException, tmp_path: Path) -> None:
-    def attempt() -> None:
-        _written(path, b"old")
-        write_file(path, b"new")
-
-    path, found = tmp_path / "x", []
-    for raised in outcomes(attempt, error):
-        found.append(path.read_bytes())
-        assert names(tmp_path) == {"x"}
-        if isinstance(raised, OSError):
-            assert (raised.errno, raised.filename) == (errno.ENOSPC, str(path))
-    assert found[:3] == [b"old"] * 3  # open, sync, replace
-    assert found[3:] == [b"new"] * len(found[3:])
-
-
 # What a backend builds is judged as well.
 
 
@@ -254,130 +266,207 @@ def test_a_backend_that_builds_something_else_is_told(
     save_map(tmp_path, info(), state())
     chosen = load_backend("hashgrid")
     monkeypatch.setattr(type(chosen), "build", lambda *_: HomogeneousBall(1.0, 1.0))
-    with pytest.raises(InputError, match=r"built a HomogeneousBall, expected an nn\.Module"):
+    with pytest.raises(InputError, match=r"HomogeneousBall.*nn\.Module"):
         load_map(tmp_path)
 
 
-# The baked surface is kept beside the weights that it shows.
+# The parts beside the weights that they were made from.
 
 
-def with_surface(folder: Path, surface: SurfaceMap, complete: bool = True) -> MapInfo:
-    return save_surface(folder, save_map(folder, info(complete=complete), state()), surface)
+@functools.cache
+def landmarks() -> LandmarkMap:
+    points = Points(count=60, noise=0.2)
+    return replace(build_landmarks(ring(points, 5), points), features="points")
 
 
-def test_a_surface_comes_back_as_it_was(tmp_path: Path) -> None:
-    saved = with_surface(tmp_path, baked.toy(), complete=False)
+@dataclass(frozen=True)
+class Part:
+    """A part that is added to a map: two contents, how it is saved and read, and its content to compare."""
+
+    contents: Callable[[], tuple[Any, Any]]
+    save: Callable[[Path, MapInfo, Any], MapInfo]
+    read: Callable[[Map], Any]
+    plain: Callable[[Any], Any]
+
+
+def plain(tensors: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: (value.dtype, value.tolist()) for name, value in tensors.items()}
+
+
+PARTS = {
+    "surface": Part(
+        lambda: (baked.patch(), baked.patch(3)), save_surface, lambda scene: scene.surface,
+        lambda part: plain(surface_tensors(part)),
+    ),
+    "landmarks": Part(
+        lambda: (landmarks(), landmarks()[torch.arange(10)]), save_landmarks, lambda scene: scene.landmarks,
+        lambda part: plain(landmark_tensors(part)),
+    ),
+    "capture": Part(
+        lambda: (CaptureReport((), CoverageRecord(landmarks=7)), CaptureReport((), CoverageRecord())), save_capture,
+        lambda scene: scene.capture, lambda part: part,
+    ),
+}  # fmt: skip
+every_part = pytest.mark.parametrize("name", PARTS)
+baked_part = pytest.mark.parametrize("name", ["surface", "landmarks"])
+
+
+def with_part(folder: Path, name: str, complete: bool = True) -> tuple[MapInfo, Path]:
+    """Write a map with a part; return its description and the path of the part."""
+    part = PARTS[name]
+    saved = part.save(folder, save_map(folder, info(complete=complete), state()), part.contents()[0])
+    return saved, folder / getattr(saved, name)
+
+
+@every_part
+def test_a_part_comes_back_as_it_was_and_the_rest_of_the_map_stays(name: str, tmp_path: Path) -> None:
+    part = PARTS[name]
+    saved, path = with_part(tmp_path, name, complete=False)
     loaded = load_map(tmp_path)
-    assert loaded.info == saved
-    assert loaded.surface is not None
-    assert_equal(surface_tensors(loaded.surface), surface_tensors(baked.toy()))
-    assert isinstance(loaded.field, nn.Module)
-    assert_equal(loaded.field.state_dict(), state().field)
-    assert names(tmp_path) == {"map.json", saved.weights, saved.training, saved.surface}
-    assert load_map(tmp_path, baked=False).surface is None
+    assert loaded.info == saved == load_info(tmp_path)
+    assert part.plain(part.read(loaded)) == part.plain(part.contents()[0])
+    assert_holds(loaded, state())
+    assert names(tmp_path) == {"map.json", saved.weights, saved.training, path.name}
 
 
-def test_a_new_surface_replaces_the_old_one_and_training_drops_it(tmp_path: Path) -> None:
-    first = with_surface(tmp_path, baked.patch())
-    second = save_surface(tmp_path, first, baked.toy())
-    assert names(tmp_path) == {"map.json", second.weights, second.surface}
-    assert second.surface != first.surface
-    trained = save_map(tmp_path, second, state(6))
-    assert trained.surface is None
-    assert load_map(tmp_path).surface is None
+@settings(max_examples=20)
+@given(capture=record(CaptureReport))
+def test_any_capture_record_comes_back_as_it_was(capture: CaptureReport, tmp_path: Path) -> None:
+    save_capture(tmp_path, save_map(tmp_path, info(), TrainingState(5, {"w": torch.ones(1)}, {})), capture)
+    assert files.load_capture(tmp_path / str(load_info(tmp_path).capture)) == capture
+
+
+@baked_part
+def test_a_map_may_be_loaded_without_its_baked_parts(name: str, tmp_path: Path) -> None:
+    with_part(tmp_path, name)
+    assert PARTS[name].read(load_map(tmp_path, baked=False)) is None
+
+
+@every_part
+def test_a_new_part_replaces_the_old_one_alone_and_training_drops_it(name: str, tmp_path: Path) -> None:
+    part, others = PARTS[name], [PARTS[other] for other in PARTS if other != name]
+    with_part(tmp_path, name)
+    for other in others:
+        other.save(tmp_path, load_info(tmp_path), other.contents()[0])
+    before = load_info(tmp_path)
+    after = part.save(tmp_path, before, part.contents()[1])
+    assert getattr(after, name) != getattr(before, name)
+    assert replace(after, **{name: getattr(before, name)}) == before
+    loaded = load_map(tmp_path)
+    assert part.plain(part.read(loaded)) == part.plain(part.contents()[1])
+    assert all(other.plain(other.read(loaded)) == other.plain(other.contents()[0]) for other in others)
+    assert names(tmp_path) == {"map.json", after.weights, after.surface, after.landmarks, after.capture}
+    trained = save_map(tmp_path, after, state(6))
+    assert [getattr(trained, each) for each in PARTS] == [None] * 3
+    assert [each.read(load_map(tmp_path)) for each in PARTS.values()] == [None] * 3
     assert names(tmp_path) == {"map.json", trained.weights}
 
 
-def test_a_surface_of_other_weights_is_refused(tmp_path: Path) -> None:
-    before = save_map(tmp_path, info(complete=True), state())
-    after = save_map(tmp_path, info(complete=True), state())
-    with pytest.raises(InputError, match="retrained while"):
-        save_surface(tmp_path, before, baked.toy())
+def test_what_was_measured_of_the_field_is_stored_with_landmarks_and_dropped_by_training(
+    tmp_path: Path,
+) -> None:
+    saved = save_map(tmp_path, info(complete=True), state())
+    found = save_landmarks(tmp_path, saved, landmarks(), colour_noise=0.03125)
+    assert load_map(tmp_path).colour_noise == 0.03125
+    assert save_map(tmp_path, found, state(6)).colour_noise is None
+    assert load_map(tmp_path).colour_noise is None
+
+
+@every_part
+def test_a_part_of_other_weights_is_refused(name: str, tmp_path: Path) -> None:
+    before, after = (save_map(tmp_path, info(complete=True), state()) for _ in range(2))
+    with pytest.raises(InputError, match=f"retrained while its {name}"):
+        PARTS[name].save(tmp_path, before, PARTS[name].contents()[0])
     assert load_info(tmp_path) == after
     assert names(tmp_path) == {"map.json", after.weights}
 
 
-def test_a_surface_that_cannot_be_written_leaves_the_map(tmp_path: Path) -> None:
-    saved = with_surface(tmp_path, baked.patch())
-    for raised in outcomes(lambda: save_surface(tmp_path, load_info(tmp_path), baked.patch()), FULL):
-        found = load_map(tmp_path)
-        assert found.surface is not None
-        assert names(tmp_path) == {"map.json", saved.weights, found.info.surface}
-        if raised is not None:
-            assert str(raised.filename).startswith(str(tmp_path))
+def test_landmarks_of_a_detector_without_a_name_are_not_stored(tmp_path: Path) -> None:
+    saved = save_map(tmp_path, info(complete=True), state())
+    with pytest.raises(InputError, match="detector has no name"):
+        save_landmarks(tmp_path, saved, replace(landmarks(), features=""))
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b"\x80\x04.", "expected a safetensors file"),
-        (None, "no such file"),
-        ({"rgb": torch.ones(2, 3)}, "can recreate"),
-    ],
-    ids=["no tensors", "missing", "other tensors"],
-)
-def test_a_damaged_surface_is_named(content: Any, said: str, tmp_path: Path) -> None:
-    saved = with_surface(tmp_path, baked.patch())
-    path = tmp_path / str(saved.surface)
-    if content is None:
-        path.unlink()
-    elif isinstance(content, bytes):
-        path.write_bytes(content)
-    else:
-        write_file(path, tensors_to_bytes(content))
+DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no tensors": (lambda path: path.write_bytes(b"\x80\x04."), "expected "),
+    "missing": (lambda path: None, "no such file"),
+    "a pipe": (os.mkfifo, "named pipe"),
+    "a device": (lambda path: path.symlink_to("/dev/zero"), "device"),
+    "a folder": (Path.mkdir, "folder"),
+}
+
+
+@every_part
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_part_is_named_and_can_be_made_anew(damage: str, name: str, tmp_path: Path) -> None:
+    (make, said), part = DAMAGES[damage], PARTS[name]
+    _, path = with_part(tmp_path, name)
+    path.unlink()
+    make(path)
     with pytest.raises(InputError, match=said) as told:
-        load_map(tmp_path)
+        part.read(load_map(tmp_path))
     assert str(path) in str(told.value)
     assert "\n" not in str(told.value)
     assert load_map(tmp_path, baked=False).surface is None
-    save_surface(tmp_path, load_info(tmp_path), baked.patch())  # which mends it
-    assert load_map(tmp_path).surface is not None
+    part.save(tmp_path, load_info(tmp_path), part.contents()[0])
+    assert part.read(load_map(tmp_path)) is not None
 
 
-def _with_weights(folder: Path, name: str, value: Tensor) -> Path:
-    path = folder / save_map(folder, info(complete=True), state()).weights
-    write_file(path, tensors_to_bytes(dict(state().field) | {name: value}))
-    return path
+@pytest.mark.parametrize(
+    ("name", "tensors", "said"),
+    [
+        ("surface", {"rgb": torch.ones(2, 3)}, "can recreate"),
+        ("landmarks", {"positions": torch.ones(2, 3)}, "landmarks"),
+        ("landmarks", landmark_tensors(landmarks()) | {"noise": torch.tensor(-1.0).double()}, "noise is -1"),
+        ("landmarks", landmark_tensors(landmarks()) | {"positions": torch.full((2, 3), torch.nan)}, "NaN"),
+    ],
+    ids=["other surface", "other landmarks", "negative noise", "not a number"],
+)
+def test_a_part_of_other_tensors_is_named(
+    name: str, tensors: dict[str, Tensor], said: str, tmp_path: Path
+) -> None:
+    _, path = with_part(tmp_path, name)
+    path.write_bytes(tensors_to_bytes(tensors))
+    with pytest.raises(InputError, match=said) as told:
+        load_map(tmp_path)
+    assert str(path) in str(told.value)
+
+
+@pytest.mark.parametrize("name", ["../elsewhere.safetensors", ""])
+def test_a_name_that_leads_out_of_the_folder_is_refused(name: str, tmp_path: Path) -> None:
+    for part in (*PARTS, "weights", "training", "anchor"):
+        described(tmp_path, **{part: name})
+        with pytest.raises(InputError, match="expected the name of a file next to it"):
+            load_map(tmp_path)
+
+
+def test_a_map_from_before_there_were_landmarks_still_opens(tmp_path: Path) -> None:
+    """Its description has neither entry."""
+    save_map(tmp_path, info(), state())
+    path = tmp_path / "map.json"
+    entries = json.loads(path.read_text())
+    path.write_text(json.dumps({k: v for k, v in entries.items() if k not in ("landmarks", "colour_noise")}))
+    loaded = load_map(tmp_path)
+    assert (loaded.landmarks, loaded.surface, loaded.colour_noise) == (None, None, None)
+
+
+# Values that no training gives.
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [
-        (lambda value: value.int(), "has dtype int32, expected float32"),
-        (lambda value: torch.full_like(value, torch.nan), "holds NaN"),
-    ],
+    [(lambda value: value.int(), "dtype int32"), (lambda value: torch.full_like(value, torch.nan), "NaN")],
     ids=["int", "nan"],
 )
 @pytest.mark.parametrize("name", ["occupancy.peak", "colour.0.bias"])
 def test_weights_and_buffers_of_another_kind_are_refused(
     name: str, change: Callable[[Tensor], Tensor], said: str, tmp_path: Path
 ) -> None:
-    path = _with_weights(tmp_path, name, change(state().field[name]))
+    path = tmp_path / save_map(tmp_path, info(complete=True), state()).weights
+    write_file(path, tensors_to_bytes(dict(state().field) | {name: change(state().field[name])}))
     with pytest.raises(InputError, match=said) as told:
         load_map(tmp_path)
     assert str(told.value).startswith(f"{path}: tensor {name!r}")
-
-
-@pytest.mark.parametrize(
-    "rows", [((2.0, 0.0, 0.0, 0.0), *torch.eye(4).tolist()[1:]), torch.eye(4).tolist()[:3]]
-)
-def test_cameras_without_a_rigid_pose_are_refused(rows: list[list[float]], tmp_path: Path) -> None:
-    save_map(tmp_path, info(), state())
-    described = json.loads((tmp_path / "map.json").read_text())
-    described["cameras"][1]["T_world_camera"] = list(rows)
-    (tmp_path / "map.json").write_text(json.dumps(described))
-    with pytest.raises(InputError, match=r"map\.json: pose of camera '.+' is not a rigid transform"):
-        load_info(tmp_path)
-
-
-@pytest.mark.parametrize("far", [1e308, 1e16])
-def test_bounds_beyond_single_precision_are_refused(far: float, tmp_path: Path) -> None:
-    save_map(tmp_path, info(), state())
-    described = json.loads((tmp_path / "map.json").read_text())
-    described["bounds"]["far"] = far
-    (tmp_path / "map.json").write_text(json.dumps(described))
-    with pytest.raises(InputError, match=r"bounds: .* m is too large, expected at most 1e\+15 m"):
-        load_info(tmp_path)
 
 
 @pytest.mark.parametrize("value", [-1e30, 3e38, math.nan, -math.inf])
@@ -392,15 +481,41 @@ def test_weights_that_no_training_gives_are_refused(tmp_path: Path, value: float
         load_map(tmp_path)
 
 
-def test_noise_of_poses_that_no_image_has_is_refused(tmp_path: Path) -> None:
-    save_map(tmp_path, info(), state())
-    described = json.loads((tmp_path / "map.json").read_text())
-    described["pose_refinement"] = {"noise_before": 1e308, "noise_after": 0.3, "refined": False}
-    (tmp_path / "map.json").write_text(json.dumps(described))
-    with pytest.raises(
-        InputError, match=r"pose_refinement: the keypoint noise is 1e\+308, expected 0 to 1e\+06"
-    ):
+PLAIN = json.loads(json.dumps(to_plain(info())))
+EYE = torch.eye(4).tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "culprit", "value"),
+    [
+        ({"cameras": [PLAIN["cameras"][0] | {"T_world_camera": [[2.0, 0.0, 0.0, 0.0], *EYE[1:]]}]}, "camera", "rigid"),
+        ({"cameras": [PLAIN["cameras"][0] | {"T_world_camera": EYE[:3]}]}, "camera", "rigid"),
+        ({"bounds": PLAIN["bounds"] | {"far": 1e308}}, "bounds", "1e+308"),
+        ({"bounds": PLAIN["bounds"] | {"far": 1e16}}, "bounds", "1e+16"),
+        ({"pose_refinement": {"noise_before": 1e308, "noise_after": 0.3, "refined": False}}, "pose_refinement", "1e+308"),
+        ({"field_frame": {"scale": 0.0, "bounds": PLAIN["bounds"]}}, "field_frame", "0.0"),
+    ],
+)  # fmt: skip
+def test_descriptions_of_what_cannot_be_are_refused(
+    changes: dict[str, Any], culprit: str, value: str, tmp_path: Path
+) -> None:
+    described(tmp_path, **changes)
+    with pytest.raises(InputError) as told:
         load_info(tmp_path)
+    assert str(told.value).startswith(f"{tmp_path / 'map.json'}: ")
+    assert culprit in str(told.value)
+    assert value in str(told.value)
+
+
+def test_a_training_of_any_length_is_described(bidnerf: Run, tmp_path: Path) -> None:
+    described(tmp_path, seconds=1e308)
+    assert bidnerf("info", tmp_path).status == 0
+
+
+def test_more_layers_than_there_are_weights_for_are_refused_at_once(tmp_path: Path) -> None:
+    described(tmp_path, config=PLAIN["config"] | {"colour_layers": 1_000_000})
+    with pytest.raises(InputError):
+        load_map(tmp_path)
 
 
 def test_a_map_of_thousands_of_cameras_is_described_without_a_loop_of_tensors(

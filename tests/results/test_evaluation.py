@@ -208,7 +208,7 @@ def test_perturb_is_wrong_by_exactly_what_was_asked(
 def test_bid_has_the_lengths_of_its_tangent(start, size: float) -> None:
     true = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))
     widest = math.pi / 4 if start is bid_start else 1.4
-    tangents = torch.stack([(true.inverse() @ start(true, size, seed)).log() for seed in range(200)])
+    tangents = (true.inverse() @ SE3.stack([start(true, size, seed) for seed in range(200)])).log()
     assert tangents[:, :3].norm(dim=-1).tolist() == pytest.approx([size] * 200)
     assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx([rotation_of_size(size, widest)] * 200)
     directions = torch.nn.functional.normalize(tangents.reshape(-1, 2, 3), dim=-1)

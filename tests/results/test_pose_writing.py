@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,14 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+import drawn
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
-from bidnerf_core.errors import InputError
+from bidnerf_core.datasets.colmap_files import read_posed_images
+from bidnerf_core.datasets.transforms_json import read_frames
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.results import PosedImage, write_poses
+from bidnerf_core.io import read_record
+from bidnerf_core.results import PosedImage, read_poses, write_poses
 from bidnerf_core.results.pose_files import tum_trajectory, write_pose_transforms, write_tum
 from photo_files import noise, write_photo
 
@@ -89,6 +97,42 @@ def test_a_mirror_image_has_no_pose(tmp_path: Path) -> None:
     assert not (tmp_path / "transforms.json").exists()
 
 
+def trajectory(path: Path, times: list[float]) -> list[SE3]:
+    with warnings.catch_warnings():  # rows without times, in KITTI's format
+        warnings.simplefilter("ignore", InputWarning)
+        found = read_trajectory(path, times)
+    assert found.times.tolist() == pytest.approx(times, abs=1e-6)
+    return list(map(SE3, found.rotations, found.translations))
+
+
+POSE_READERS: dict[str, Callable[[Path, list[float]], list[SE3]]] = {
+    "path.tum": trajectory,
+    "path.txt": trajectory,
+    "path.kitti.txt": trajectory,
+    "path.euroc.csv": trajectory,
+    "poses.json": lambda path, _: list(read_poses(path).values()),
+    "transforms.json": lambda path, _: [frame.T_world_camera for frame in read_frames(read_record(path))],
+    "images.txt": lambda path, _: [image.T_camera_model.inverse() for image in read_posed_images(path.parent)[0]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", POSE_READERS)
+@settings(max_examples=20)
+@given(given_poses=st.lists(drawn.poses(), min_size=1, max_size=4), camera=drawn.cameras((0, 4, 5)))
+def test_any_poses_that_are_written_are_read_again(
+    name: str, given_poses: list[SE3], camera: Intrinsics, tmp_path: Path
+) -> None:
+    times = [104137.25 + number / 30 for number in range(len(given_poses))]
+    write_poses(
+        tmp_path / name,
+        [PosedImage(f"f{n}", n, camera, T, time=times[n]) for n, T in enumerate(given_poses)],
+    )
+    found = POSE_READERS[name](tmp_path / name, times)
+    assert len(found) == len(given_poses)
+    for one, other in zip(found, given_poses, strict=True):
+        torch.testing.assert_close(one.matrix(), other.matrix(), atol=1e-9, rtol=0)
+
+
 def timed_images(count: int) -> list[PosedImage]:
     generator = torch.Generator().manual_seed(5)
     roots = torch.randn((count, 6, 6), generator=generator, dtype=torch.float64)
@@ -98,17 +142,6 @@ def timed_images(count: int) -> list[PosedImage]:
             zip(images([f"f{n}" for n in range(count)]), roots, strict=True)
         )
     ]
-
-
-def test_a_trajectory_with_times_is_read_again(tmp_path: Path) -> None:
-    written = timed_images(8)
-    write_poses(tmp_path / "path.tum", written)
-    path = read_trajectory(tmp_path / "path.tum")
-    assert len(path) == 8
-    for place, image in enumerate(written):
-        assert float(path.times[place]) == pytest.approx(image.time, abs=1e-6)
-        found = SE3(path.rotations[place], path.translations[place]).matrix()
-        torch.testing.assert_close(found, image.T_world_camera.matrix(), atol=1e-9, rtol=0)
 
 
 def test_json_has_times_and_covariances(tmp_path: Path) -> None:

@@ -1,0 +1,51 @@
+"""Maps whose numbers are finite and overflow in computations: an image is localized or rejected, or the file is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save as tensors_to_bytes
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization import Localizer, Tracker
+from bidnerf_core.mapping import surface_tensors
+from bidnerf_core.maps.files import load_surface
+from bidnerf_core.testing import textured_map
+from flights import flight
+
+
+def overflowing(tensors: dict[str, Tensor], part: str, value: float) -> dict[str, Tensor]:
+    assert part in tensors
+    return tensors | {part: torch.full_like(tensors[part], value)}
+
+
+@pytest.mark.parametrize("value", [1e30, -1e30, 3.4e38])
+@pytest.mark.parametrize("part", ["rgb", "normals", "positions"])
+def test_a_surface_of_overflowing_numbers_ends_no_tracking(part: str, value: float, tmp_path: Path) -> None:
+    known = textured_map(surface=True)
+    assert known.surface is not None
+    file = tmp_path / "surface.safetensors"
+    file.write_bytes(tensors_to_bytes(overflowing(surface_tensors(known.surface), part, value)))
+    try:
+        scene = replace(known, surface=load_surface(file))
+    except InputError:
+        return
+    tracker = Tracker(Localizer(scene, warm_up=False))
+    answers = [tracker(frame, time) for time, frame, _ in flight()[:2]]
+    assert all(answer.reason for answer in answers if not answer.converged)
+
+
+def test_landmarks_of_overflowing_positions_locate_nothing() -> None:
+    known = textured_map()
+    assert known.landmarks is not None
+    far = torch.full_like(known.landmarks.positions, 3e38)
+    scene = replace(known, landmarks=replace(known.landmarks, positions=far))
+    _, frame, _ = flight()[0]
+    with pytest.raises(
+        InputError, match="no surface"
+    ):  # which would be searched where landmarks find nothing
+        Localizer(scene, warm_up=False)(replace(frame, depth=None))

@@ -1,0 +1,139 @@
+"""Whatever saves files: where writing stops, at any of its writes, the earlier content stays or the new one is whole."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import pytest
+import torch
+
+import bidnerf_core as bn
+from bidnerf_core.captures import write_inria_cameras
+from bidnerf_core.evaluation import (
+    Comparison,
+    ResultTable,
+    Trial,
+    note_run,
+    provenance,
+    read_runs,
+    write_record,
+)
+from bidnerf_core.io import is_temporary, write_file
+from bidnerf_core.localization.tracking.motion import Clock
+from bidnerf_core.localization.tracking.state import TrackerState, save_state
+from bidnerf_core.maps import Anchor, load_info, load_map, save_map
+from bidnerf_core.maps.anchor import save_anchor
+from bidnerf_core.results import Answer, Answers, PosedImage, new_figure, save_gif, write_figure
+from bidnerf_core.results.pose_files import POSE_WRITERS
+from interruptions import FULL, Stopped, outcomes
+from test_storage import CAMERAS, PARTS, info, names, state
+from trial_results import trial_result
+
+CAMERA = bn.Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)
+POSE = bn.SE3.identity().to("cpu", torch.float64)
+FOUND = bn.Localization(
+    POSE, bn.Outcome.CONVERGED, "", 1, 0.1, 0.0, "auto", bn.SE3.stack([POSE]), torch.zeros(1)
+)
+
+Saver: TypeAlias = tuple[Callable[[Path, int], object], Callable[[Path], object]]
+"""A function that saves content 1 or 2 into a folder, and one that reads it there; None where there is none."""
+
+
+def file(
+    name: str, save: Callable[[Path, int], object], read: Callable[[Path], object] = Path.read_bytes
+) -> Saver:
+    def content(folder: Path) -> object:
+        return read(folder / name) if (folder / name).exists() else None
+
+    return lambda folder, number: save(folder / name, number), content
+
+
+def part_of_a_map(name: str) -> Saver:
+    part = PARTS[name]
+
+    def save(folder: Path, number: int) -> None:
+        part.save(folder, load_info(folder), part.contents()[number - 1])
+
+    def read(folder: Path) -> object:
+        found = part.read(load_map(folder))
+        return None if found is None else part.plain(found)
+
+    return save, read
+
+
+def posed(path: Path, number: int) -> None:
+    bn.write_poses(path, [PosedImage(f"{n}", n, CAMERA, POSE) for n in range(number)])
+
+
+def answers(path: Path, number: int) -> None:
+    given = Answers("map")
+    for n in range(number):
+        given.append(Answer.of(bn.Frame(f"{n}", torch.zeros((6, 8, 3)), CAMERA), n, FOUND))
+    given.save(path)
+
+
+def results(path: Path, number: int) -> None:
+    trials = [Trial("m", "d", ("a",), seed=n) for n in range(number)]
+    ResultTable(tuple(trial_result(trial, [1.0]) for trial in trials)).save(path)
+
+
+SAVERS: dict[str, Saver] = {
+    **{name: part_of_a_map(name) for name in PARTS},
+    "anchor": file("anchor.json", lambda path, n: save_anchor(path.parent, Anchor(47.0, 19.0, float(n)))),
+    "bytes": file("x", lambda path, n: write_file(path, bytes(n))),
+    **{f"poses{ending}": file(f"poses{ending}", posed) for ending in POSE_WRITERS if "scanner" not in ending},
+    "localization": file("found.json", lambda path, n: bn.Localization.save(FOUND.rejected(FOUND) if n > 1 else FOUND, path)),
+    "answers": file("found.json", answers),
+    "results": file("r.jsonl", results),
+    "comparison": file("c.json", lambda path, n: Comparison("d", "test", "none", (), "auto", {}, 0, n, ()).save(path)),
+    "runs": (lambda folder, n: note_run(folder / "r.jsonl", provenance("bidnerf evaluate", f"{n}")),
+             lambda folder: [run.workers for run in read_runs(folder / "r.jsonl")] or None),
+    "record": file("a.json", lambda path, n: write_record(path, {"rate": n}, seed=0), lambda path: json.loads(path.read_text())["results"]),
+    "figure": file("a.png", lambda path, n: write_figure(new_figure(n, 1), path)),
+    "animation": file("a.gif", lambda path, n: save_gif(path, [np.zeros((4, 4, 3))] * n)),
+    "tracker": file("state", lambda path, n: save_state(path, TrackerState(Clock(None, float(n))), "map")),
+    "cameras": file("cameras.json", lambda path, n: write_inria_cameras(path.parent, CAMERAS[:n])),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
+@pytest.mark.parametrize("before", [True, False], ids=["second save", "first save"])
+@pytest.mark.parametrize("name", SAVERS)
+def test_a_save_that_fails_at_any_write_leaves_whole_files(
+    name: str, before: bool, error: BaseException, tmp_path: Path
+) -> None:
+    (save, read), places = SAVERS[name], (tmp_path / str(number) for number in itertools.count())
+    old, folder, seen = next(places), tmp_path, list[tuple[object, object]]()
+    old.mkdir()
+    if name in PARTS:
+        save_map(old, info(complete=True), state())
+    if before:
+        save(old, 1)
+    kept = read(old)
+    assert (kept is None) == (not before)
+
+    def attempt() -> None:
+        nonlocal folder
+        folder = Path(shutil.copytree(old, next(places)))  # without a write that is counted
+        save(folder, 2)
+
+    for raised in outcomes(attempt, error):
+        found = read(folder)
+        seen.append((raised, found))
+        assert not any(is_temporary(each) for each in names(folder))
+        if isinstance(raised, OSError):
+            assert (raised.errno, found) == (errno.ENOSPC, kept)
+            assert str(raised.filename).startswith(str(folder))
+            assert before or name.startswith("poses") or names(folder) == names(old)
+    new = seen[-1][1]
+    assert new not in (None, kept)
+    assert len(seen) > 3  # open, sync, replace, and sync the folder
+    for raised, found in seen:
+        assert found == new or (found == kept and raised is not None)
