@@ -13,10 +13,11 @@ import blob_images
 import module_fields
 from bidnerf_core import Localizer
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import faulty, perturb
-from bidnerf_core.fields import Observations, Stratified
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.evaluation.faults import faulty
+from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     AutoConfig,
     Localization,
@@ -25,8 +26,8 @@ from bidnerf_core.localization import (
     Problem,
     rig,
 )
-from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import demo_room
+from bidnerf_core.results.errors import pose_error
+from bidnerf_core.scenes.demo import demo_room
 from localizations import assert_covered, assert_near, colour_only
 from problems import FieldMap, localize
 from tiny import depth_rays_of
@@ -205,8 +206,8 @@ def test_a_map_without_a_surface_needs_a_start(channels: str) -> None:
 @pytest.mark.slow
 def test_in_a_map_without_a_surface_it_descends_from_the_start() -> None:
     start = perturb(blob_images.TRUTH, 0.1, 3.0, seed=2)
-    coarse = replace(blob_images.FIELD, sampler=Stratified(16, blob_images.BOUNDS))
-    found = Localizer(FieldMap(coarse, blob_images.BOUNDS), warm_up=False)(blob_images.FRAME, start)
+    scene = FieldMap(blob_images.FIELD, blob_images.BOUNDS)
+    found = Localizer(scene, warm_up=False)(blob_images.FRAME, start)
     assert found.method == "bid"
     assert "the map has no surface" in found.reason
     assert float(pose_error(found.T_world_camera, blob_images.TRUTH).translation) < 0.03
