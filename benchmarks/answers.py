@@ -5,23 +5,24 @@ r"""Answers on record: what the localizer says to the same images, before and af
     python benchmarks/answers.py --compare A.jsonl [B.jsonl]
     python benchmarks/answers.py --record A.jsonl [A2.jsonl ...]
 
-MAP is the name of a dataset in the folder ``BIDNERF_DATA`` whose map ``answer_maps.py`` has put into the folder ``BIDNERF_MAPS``,
-or ``planes``, the scenes of ``planar_scenes.py``. Images that training never saw are localized without a start and on one
-thread, with depth and without, under the conditions that the table ``CONDITIONS`` lists. Each answer is kept as a row with its
-pose, covariance (upper triangle, single precision), outcome, reason, confidence, errors and CPU time. The same code gives the
-same rows on the same maps, to the bit, but for the time. An interrupted run resumes; several may run at a time on different
-maps, each with its own file. At any moment of a run, all conditions are covered about as far. ``--share`` takes a part of the
-images, evenly spaced.
+MAP is the name of a dataset in the folder ``BIDNERF_DATA`` whose map ``answer_maps.py`` has put into the folder
+``BIDNERF_MAPS``, or ``planes``, the scenes of ``planar_scenes.py``. Images that training never saw are localized without a
+start and on one thread, with depth and without, under the conditions that the table ``CONDITIONS`` lists. Each answer is kept
+as a row with its pose, covariance (upper triangle, single precision), outcome, reason, confidence, errors and CPU time. The
+same code gives the same rows on the same maps, to the bit, but for the time. An interrupted run resumes; several may run at a
+time on different maps, each with its own file. All conditions advance alike, so that an unfinished run covers each of them.
+``--share`` takes a part of the images, evenly spaced.
 
-Of the frames of a test split, those for tuning are left out if at least 15 others remain. Images of other scenes, of a bare wall and of a
-scene that stands twice have no right answer. Right for the average of two photos is the pose of either; right for a photo of a
-picture of the scene, and for a mirrored one, is the pose from which the scene was seen. In ``planes``, where scenes differ in
-size, errors are relative to the distance of what is seen.
+Of the frames of a test split, those for tuning are left out if at least 15 others remain. Images of other scenes, of a bare
+wall, and of a scene that stands twice have no right answer. Right for the average of two photos is the pose of either; right
+for a photo of a picture of the scene, and for a mirrored one, is the pose from which the scene was seen. In ``planes``, where
+scenes differ in size, errors of the position are relative to the distance of what is seen.
 
 ``--compare`` counts, over the answers that both files have, those that are right (within 5 degrees and 0.05 units), strictly
-right (1 degree, 0.02), accepted, and silent (accepted and not right); how many of the accepted with a known error lie inside the 95 % bound of
-their covariance; the median and the longest CPU time; exact McNemar tests of both files; and how many answers changed.
-``--record`` joins files into ``results/answers.rows.jsonl.xz`` and writes a summary to ``results/answers.json``.
+right (1 degree, 0.02), accepted, and silent (accepted and not right); how many of the accepted with a known error lie inside
+the 95 % bound of their covariance; and the median and the longest CPU time. Exact McNemar tests of both files follow, and how
+many answers changed. ``--record`` joins files into ``results/answers.rows.jsonl.xz``, and summarises them in
+``results/answers.json``.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import hashlib
 import json
 import lzma
 import math
-import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -54,14 +55,13 @@ from _lab import (
     within,
     without_depth,
 )
-from _lab import answer as timed_answer
 from answer_maps import folder_of, map_folder
 from repeated_scene import copies, doubled
 from scipy.stats import binomtest
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
-from bidnerf_core import Localization, Localizer
+from bidnerf_core import Localizer
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty
@@ -222,6 +222,11 @@ def spread(names: Sequence[str], count: int) -> list[str]:
 
 # Questions, and answers to them.
 
+UNKNOWN = dict.fromkeys(
+    ("translation", "rotation_deg", "normalized_error_squared", "pose", "covariance", "confidence")
+)
+"""What is not known of an image that could not be localized at all."""
+
 
 @dataclass(frozen=True)
 class Question:
@@ -236,46 +241,28 @@ class Question:
 
     def answer(self) -> Row:
         """Localize the image and return the row of the answer."""
-        found: list[Localization] = []
-
-        def localize() -> Localization:
-            found.append(self.localizer(self.frame, self.start, seed=SEED))
-            return found[0]
-
+        began = time.process_time()
         try:
-            row = timed_answer(localize, None)
+            found = self.localizer(self.frame, self.start, seed=SEED)
         # What the localizer cannot take is behaviour too, and one such image must not end the record.
         except Exception as error:
-            unknown = dict.fromkeys(
-                (
-                    "pose",
-                    "covariance",
-                    "confidence",
-                    "translation",
-                    "rotation_deg",
-                    "normalized_error_squared",
-                )
-            )
-            said = {"outcome": f"raised {type(error).__name__}", "reason": str(error)}
-            return unknown | said | {"converged": False, "cpu_seconds": 0.0}
-        errors = [errors_of(found[0], view) for view in self.right]
-        nearest_error = min(
-            (some for some in errors if some["translation"] is not None),
-            key=lambda some: some["translation"],
-            default=errors_of(found[0], None),
-        )
-        row |= nearest_error
-        if row["translation"] is not None:
-            row["translation"] /= self.unit
-        pose, covariance = found[0].T_world_camera.matrix()[:3], found[0].covariance
+            said = {"converged": False, "outcome": f"raised {type(error).__name__}", "reason": str(error)}
+            return UNKNOWN | said | {"cpu_seconds": time.process_time() - began}
+        seconds = time.process_time() - began
+        errors = [errors_of(found, view) for view in self.right] or [errors_of(found, None)]
+        if errors[0]["translation"] is not None:
+            errors = [some | {"translation": some["translation"] / self.unit} for some in errors]
+            errors.sort(key=lambda some: some["translation"])
+        pose, covariance = found.T_world_camera.matrix()[:3], found.covariance
         upper = None if covariance is None else covariance[tuple(torch.triu_indices(6, 6))]
-        return {
+        return errors[0] | {
             "pose": pose.tolist() if bool(pose.isfinite().all()) else None,
             # The shortest decimal numbers that are these in single precision, to keep the rows small.
             "covariance": None if upper is None or not bool(upper.isfinite().all())
             else [float(str(value)) for value in upper.float().numpy()],
-            "reason": found[0].reason, "confidence": found[0].confidence,
-        } | row  # fmt: skip
+            "converged": found.converged, "outcome": str(found.outcome), "reason": found.reason,
+            "confidence": found.confidence, "cpu_seconds": seconds,
+        }  # fmt: skip
 
 
 class Subject:
@@ -581,4 +568,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
