@@ -540,8 +540,8 @@ def keep(paths: Sequence[Path]) -> None:
     found: dict[str, Any] = {}
     for (name, mode, condition), some in cells(list(answers)).items():
         found.setdefault(f"{name}, {mode}", {})[condition] = summary([answers[key] for key in some])
-    maps = {key[1]: row for key, row in rows.items() if key[0] == "about"}
-    record("answers", {"maps": maps, "counts": found}, SEED)
+    maps = {key[1]: [row["commit"], *row["content"]] for key, row in rows.items() if key[0] == "about"}
+    record("answers", {"commit_and_content_of_maps": maps, "counts": found}, SEED)
 
 
 def main() -> None:
