@@ -84,6 +84,8 @@ PLANES = "planes"
 START_DEGREES = 5.0
 TILT = {"tilted": math.radians(30), "full": math.radians(10)}
 WALL_DISTANCE = 2.0
+ROUNDING = 1e-6
+"""Smallest change of an entry of a pose that counts as one."""
 
 
 # Conditions.
@@ -471,9 +473,19 @@ def changes(first: Sequence[Row], second: Sequence[Row]) -> dict[str, int]:
     """Return how many pairs of answers differ at all, and in what."""
     pairs = list(zip(first, second, strict=True))
     parts = ("pose", "covariance", "outcome", "reason", "confidence")
-    return {"any": sum(untimed(a) != untimed(b) for a, b in pairs)} | {
-        part: sum(a[part] != b[part] for a, b in pairs) for part in parts
-    }
+    found = {"any": sum(untimed(a) != untimed(b) for a, b in pairs)}
+    found |= {part: sum(a[part] != b[part] for a, b in pairs) for part in parts}
+    return found | {"pose beyond rounding": sum(moved(a["pose"], b["pose"]) for a, b in pairs)}
+
+
+def moved(first: list[list[float]] | None, second: list[list[float]] | None) -> bool:
+    """Return whether two poses differ by more than rounding does, or only one is known."""
+    if first is None or second is None:
+        return first is not second
+    return bool(
+        (torch.tensor(first, dtype=torch.float64) - torch.tensor(second, dtype=torch.float64)).abs().max()
+        > ROUNDING
+    )
 
 
 def cells(keys: Sequence[tuple[str, ...]]) -> dict[tuple[str, str, str], list[tuple[str, ...]]]:

@@ -179,10 +179,19 @@ def test_two_files_are_compared(
     assert "| accepted | 0 | 0 | 1 |" in lines
     assert "| silent | 0 | 10 | 0.00195 |" in lines
     assert lines[-1] == (
-        "Changed answers: any 10, pose 0, covariance 0, outcome 0, reason 0, confidence 0"
+        "Changed answers: any 10, pose 0, covariance 0, outcome 0, reason 0, confidence 0,"
+        " pose beyond rounding 0"
     )  # rows of this test have no poses; their errors differ
     with pytest.raises(InputError, match="no answers that all files have"):
         answers.compare([first, written(tmp_path / "d.jsonl", [])])
+
+
+def test_rounding_moves_no_pose(answers: ModuleType) -> None:
+    pose = SE3.identity().matrix()[:3]
+    assert not answers.moved(pose.tolist(), (pose + 1e-9).tolist())
+    assert answers.moved(pose.tolist(), (pose + 1e-4).tolist())
+    assert answers.moved(None, pose.tolist())
+    assert not answers.moved(None, None)
 
 
 def test_a_record_is_compressed_and_compares_as_its_files(
