@@ -149,19 +149,22 @@ def scenes() -> list[PlanarScene]:
     ]
 
 
-def measured(scene: PlanarScene, queries: int, seed: int) -> list[dict[str, Any]]:
-    """Map a scene and localize images in it."""
-    generator = Generator().manual_seed(seed)
+def mapped(scene: PlanarScene, generator: Generator) -> tuple[PlanarMap, Localizer]:
+    """Return a map of a scene from images of known pose, and what localizes in it without rendering."""
     training = [scene.view(T, f"{i:04d}", generator) for i, T in enumerate(scene.poses(16, generator))]
     side = 2 * scene.distance
     bounds = SceneBounds((-side,) * 3, (side,) * 3, 0.01 * side, 2 * side)
     landmarks = build_landmarks(training)
     if landmarks is None:
         raise InputError(f"{scene.name}: no landmarks")
-    localizer = Localizer(
-        PlanarMap(landmarks, HomogeneousBall(1.0, 1.0, sampler=Stratified(2)), bounds),
-        config=AutoConfig(fused_rays=0),
-    )
+    found = PlanarMap(landmarks, HomogeneousBall(1.0, 1.0, sampler=Stratified(2)), bounds)
+    return found, Localizer(found, config=AutoConfig(fused_rays=0))
+
+
+def measured(scene: PlanarScene, queries: int, seed: int) -> list[dict[str, Any]]:
+    """Map a scene and localize images in it."""
+    generator = Generator().manual_seed(seed)
+    planar, localizer = mapped(scene, generator)
     rows = []
     for i, T in enumerate(scene.poses(queries, generator)):
         view = scene.view(T, f"query {i}", generator)
@@ -172,7 +175,7 @@ def measured(scene: PlanarScene, queries: int, seed: int) -> list[dict[str, Any]
             row |= {"converged": False, "outcome": "no landmarks recognised", "cpu_seconds": 0.0}
         off = row["translation"]
         right = off is not None and off < POSITION * scene.distance and row["rotation_deg"] < ANGLE
-        rows.append(row | {"right": right, "scene": scene.name, "landmarks": len(landmarks)})
+        rows.append(row | {"right": right, "scene": scene.name, "landmarks": len(planar.landmarks)})
     return rows
 
 
