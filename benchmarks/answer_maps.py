@@ -20,7 +20,7 @@ from pathlib import Path
 from _lab import one_thread
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.maps.training import train
+from bidnerf_core.maps import train
 
 CONFIG = {"steps": 1500, "seed": 0}
 VERSION = 1

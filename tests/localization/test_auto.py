@@ -13,11 +13,10 @@ import blob_images
 import module_fields
 from bidnerf_core import Localizer
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.evaluation import faulty, perturb
+from bidnerf_core.fields import Observations
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     AutoConfig,
     Localization,
@@ -26,8 +25,8 @@ from bidnerf_core.localization import (
     Problem,
     rig,
 )
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.demo import demo_room
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import demo_room
 from localizations import assert_covered, assert_near, colour_only
 from problems import FieldMap, localize
 from tiny import depth_rays_of

@@ -15,11 +15,11 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, View
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import faulty
+from bidnerf_core.evaluation import faulty
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
