@@ -27,7 +27,7 @@ import tiny
 from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main
 
-# Inside: a line of progress is drawn with values that no training of this length reports
+# Inside: a line of progress, without a training that takes as long as the line says
 from bidnerf_core.cli.progress import Display
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3

@@ -18,7 +18,7 @@ from bidnerf_core import train
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import located
 
-# Inside: what the command calls is replaced, so that a test does not bake
+# Inside: the map that the command loads is replaced by a ball, so that nothing is trained
 from bidnerf_core.cli import bake as command
 from bidnerf_core.cli import main
 from bidnerf_core.cli.output import read_views

@@ -16,7 +16,7 @@ import torch
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import open_dataset, open_sequence
 
-# Inside: which frames of a video are kept, without a video of that length
+# Inside: which frames of a sequence are kept, and the frames of a video in any order
 from bidnerf_core.datasets.phone_scans import thinned
 from bidnerf_core.datasets.posed_images import ImageFrame
 from bidnerf_core.datasets.video_frames import VideoFrames

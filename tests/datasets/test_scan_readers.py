@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-# Inside: what the classes of readers state about unit and gravity, and the number of frames they keep
+# Inside: a limit of size that small images reach, and what readers state about unit and gravity
 from bidnerf_core.datasets import (
     READERS,
     Georeferenced,

@@ -16,7 +16,7 @@ import torch
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import FrameSequence, TimedFrame, open_sequence
 
-# Inside: masks beside a sequence whose frames are not all read
+# Inside: masks beside a sequence that is no folder of files
 from bidnerf_core.datasets.masked import masked_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import Frame, MaskFolder

@@ -15,7 +15,7 @@ from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 
-# Inside: the memory and time of single processes, and rows without the trials they summarize
+# Inside: rows and costs of single trials, from which a comparison is put together
 from bidnerf_core.evaluation import (
     Comparison,
     Plan,

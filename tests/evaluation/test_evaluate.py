@@ -19,9 +19,7 @@ import bidnerf_core as bn
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
-
-# Inside: counts how often a map is opened for its trials
-from bidnerf_core.evaluation import ResultTable, TrialResult, read_results, trials
+from bidnerf_core.evaluation import ResultTable, TrialResult, opened, read_results
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.scenes import closed_form_data, closed_form_map
@@ -108,7 +106,7 @@ def test_a_map_is_read_once_until_it_changes(shared: Path, tmp_path: Path) -> No
     for steps in (4, 8):
         words = ["train", str(data), "--out", str(scene), "--overwrite", *tiny.options(steps)]
         assert main(words) == 0
-        found += [trials.opened(str(scene), str(data), *device)[0] for device in ((), ("cpu",))]
+        found += [opened(str(scene), str(data), *device)[0] for device in ((), ("cpu",))]
         (row,) = bn.evaluate(scene, data, trials=1, **QUICK).rows
         assert row.weights == found[-1].training == bn.load_map(scene).info.weights
     assert found[0] is found[1] is not found[2] is found[3]

@@ -36,7 +36,7 @@ from bidnerf_core.evaluation import (
     summarize,
 )
 
-# Inside: the page and its groups are built from rows that no file of results holds
+# Inside: statistical tests, groups and figures before they are put on a page
 from bidnerf_core.evaluation.groups import situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.report import page

@@ -20,7 +20,7 @@ from bidnerf_core.evaluation import (
     write_record,
 )
 
-# Inside: a record of how results were made, with fields that this computer does not have
+# Inside: records of runs with any content, of which a script makes only its own
 from bidnerf_core.evaluation.provenance import Provenance
 from bidnerf_core.io import from_plain
 from drawn import record

@@ -16,7 +16,7 @@ from PIL import Image
 import tiny
 from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
 
-# Inside: block sizes are reduced to those of small images, and pixels looked up one by one
+# Inside: blocks are made so small that the images of a test fill several
 from bidnerf_core.captures.photos import nearby
 from bidnerf_core.datasets import open_dataset, reading_at
 from bidnerf_core.errors import InputError

@@ -13,7 +13,7 @@ import pytest
 
 import tiny
 
-# Inside: a process is killed between the temporary file and its renaming
+# Inside: a lock is taken late, as if between two steps of another process; names of temporary files
 from bidnerf_core.io import FileInUse, files, is_temporary, locked, output_folder
 from bidnerf_core.io.files import temporary
 from bidnerf_core.maps import load_map

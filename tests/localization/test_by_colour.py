@@ -19,7 +19,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Localization, Outcome, Problem, rig
 
-# Inside: two verdicts, each without the refinement that precedes it
+# Inside: two verdicts on given results, without the refinement that leads to them
 from bidnerf_core.localization.acceptance import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.mapping import SurfaceMap, bake, build_landmarks

@@ -22,7 +22,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import NormalEquations, SurfaceRenderer
 
-# Inside: derivatives of the cost and of its pyramid, compared with differences
+# Inside: the cost of small images and its steps, of which an answer keeps one pose
 from bidnerf_core.localization.costs.images import (
     UNKNOWN_COST,
     ColourScales,

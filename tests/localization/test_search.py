@@ -19,7 +19,7 @@ from bidnerf_core.frames import View, all_pixels, observe
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import NormalEquations, Pivot, SurfaceRenderer
 
-# Inside: the distribution of proposals and the margin between them, of which one is left
+# Inside: the distribution of proposals and how far apart they are kept, of which one is left
 from bidnerf_core.localization.costs.images import FieldRenderer
 from bidnerf_core.localization.refinement import centred, rendered_middle
 from bidnerf_core.localization.search.by_images import APART, IMAGE_STAGES, TURNED, ImageSearch

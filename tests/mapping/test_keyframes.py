@@ -14,7 +14,7 @@ from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, propose
 from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
 
-# Inside: the limits on number and size of keyframes, which fewer images than that do not reach
+# Inside: the limits on the number and size of keyframes, which a map does not state
 from bidnerf_core.mapping.surface.baking import KEYFRAME_SIDE, MOST
 from bidnerf_core.scenes import HomogeneousBall, orbit
 from bidnerf_core.testing import BOUNDS, CAMERA, ground, training_views, unseen

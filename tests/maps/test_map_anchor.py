@@ -16,7 +16,7 @@ import tiny
 from bidnerf_core import resume, train
 from bidnerf_core.captures import CaptureReport, CoverageRecord
 
-# Inside: anchors and records are written while another process saves the map
+# Inside: writes are counted and stopped at each, and an anchor is written as users write it
 from bidnerf_core.maps import Anchor, Map, files, load_info, load_map, save_map
 from bidnerf_core.maps.anchor import anchor_bytes, load_anchor, save_anchor
 from bidnerf_core.maps.files import save_capture

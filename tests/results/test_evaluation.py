@@ -26,7 +26,7 @@ from bidnerf_core.results import (
     success_rate_by_frame,
 )
 
-# Inside: angles near zero and near pi, and criteria that no command offers
+# Inside: the angles of rotations near zero and pi, and criteria with other bars
 from bidnerf_core.results.errors import Criterion, Within, rotation_angle
 
 tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(

@@ -22,7 +22,7 @@ from bidnerf_core.geometry import Geodetic, geodetic
 from bidnerf_core.maps import Anchor, GeographicPose, load_anchor
 from bidnerf_core.results import Answer
 
-# Inside: axes and fields of single answers, compared with the standard, without a server
+# Inside: the axes of the standard, and answers without a server
 from bidnerf_core.service import geopose
 
 places = st.builds(Geodetic, st.floats(-90, 90), st.floats(-179.99, 179.99), st.floats(-5000, 20000))
