@@ -452,12 +452,14 @@ def test_warnings_of_other_libraries_cannot_control_the_terminal(
 def test_a_report_links_to_the_frames_that_are_wrong_or_refused(tmp_path: Path) -> None:
     first = ResultTable.load(Path(__file__).with_name("earlier_results.jsonl")).rows[0]
     near, far, hostile = ScalarPoseError(0.01, 1.0), ScalarPoseError(0.3, 1.0), "<script>alert(1)</script>"
-    rows = (
-        dataclasses.replace(first, converged=False, error=near, frame=hostile),
-        dataclasses.replace(first, converged=True, error=near, frame="right"),
-        dataclasses.replace(first, converged=True, error=far, frame="wrong #1"),
-    )
-    ResultTable(rows).save(tmp_path / "results.jsonl")
+    rows = [
+        dataclasses.replace(first, converged=accepted, error=error, frame=frame, trial=trial)
+        for seed, (accepted, error, frame) in enumerate(
+            [(False, near, hostile), (True, near, "right"), (True, far, "wrong #1")]
+        )
+        for trial in [dataclasses.replace(first.trial, seed=seed)]
+    ]
+    ResultTable(tuple(rows)).save(tmp_path / "results.jsonl")
     (tmp_path / "my map.html").touch()
     report = ["report", str(tmp_path / "results.jsonl"), "--out", str(tmp_path / "out")]
     assert main([*report, "--view", str(tmp_path / "my map.html")]) == 0
