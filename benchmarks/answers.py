@@ -64,10 +64,7 @@ from torch.nn.functional import interpolate
 from bidnerf_core import Localizer
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import RowStore, faulty, provenance
-from bidnerf_core.evaluation.faults.warp import warped
-from bidnerf_core.evaluation.protocols import random_units
-from bidnerf_core.evaluation.provenance import VERSIONS
+from bidnerf_core.evaluation import VERSIONS, RowStore, faulty, provenance, random_units, warped
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import write_file

@@ -2,6 +2,7 @@ from .advice import sentences as sentences
 from .advice import summary as summary
 from .cameras import MatrixRows as MatrixRows
 from .cameras import MovedCamera as MovedCamera
+from .cameras import PoseConsistency as PoseConsistency
 from .cameras import PoseRefinement as PoseRefinement
 from .cameras import RowMotion as RowMotion
 from .cameras import StoredCamera as StoredCamera
@@ -20,10 +21,12 @@ from .photos import detail_kept as detail_kept
 from .photos import sharpness as sharpness
 from .pose_conventions import pose_contradiction as pose_contradiction
 from .report import CaptureReport as CaptureReport
+from .report import CoverageRecord as CoverageRecord
 from .report import Gap as Gap
 from .report import PhotoProblem as PhotoProblem
 from .report import PhotoRecord as PhotoRecord
 from .survey import surveyed as surveyed
+from .training_poses import TrainingPoses as TrainingPoses
 from .training_views import RefinementChoice as RefinementChoice
 from .training_views import located as located
 from .training_views import prepared as prepared

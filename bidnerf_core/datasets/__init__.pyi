@@ -1,5 +1,7 @@
 from .colmap import SparseChoice as SparseChoice
 from .colmap import SparsePoints as SparsePoints
+from .colmap_files import read_model as read_model
+from .colmap_files import read_posed_images as read_posed_images
 from .dataset import Dataset as Dataset
 from .dataset import Georeferenced as Georeferenced
 from .dataset import ReadingProgress as ReadingProgress
@@ -39,6 +41,7 @@ from .splits import SplitDataset as SplitDataset
 from .splits import Splits as Splits
 from .splits import hold_out as hold_out
 from .trajectories import read_trajectory as read_trajectory
+from .transforms_json import read_frames as read_frames
 from .video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from .video import frame_count as frame_count
 from .video import is_video as is_video

@@ -17,6 +17,7 @@ from .faults import find_fault as find_fault
 from .faults import parse_faults as parse_faults
 from .faults.camera import rolling_shutter as rolling_shutter
 from .faults.scene import texture as texture
+from .faults.warp import warped as warped
 from .groups import Group as Group
 from .groups import grouped as grouped
 from .json_lines import RowStore as RowStore
@@ -25,9 +26,13 @@ from .plots import convergence_plot as convergence_plot
 from .protocols import FARTHEST_START as FARTHEST_START
 from .protocols import PROTOCOLS as PROTOCOLS
 from .protocols import Size as Size
+from .protocols import bid_hard_start as bid_hard_start
 from .protocols import bid_start as bid_start
 from .protocols import find_protocol as find_protocol
 from .protocols import perturb as perturb
+from .protocols import random_units as random_units
+from .protocols import rotation_of_size as rotation_of_size
+from .provenance import VERSIONS as VERSIONS
 from .provenance import command_line as command_line
 from .provenance import note_run as note_run
 from .provenance import provenance as provenance
@@ -46,6 +51,8 @@ from .summary import median as median
 from .summary import pairwise_tests as pairwise_tests
 from .summary import steps_of as steps_of
 from .summary import summarize as summarize
+from .trial import ScalarPoseError as ScalarPoseError
+from .trial import Trace as Trace
 from .trial import Trial as Trial
 from .trial import TrialResult as TrialResult
 from .trial import views_digest as views_digest

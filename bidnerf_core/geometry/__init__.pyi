@@ -1,4 +1,6 @@
 from .arcs import arc as arc
+from .arcs import mean_up as mean_up
+from .arcs import seen_middle as seen_middle
 from .arcs import turned_about as turned_about
 from .independent import CORNERS_PER_INDEPENDENT as CORNERS_PER_INDEPENDENT
 from .independent import KEYPOINTS_PER_INDEPENDENT as KEYPOINTS_PER_INDEPENDENT

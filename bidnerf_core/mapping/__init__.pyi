@@ -25,6 +25,7 @@ from .geometry.projection import Array as Array
 from .geometry.projection import projected as projected
 from .geometry.reprojection import SCALE as SCALE
 from .geometry.reprojection import ReprojectionErrors as ReprojectionErrors
+from .geometry.reprojection import RobustEquations as RobustEquations
 from .geometry.reprojection import State as State
 from .geometry.resection import LEAST_NOISE as LEAST_NOISE
 from .geometry.resection import RESECTION_STEPS as RESECTION_STEPS
@@ -46,6 +47,7 @@ from .landmarks.building import posed_keypoints as posed_keypoints
 from .landmarks.building import robust_covariance as robust_covariance
 from .landmarks.building import tracked_views as tracked_views
 from .landmarks.building import update_scatter as update_scatter
+from .landmarks.features import FEATURES as FEATURES
 from .landmarks.features import FIRST_CENTRE as FIRST_CENTRE
 from .landmarks.features import SIFT as SIFT
 from .landmarks.features import USUAL_FEATURES as USUAL_FEATURES

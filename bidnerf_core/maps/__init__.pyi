@@ -1,6 +1,8 @@
 from .anchor import Anchor as Anchor
 from .anchor import GeographicPose as GeographicPose
+from .anchor import load_anchor as load_anchor
 from .checkpoints import CHECKPOINT_SECONDS as CHECKPOINT_SECONDS
+from .checkpoints import Checkpoints as Checkpoints
 from .collection import MapCollection as MapCollection
 from .collection import Placement as Placement
 from .collection import maps_in as maps_in
@@ -10,8 +12,11 @@ from .description import cameras_of as cameras_of
 from .description import load_info as load_info
 from .description import longest_side as longest_side
 from .extending import extend as extend
+from .files import load_capture as load_capture
+from .files import load_surface as load_surface
 from .files import map_folder as map_folder
 from .files import save_map as save_map
+from .files import save_surface as save_surface
 from .importers import IMPORTERS as IMPORTERS
 from .importers import UNMOVED as UNMOVED
 from .importers import ImportedField as ImportedField

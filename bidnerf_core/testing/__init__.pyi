@@ -5,8 +5,11 @@ from .method_contract import MethodContract as MethodContract
 from .reader_contract import ReaderContract as ReaderContract
 from .recipes import Recorder as Recorder
 from .recipes import colour_error as colour_error
+from .samples import check_background as check_background
 from .samples import check_hits as check_hits
 from .samples import check_intervals as check_intervals
+from .samples import check_levels as check_levels
+from .samples import check_rays_alone as check_rays_alone
 from .samples import check_repeatable as check_repeatable
 from .scene import SCENE_BOUNDS as SCENE_BOUNDS
 from .scene import SIDE as SIDE
@@ -28,3 +31,6 @@ from .textured_field import textured_map as textured_map
 from .textured_field import training_views as training_views
 from .textured_field import unseen as unseen
 from .textured_field import view as view
+from .values import check_precision as check_precision
+from .values import check_ranges as check_ranges
+from .values import check_shapes as check_shapes

@@ -19,10 +19,10 @@ from bidnerf_core.fields import (
     RaySampler,
     Resampled,
     SceneBounds,
+    SplittingSampler,
     VoxelGrid,
     render,
 )
-from bidnerf_core.fields.sampling import SplittingSampler
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
 from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid

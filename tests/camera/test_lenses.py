@@ -22,8 +22,9 @@ from bidnerf_core.camera import (
     PanoramaFace,
     colmap_camera,
 )
+
+# Inside: each lens model is compared with COLMAP's and OpenCV's own projection
 from bidnerf_core.camera.lenses import LENS_MODELS, lens_camera
-from bidnerf_core.camera.orientation import CODES
 from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
@@ -120,7 +121,7 @@ def test_an_undistorted_image_is_that_of_its_pinhole_camera(model: str) -> None:
     assert bool((seen == 1).all())
 
 
-@pytest.mark.parametrize("code", CODES)
+@pytest.mark.parametrize("code", range(1, 9))
 def test_turned_photos_are_undistorted_alike(code: int) -> None:
     """Undistorting the upright image is turning the undistorted one."""
     lens, orientation = lens_of("OPENCV_FISHEYE"), Orientation.from_exif(code)

@@ -16,6 +16,7 @@ import torch
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.captures import (
     CaptureReport,
+    CoverageRecord,
     Gap,
     PhotoRecord,
     UpDirection,
@@ -24,10 +25,11 @@ from bidnerf_core.captures import (
     summary,
     surveyed,
 )
+
+# Inside: the measures of single photos and pairs, of which a report gives only the remarks
 from bidnerf_core.captures.advice import SUMMARY_LINES
 from bidnerf_core.captures.links import groups
 from bidnerf_core.captures.photos import exposures, nearby, photo_measures
-from bidnerf_core.captures.report import CoverageRecord
 from bidnerf_core.fields import render_image
 from bidnerf_core.geometry import look_at
 from bidnerf_core.io import from_plain, to_plain

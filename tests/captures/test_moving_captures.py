@@ -13,6 +13,8 @@ from torch import Tensor
 
 from bidnerf_core import SE3, View
 from bidnerf_core.camera import STILL
+
+# Inside: the evidence of a common motion, of which a capture only shows the decision
 from bidnerf_core.captures import (
     PoseRefinement,
     at_stored_poses,

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from bidnerf_core import SE3, InputError, register
 from bidnerf_core.captures import pose_contradiction, prepared
+
+# Inside: every reading of poses is applied and taken back, also those that no message proposes
 from bidnerf_core.captures.pose_conventions import PoseContradiction
 from bidnerf_core.captures.pose_readings import AS_GIVEN, Y_AND_Z_REVERSED, readings, signed_permutations
 from bidnerf_core.mapping import ImageKeypoints, posed_keypoints

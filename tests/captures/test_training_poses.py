@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +20,15 @@ from bidnerf_core.captures import (
     pose_sentences,
     stored_cameras,
 )
+
+# Inside: how far each pose was refined, and the checks of depth that precede a training
 from bidnerf_core.captures.cameras import moved_from
 from bidnerf_core.captures.pose_refinement import adjusted_poses
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
+from bidnerf_core.captures.training_views import check_depth_unit
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.mapping import LandmarkConfig, Sift, tracked_views
+from bidnerf_core.errors import InputError
+from bidnerf_core.mapping import LandmarkConfig, Sift, TrackedViews, tracked_views
 from inaccurate_captures import VIEWS, refined, turned, updates
 from landmark_scene import Points, looking_in, ring
 
@@ -184,3 +189,30 @@ def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
         assert 0.3 < float(found.pixels.median()) < 2
     else:
         assert found.consistency.inconsistency < 0.1
+
+
+def measured(ratio: float) -> TrackedViews:
+    """Images whose measured depth is ``ratio`` times the true one."""
+    points = Points(noise=0.3)
+    return tracked_views(ring(points, 8, depth=ratio), points)
+
+
+@pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])
+def test_depth_in_another_unit_is_refused(ratio: float) -> None:
+    with pytest.raises(InputError, match=r"times the depth that the poses .*depth_unit_scale_factor"):
+        check_depth_unit(measured(ratio))
+
+
+def test_another_unit_of_depth_is_named_where_it_can_be_given() -> None:
+    for ratio, unit, better in ((0.2, 1 / 5000, "0.001"), (0.3048, 0.001, "0.00328")):
+        with pytest.raises(InputError, match=rf"times .*--depth-unit {re.escape(better)}, "):
+            check_depth_unit(measured(ratio), unit)
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(1.08, True), (0.94, True), (1.02, False)])
+def test_a_scale_of_depth_that_is_a_few_percent_off_is_told(
+    ratio: float, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "bidnerf")
+    check_depth_unit(measured(ratio))
+    assert ("times the depth that the poses and photos imply; training takes both" in caplog.text) == said

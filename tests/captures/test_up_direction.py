@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
 
 from bidnerf_core.captures import given_up, up_direction
-from bidnerf_core.datasets.record3d import Record3DDataset
 from bidnerf_core.geometry import SE3
 
 WORLD = SE3.exp(torch.tensor([0.0, 0, 0, 0.7, -1.1, 0.4], dtype=torch.float64)).rotation
@@ -76,22 +74,3 @@ def test_walls_do_not_count_as_floors() -> None:
 def test_gravity_is_taken_as_it_is() -> None:
     assert given_up((0, 9.81, 0)).direction == (0, 1, 0)
     assert given_up((0, 9.81, 0)).source == "gravity"
-
-
-def test_datasets_that_wrap_others_keep_what_these_know() -> None:
-    """A scan's unit and gravity reach training whatever masks or splits are chosen."""
-    from bidnerf_core.datasets import Georeferenced, Splits
-    from bidnerf_core.datasets.polycam import PolycamDataset
-    from bidnerf_core.datasets.whole import WholeDataset
-
-    scan = PolycamDataset(Splits(Path("scan"), {"train": []}), None)
-    whole = WholeDataset(scan)
-    assert isinstance(scan, Georeferenced)
-    assert isinstance(whole, Georeferenced)
-    assert (whole.unit, whole.up) == ("metres", (0.0, 1.0, 0.0))
-
-
-def test_the_world_of_record3d_has_no_vertical_axis() -> None:
-    """It is the camera of the first frame, however the phone was held."""
-    assert Record3DDataset.up is None
-    assert Record3DDataset.unit == "metres"

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import FreeSpace, estimate_bounds, occupied_cells
+
+# Inside: the points and factors from which bounds are computed, as limits of what bounds may be
 from bidnerf_core.carving.bounds import ONE_PLACE, ROOM, measured_points
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError

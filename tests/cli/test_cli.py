@@ -26,13 +26,14 @@ from safetensors.torch import load_file, save_file
 import tiny
 from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main
+
+# Inside: a line of progress is drawn with values that no training of this length reports
 from bidnerf_core.cli.progress import Display
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localizer
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.maps import MapInfo, load_info, load_map
-from bidnerf_core.maps.checkpoints import Checkpoints
+from bidnerf_core.maps import Checkpoints, MapInfo, load_info, load_map
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import TrainingStep

@@ -16,14 +16,16 @@ import torch
 import tiny
 from bidnerf_core import train
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import training_views
+from bidnerf_core.captures import located
+
+# Inside: what the command calls is replaced, so that a test does not bake
 from bidnerf_core.cli import bake as command
 from bidnerf_core.cli import main
 from bidnerf_core.cli.output import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
-from bidnerf_core.maps import Map, baking, load_info, load_map
+from bidnerf_core.maps import Map, load_info, load_map
 from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
@@ -82,7 +84,7 @@ def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     photos = read_views(open_dataset(sharp / "data", tiny.BACKGROUND), "train")
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
     monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
-    monkeypatch.setattr(baking, "rendered_views", lambda *_: photos[:12])
+    monkeypatch.setattr("bidnerf_core.maps.baking.rendered_views", lambda *_: photos[:12])
 
 
 def test_a_baked_map_needs_no_start(sharp: Path, folder: Path, bidnerf: Run) -> None:
@@ -256,8 +258,8 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
         seen.append(sum(len(v.landmarks.distance) for v in views if v.landmarks is not None))
         hashgrid.train(field, views, *rest)
 
-    for part in (baking, training_views):
-        monkeypatch.setattr(part, "tracked_views", tracked)
+    for part in ("maps.baking", "captures.training_views"):
+        monkeypatch.setattr(f"bidnerf_core.{part}.tracked_views", tracked)
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
     monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
@@ -272,7 +274,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
 
 def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
     bare = [replace(v, frame=replace(v.frame, depth=None)) for v in tiny.views(3)]
-    tracked, views = training_views.located(bare)
+    tracked, views = located(bare)
     assert tracked is None
     assert all(view.landmarks is None for view in views)
 

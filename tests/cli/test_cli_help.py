@@ -17,6 +17,8 @@ import pytest
 import tyro
 
 from bidnerf_core.cli import COMMANDS, main
+
+# Inside: the parser alone, with another version of its library and without the settings for experts
 from bidnerf_core.cli.help_page import without_expert_settings
 from bidnerf_core.cli.options import parse
 from bidnerf_core.localization import METHODS

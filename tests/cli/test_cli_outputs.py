@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 import torch
 
+# Inside: signals arrive within sections that a command passes in microseconds
 import bidnerf_core.cli.localize as localize_module
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf_core.cli import main

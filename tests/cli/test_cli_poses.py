@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,15 +14,13 @@ import torch
 
 import tiny
 from bidnerf_core import SE3, View
-from bidnerf_core.captures import as_given, stored_cameras, training_views
-from bidnerf_core.captures.cameras import PoseConsistency
-from bidnerf_core.captures.training_poses import TrainingPoses
+from bidnerf_core.captures import PoseConsistency, TrainingPoses, as_given, stored_cameras
+from bidnerf_core.captures import prepared as prepared_for_training
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import TrackedViews, tracked_views
-from bidnerf_core.maps import cameras_of, load_info, read_views
-from bidnerf_core.maps.files import load_capture
+from bidnerf_core.maps import cameras_of, load_capture, load_info, read_views
 from commands import Run, assert_refused
 from landmark_scene import Points, ring
 from trainings import assert_same_map, stop_at
@@ -40,7 +37,7 @@ def refine_poses(patch: pytest.MonkeyPatch) -> None:
         there = tracked.at(tracked.T_world_camera.retract(UPDATE))
         return TrainingPoses(there, pixels, [1], True, PoseConsistency(0.7, 0.36))
 
-    patch.setattr(training_views, "training_poses", moved)
+    patch.setattr("bidnerf_core.captures.training_views.training_poses", moved)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +99,7 @@ def test_a_resumed_training_takes_the_refined_poses_again(
     with monkeypatch.context() as patch:
         stop_at(patch, 5)
         assert bidnerf(*train, "--out", tmp_path / "half").status == 130
-    monkeypatch.setattr(training_views, "training_poses", None)  # it is not called again
+    monkeypatch.setattr("bidnerf_core.captures.training_views.training_poses", None)  # it is not called again
     resume = ["train", shared / "data", "--resume", "--out", tmp_path / "half"]
     assert_refused(bidnerf(*resume, "--refine-poses", "never"), 2, "refined poses")
     assert bidnerf(*resume, "--no-bake").status == 0
@@ -129,20 +126,13 @@ def test_a_damaged_given_pose_is_named(bidnerf: Run, refined: Path, tmp_path: Pa
     assert_refused(bidnerf("info", tmp_path / "map"), 1, file, described["cameras"][1]["name"], "rigid")
 
 
-def measured(ratio: float) -> TrackedViews:
-    """Images whose measured depth is ``ratio`` times the true one."""
-    points = Points(noise=0.3)
-    return tracked_views(ring(points, 8, depth=ratio), points)
-
-
 def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch) -> None:
     """Prepare views of points for training, as the command does."""
     monkeypatch.setattr(
-        training_views,
-        "tracked_views",
+        "bidnerf_core.captures.training_views.tracked_views",
         lambda given, features, progress: tracked_views(given, points, progress=progress),
     )
-    training_views.prepared(views)
+    prepared_for_training(views)
 
 
 @pytest.mark.slow
@@ -162,31 +152,10 @@ def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPat
         prepared(millimetres, points, monkeypatch)
 
 
-@pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])
-def test_depth_in_another_unit_is_refused(ratio: float) -> None:
-    with pytest.raises(InputError, match=r"times the depth that the poses .*depth_unit_scale_factor"):
-        training_views.check_depth_unit(measured(ratio))
-
-
-def test_another_unit_of_depth_is_named_where_it_can_be_given() -> None:
-    for ratio, unit, better in ((0.2, 1 / 5000, "0.001"), (0.3048, 0.001, "0.00328")):
-        with pytest.raises(InputError, match=rf"times .*--depth-unit {re.escape(better)}, "):
-            training_views.check_depth_unit(measured(ratio), unit)
-
-
 def test_datasets_tell_the_unit_of_their_depth(shared: Path) -> None:
     assert read_views(shared / "data").depth_unit == 0.001
     centimetres = open_dataset(shared / "data", depth_unit=0.01)
     assert read_views(centimetres, "all").depth_unit == 0.01
-
-
-@pytest.mark.parametrize(("ratio", "said"), [(1.08, True), (0.94, True), (1.02, False)])
-def test_a_scale_of_depth_that_is_a_few_percent_off_is_told(
-    ratio: float, said: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level("INFO", "bidnerf")
-    training_views.check_depth_unit(measured(ratio))
-    assert ("times the depth that the poses and photos imply; training takes both" in caplog.text) == said
 
 
 @pytest.mark.data

@@ -15,6 +15,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+# Inside: single lines of standard input, and a watched folder without waiting
 import bidnerf_core.cli.watch_folder as following
 from bidnerf_core import InputError, View
 from bidnerf_core.captures import stored_cameras

@@ -21,7 +21,6 @@ from PIL import Image
 
 from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.io import archives
 from scan_layouts import (
     LAYOUTS,
     edit_frame,
@@ -321,7 +320,7 @@ def test_members_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.Mon
     file = packed(
         tmp_path, {**record3d_files(small_views(2)), "metadata": bytes(10**6)}, zipfile.ZIP_DEFLATED
     )
-    monkeypatch.setattr(archives, "LARGEST_MEMBER", 10**5)
+    monkeypatch.setattr("bidnerf_core.io.archives.LARGEST_MEMBER", 10**5)
     assert "scan.r3d/metadata: unpacks to 1 MiB, expected at most 0 MiB" in message(file)
     content = file.read_bytes().replace((10**6).to_bytes(4, "little"), (10**4).to_bytes(4, "little"))
     file.write_bytes(content)

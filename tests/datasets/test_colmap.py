@@ -13,8 +13,7 @@ import sparse_model
 import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets import SparseChoice, SparsePoints
-from bidnerf_core.datasets.colmap_files import read_model
+from bidnerf_core.datasets import SparseChoice, SparsePoints, read_model
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, SceneBounds, render, render_image
 from bidnerf_core.frames import Frame, View

@@ -15,6 +15,8 @@ import torch
 
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import open_dataset, open_sequence
+
+# Inside: which frames of a video are kept, without a video of that length
 from bidnerf_core.datasets.phone_scans import thinned
 from bidnerf_core.datasets.posed_images import ImageFrame
 from bidnerf_core.datasets.video_frames import VideoFrames

@@ -10,15 +10,21 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+# Inside: what the classes of readers state about unit and gravity, and the number of frames they keep
 from bidnerf_core.datasets import (
     READERS,
+    Georeferenced,
     ReadOptions,
+    Splits,
     find_reader,
     open_dataset,
     open_sequence,
     phone_scans,
     read_trajectory,
 )
+from bidnerf_core.datasets.polycam import PolycamDataset
+from bidnerf_core.datasets.record3d import Record3DDataset
+from bidnerf_core.datasets.whole import WholeDataset
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
@@ -195,3 +201,18 @@ def test_poses_that_are_written_are_read_again(
     if name.endswith(".kitti.txt"):
         with pytest.warns(InputWarning, match="image 1 has no pose; KITTI rows do not state their image"):
             write_poses(tmp_path / name, [posed[0], *posed[2:]])
+
+
+def test_datasets_that_wrap_others_keep_what_these_know() -> None:
+    """A scan's unit and gravity reach training whatever masks or splits are chosen."""
+    scan = PolycamDataset(Splits(Path("scan"), {"train": []}), None)
+    whole = WholeDataset(scan)
+    assert isinstance(scan, Georeferenced)
+    assert isinstance(whole, Georeferenced)
+    assert (whole.unit, whole.up) == ("metres", (0.0, 1.0, 0.0))
+
+
+def test_the_world_of_record3d_has_no_vertical_axis() -> None:
+    """It is the camera of the first frame, however the phone was held."""
+    assert Record3DDataset.up is None
+    assert Record3DDataset.unit == "metres"

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
+
+# Inside: the published calibration, with which the recording is rendered
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
 from bidnerf_core.depth import DepthCamera
 from bidnerf_core.errors import InputError

@@ -13,6 +13,8 @@ import pytest
 import torch
 
 from bidnerf_core.datasets import open_dataset, open_sequence, unique_names
+
+# Inside: a lookup of names that differ by case, which few file systems can hold
 from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.errors import InputError
 from scan_layouts import (

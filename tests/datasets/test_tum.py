@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
+
+# Inside: the published cameras and the association of times, compared with OpenCV and SciPy
 from bidnerf_core.datasets.trajectories import Trajectory
 from bidnerf_core.datasets.tum import CAMERAS, associate
 from bidnerf_core.errors import InputError

@@ -15,6 +15,8 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import FrameSequence, TimedFrame, open_sequence
+
+# Inside: masks beside a sequence whose frames are not all read
 from bidnerf_core.datasets.masked import masked_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import Frame, MaskFolder

@@ -13,6 +13,8 @@ from torch import Generator, Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.depth import DepthNoise
+
+# Inside: estimates of noise and steps are compared with the true values, of which users see a remark
 from bidnerf_core.depth.noise import DepthSteps, depth_steps, estimated_depth_noise
 from bidnerf_core.depth.sensors import KINECT
 

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.cli.camera_options import depth_registration
 from bidnerf_core.datasets import DepthCamera, TimedFrame, open_dataset, open_sequence
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
@@ -190,11 +189,6 @@ def test_depth_of_another_shape_than_its_sensors_is_refused(recording: Path) -> 
     square = DepthCamera(Intrinsics(50.0, 50.0, 30.0, 30.0, 60, 60), SE3.identity())
     with pytest.raises(InputError, match=r"depth is 160x120, expected the aspect ratio of its camera, 60x60"):
         first(recording, register_depth=square)
-
-
-@pytest.mark.parametrize("option", [None, "no", "sensor.json"])
-def test_the_option_of_the_command_line(option: str | None) -> None:
-    assert depth_registration(option) == {None: None, "no": False, "sensor.json": Path("sensor.json")}[option]
 
 
 def test_a_transform_that_loses_all_depth_is_named() -> None:

@@ -19,6 +19,8 @@ from bidnerf_core.depth import (
     find_depth_sensor,
     noise_remark,
 )
+
+# Inside: the constants of the sensors are compared with their publications
 from bidnerf_core.depth.sensors import KINECT, REALSENSE, RENDERED
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import AutoConfig, settings_of

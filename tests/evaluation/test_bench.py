@@ -33,11 +33,12 @@ from bidnerf_core.evaluation import (
     run_trial,
     run_trials,
 )
+
+# Inside: shards and lines of results, of which a bench shows only the union
 from bidnerf_core.evaluation.bench import shard_of
 from bidnerf_core.evaluation.json_lines import as_line
 from bidnerf_core.evaluation.workers import InThisProcess
-from bidnerf_core.geometry import arc, turned_about
-from bidnerf_core.geometry.arcs import mean_up, seen_middle
+from bidnerf_core.geometry import arc, mean_up, seen_middle, turned_about
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import METHODS
 from bidnerf_core.results import pose_error

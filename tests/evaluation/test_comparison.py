@@ -14,6 +14,8 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
+
+# Inside: the memory and time of single processes, and rows without the trials they summarize
 from bidnerf_core.evaluation import (
     Comparison,
     Plan,

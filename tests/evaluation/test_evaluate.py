@@ -20,6 +20,8 @@ import bidnerf_core as bn
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
+
+# Inside: counts how often a map is opened for its trials
 from bidnerf_core.evaluation import ResultTable, TrialResult, read_results, trials
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method

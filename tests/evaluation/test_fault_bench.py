@@ -31,6 +31,8 @@ from bidnerf_core.evaluation import (
     left_to_do,
     planned,
 )
+
+# Inside: the values of curves, which a report shows as pictures, and the images of a trial
 from bidnerf_core.evaluation.plots import draw_faults, fault_curves
 from bidnerf_core.evaluation.trials import trial_views
 from bidnerf_core.evaluation.workers import InThisProcess

@@ -13,8 +13,15 @@ from scipy.ndimage import label
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults, rolling_shutter
-from bidnerf_core.evaluation.protocols import random_units
+from bidnerf_core.evaluation import (
+    FAULTS,
+    NO_FAULT,
+    expand_faults,
+    faulty,
+    parse_faults,
+    random_units,
+    rolling_shutter,
+)
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes import demo_object, demo_room, look_at, orbit

@@ -22,6 +22,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
     NEVER,
     ResultTable,
+    ScalarPoseError,
+    Trace,
     Trial,
     TrialResult,
     grouped,
@@ -33,11 +35,12 @@ from bidnerf_core.evaluation import (
     steps_of,
     summarize,
 )
+
+# Inside: the page and its groups are built from rows that no file of results holds
 from bidnerf_core.evaluation.groups import situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.report import page
 from bidnerf_core.evaluation.summary import compare_pair
-from bidnerf_core.evaluation.trial import Trace
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import success_rate_by_frame
 from trial_results import trial_result
@@ -444,3 +447,23 @@ def test_warnings_of_other_libraries_cannot_control_the_terminal(
     said = capfd.readouterr().err
     assert r"Glyph \x1b[31m missing" in said
     assert harmless(said)
+
+
+def test_a_report_links_to_the_frames_that_are_wrong_or_refused(tmp_path: Path) -> None:
+    first = ResultTable.load(Path(__file__).with_name("earlier_results.jsonl")).rows[0]
+    near, far, hostile = ScalarPoseError(0.01, 1.0), ScalarPoseError(0.3, 1.0), "<script>alert(1)</script>"
+    rows = (
+        dataclasses.replace(first, converged=False, error=near, frame=hostile),
+        dataclasses.replace(first, converged=True, error=near, frame="right"),
+        dataclasses.replace(first, converged=True, error=far, frame="wrong #1"),
+    )
+    ResultTable(rows).save(tmp_path / "results.jsonl")
+    (tmp_path / "my map.html").touch()
+    report = ["report", str(tmp_path / "results.jsonl"), "--out", str(tmp_path / "out")]
+    assert main([*report, "--view", str(tmp_path / "my map.html")]) == 0
+    found = (tmp_path / "out" / "index.html").read_text()
+    linked = re.findall(r'href="\.\./my%20map\.html#frame=([^"]*)"', found)
+    assert linked == ["wrong%20%231", "%3Cscript%3Ealert%281%29%3C/script%3E"]
+    assert hostile not in found
+    assert main(report) == 0
+    assert "my%20map.html" not in (tmp_path / "out" / "index.html").read_text()

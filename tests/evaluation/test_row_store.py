@@ -19,6 +19,8 @@ from bidnerf_core.evaluation import (
     read_runs,
     write_record,
 )
+
+# Inside: a record of how results were made, with fields that this computer does not have
 from bidnerf_core.evaluation.provenance import Provenance
 from bidnerf_core.io import from_plain
 from drawn import record

@@ -16,8 +16,14 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import Trial, TrialResult, forget_peak_memory, peak_memory_bytes, run_trial
-from bidnerf_core.evaluation.trial import Trace
+from bidnerf_core.evaluation import (
+    Trace,
+    Trial,
+    TrialResult,
+    forget_peak_memory,
+    peak_memory_bytes,
+    run_trial,
+)
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import pose_error

@@ -12,7 +12,16 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import RadianceField, Rays, SceneBounds, Stratified, render
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall, orbit
-from bidnerf_core.testing import samples, values
+from bidnerf_core.testing import (
+    check_background,
+    check_intervals,
+    check_levels,
+    check_precision,
+    check_ranges,
+    check_rays_alone,
+    check_repeatable,
+    check_shapes,
+)
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)
 
@@ -26,8 +35,8 @@ def rays_towards_the_middle(count: int, generator: torch.Generator) -> Rays:
 
 @pytest.mark.parametrize(
     "check",
-    [values.check_shapes, values.check_ranges, samples.check_intervals, samples.check_repeatable, samples.check_rays_alone,
-     samples.check_background, samples.check_levels, lambda field: values.check_precision(field, field)],
+    [check_shapes, check_ranges, check_intervals, check_repeatable, check_rays_alone,
+     check_background, check_levels, lambda field: check_precision(field, field)],
 )  # fmt: skip
 @pytest.mark.parametrize(
     "field", [GaussianBlobs.random(), HomogeneousBall(0.7, 2.0)], ids=lambda f: type(f).__name__

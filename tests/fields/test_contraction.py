@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from bidnerf_core.fields import RaySpacing, SceneBounds, VoxelGrid, contract_points
+
+# Inside: the inverse of the contraction, which rendering never computes alone
 from bidnerf_core.fields.contraction import expand
 
 OPEN = SceneBounds((-1.0, -2.0, 0.5), (2.0, 1.0, 3.0), 0.1, 400.0, contracted=True)

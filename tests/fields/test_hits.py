@@ -21,6 +21,8 @@ from bidnerf_core.fields import (
     render,
 )
 from bidnerf_core.geometry import SE3
+
+# Inside: the derivatives of single rays are compared with differences; a solver only shows their sum
 from bidnerf_core.localization.costs.linearization import linearize
 from bidnerf_core.testing import check_hits
 

@@ -24,7 +24,7 @@ from bidnerf_core.fields import (
     render,
 )
 from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall
-from bidnerf_core.testing import samples as laws
+from bidnerf_core.testing import check_background, check_intervals, check_rays_alone, check_repeatable
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from voxels import cell_centres
 
@@ -82,7 +82,7 @@ def fewer(sampler: RaySampler, count: int = COUNT) -> Concentrated:
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_the_contracts_laws_hold(name: str, made: Callable[[RaySampler], RaySampler]) -> None:
     field = Resampled(GaussianBlobs.random(), made(SAMPLERS[name]()))
-    for law in (laws.check_intervals, laws.check_repeatable, laws.check_rays_alone, laws.check_background):
+    for law in (check_intervals, check_repeatable, check_rays_alone, check_background):
         law(field)
 
 

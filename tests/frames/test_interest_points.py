@@ -10,6 +10,8 @@ from scipy.ndimage import binary_dilation
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import DrawerName, Frame, drawer
+
+# Inside: where interest points lie, of which drawn pixels are a random sample
 from bidnerf_core.frames import pixels as interest
 from bidnerf_core.frames.pixels import Among, interest_points, interest_regions
 

@@ -11,7 +11,6 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-import bidnerf_core.cli.localize as localize_module
 from bidnerf_core import Frame, Intrinsics, Localizer
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.geometry import SE3
@@ -33,7 +32,7 @@ def stored(monkeypatch: pytest.MonkeyPatch, landmarks: LandmarkMap | None) -> No
     """Let the command load the textured ground with these landmarks, whatever the folder."""
     known, info = textured_map(surface=True), MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground")
     ground = Map(info, known.field, known.surface, landmarks)
-    monkeypatch.setattr(localize_module, "load_map", lambda folder: ground)
+    monkeypatch.setattr("bidnerf_core.cli.localize.load_map", lambda folder: ground)
 
 
 def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:

@@ -14,7 +14,9 @@ import torch
 from PIL import Image
 
 import tiny
-from bidnerf_core.camera import CameraBatch, Intrinsics, source
+from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
+
+# Inside: block sizes are reduced to those of small images, and pixels looked up one by one
 from bidnerf_core.captures.photos import nearby
 from bidnerf_core.datasets import open_dataset, reading_at
 from bidnerf_core.errors import InputError
@@ -194,7 +196,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
         assert side == 20 or 0.9 < count * 3 * side**2 * 120 / 192 / 10_000 <= 1
     for wrong in (0, 2.5, True):
         with pytest.raises(InputError, match=r"largest is .*, expected a positive whole number of pixels"):
-            source.checked_side(wrong)  # type: ignore[arg-type]
+            checked_side(wrong)  # type: ignore[arg-type]
 
 
 def test_a_map_of_reduced_images_is_resumed_at_their_size(tmp_path: Path) -> None:

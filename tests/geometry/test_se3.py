@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from bidnerf_core.geometry import SE3, se3_right_jacobian, skew
+
+# Inside: the Jacobians of the exponential map are compared with its series and differences
 from bidnerf_core.geometry.se3 import se3_left_jacobian, so3_left_jacobian, so3_left_jacobian_inverse
 from refusals import refused
 

@@ -28,8 +28,7 @@ import sparse_model
 import tiny
 from bidnerf_core import Frame, load_map
 from bidnerf_core.camera import read_camera
-from bidnerf_core.datasets import open_dataset, read_depth_points
-from bidnerf_core.datasets.colmap_files import read_model
+from bidnerf_core.datasets import open_dataset, read_depth_points, read_model
 from bidnerf_core.depth import read_depth_image
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation import read_results

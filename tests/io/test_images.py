@@ -21,6 +21,8 @@ from PIL import Image, features
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import as_floats, photos_in
+
+# Inside: headers of images that are not decoded, and a file system that fails
 from bidnerf_core.io import (
     IMAGE_SUFFIXES,
     LARGEST_IMAGE,

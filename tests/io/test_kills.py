@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 import tiny
+
+# Inside: a process is killed between the temporary file and its renaming
 from bidnerf_core.io import FileInUse, files, is_temporary, locked, output_folder
 from bidnerf_core.io.files import temporary
 from bidnerf_core.maps import load_map

@@ -16,6 +16,8 @@ from torch import Generator
 import baked
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Outcome, PointCloud, Support, SurfaceDiagnostics, Verdict
+
+# Inside: the threshold of each measure, of which an outcome shows only the decisive one
 from bidnerf_core.localization.acceptance import (
     descent_verdict,
     free_space_violations,

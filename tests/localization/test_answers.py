@@ -19,7 +19,10 @@ from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.registry import registered
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import textured_field
+from bidnerf_core.testing import CAMERA as GROUND_CAMERA
+from bidnerf_core.testing import POSES as GROUND_POSES
+from bidnerf_core.testing import seen as seen_ground
+from bidnerf_core.testing import textured_map, unseen
 from conditions import (
     COPY,
     NOT_RENDERED,
@@ -238,13 +241,13 @@ def stated(view: View, factor: float) -> list[View]:
 
 def other_camera(factor: float) -> list[View]:
     """Return a photo of a camera that is nearly the map's, and says so."""
-    camera = scaled(factor, textured_field.CAMERA)
-    return stated(textured_field.seen(textured_field.POSES[1], camera), 1.0)
+    camera = scaled(factor, GROUND_CAMERA)
+    return stated(seen_ground(GROUND_POSES[1], camera), 1.0)
 
 
 def own_correlation() -> LandmarkMap:
     """Return landmarks of surer cameras, whose keypoints are as correlated as those of the map's images."""
-    built = textured_field.textured_map().landmarks
+    built = textured_map().landmarks
     assert built is not None
     return replace(ground_landmarks(scatter=0.003), correlation=built.correlation)
 
@@ -273,21 +276,21 @@ GROUND: dict[str, tuple[Any, Expected]] = {
     "rig": (lambda: noisy("none", False, 1, 0), Right(metres=0.0058, degrees=0.12)),
     "depth 5 % too long": (lambda: noisy("depth-scale:1.05", True), Right(metres=0.0077, degrees=0.18)),
     "focal 0.5, not rendered": (
-        lambda: {"views": stated(textured_field.unseen(), 0.5), "config": NOT_RENDERED, "landmarks": own_correlation()},
+        lambda: {"views": stated(unseen(), 0.5), "config": NOT_RENDERED, "landmarks": own_correlation()},
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 2, not rendered": (
-        lambda: {"views": stated(textured_field.unseen(), 2.0), "config": NOT_RENDERED, "landmarks": own_correlation()},
+        lambda: {"views": stated(unseen(), 2.0), "config": NOT_RENDERED, "landmarks": own_correlation()},
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 1.02, not rendered": (
-        lambda: {"views": stated(textured_field.unseen(), 1.02), "config": NOT_RENDERED}, Outcome.MISCALIBRATED,
+        lambda: {"views": stated(unseen(), 1.02), "config": NOT_RENDERED}, Outcome.MISCALIBRATED,
     ),
     "focal 1.02, rendered": (
-        lambda: {"views": stated(textured_field.unseen(), 1.02), "config": SHARP}, MAP._replace(metres=0.005),
+        lambda: {"views": stated(unseen(), 1.02), "config": SHARP}, MAP._replace(metres=0.005),
     ),
     "focal 1.03, rendered": (
-        lambda: {"views": stated(textured_field.unseen(), 1.03), "config": SHARP}, MAP._replace(metres=0.005),
+        lambda: {"views": stated(unseen(), 1.03), "config": SHARP}, MAP._replace(metres=0.005),
     ),
     "another camera 0.97, not rendered": (
         lambda: {"views": other_camera(0.97), "config": NOT_RENDERED}, Outcome.MISCALIBRATED,
@@ -307,5 +310,5 @@ def test_ground(name: str) -> None:
     query = asked()
     scene = with_landmarks(query.get("landmarks") or ground_landmarks())
     found = Localizer(scene, config=query.get("config", QUICK), warm_up=False)(query["views"])
-    truth, camera = query["views"][-1].T_ref_camera, textured_field.CAMERA
+    truth, camera = query["views"][-1].T_ref_camera, GROUND_CAMERA
     assert_as_expected(found, truth, expected, (camera,), camera)

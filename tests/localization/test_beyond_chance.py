@@ -18,6 +18,8 @@ from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import NO_RIVAL, AutoConfig, Localization, Outcome, Problem, Support, rig
+
+# Inside: the odds themselves, far from the values at which they decide
 from bidnerf_core.localization.beyond_chance import log_odds, support
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 from bidnerf_core.scenes import look_at

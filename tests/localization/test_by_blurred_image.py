@@ -18,6 +18,8 @@ from bidnerf_core.fields import Stratified, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import LandmarkMatcher, Localization, Outcome, Problem, Support, rig
+
+# Inside: when blur is taken into account, and the filter that models it
 from bidnerf_core.localization.by_blurred_image import BLURS, refined_if_blurred
 from bidnerf_core.localization.costs.images import (
     ColourScales,

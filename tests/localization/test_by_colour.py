@@ -18,6 +18,8 @@ from bidnerf_core.fields import render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Localization, Outcome, Problem, rig
+
+# Inside: two verdicts, each without the refinement that precedes it
 from bidnerf_core.localization.acceptance import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.mapping import SurfaceMap, bake, build_landmarks

@@ -25,6 +25,8 @@ from bidnerf_core.localization import (
     localization_by_landmarks,
     rig,
 )
+
+# Inside: which measurements were fused, and how the scale of depth is shrunk
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.mapping import Keypoints, Sift
 from bidnerf_core.registry import registered

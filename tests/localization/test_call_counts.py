@@ -20,6 +20,8 @@ import torch
 
 from bidnerf_core import Frame, Localization, Localizer, Tracker, View
 from bidnerf_core.captures import tried_landmarks
+
+# Inside: relocates single photos, to count the detections in that step alone
 from bidnerf_core.captures.relocated_photos import relocated
 from bidnerf_core.localization import LandmarkMatcher
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, FoundOnce, LandmarkMap, resect, tracked_views

@@ -13,6 +13,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+# Inside: the weights and features of the model, of which an answer shows one probability
 from bidnerf_core.localization import (
     LandmarkDiagnostics,
     Outcome,

@@ -26,6 +26,8 @@ from bidnerf_core.localization import (
     RenderedCostSettings,
     SurfaceCost,
 )
+
+# Inside: the closed forms are compared with repeated trials and integrals
 from bidnerf_core.localization.covariance import (
     finest_cost,
     position_deviation,
@@ -50,7 +52,7 @@ def seen_patch(noise: float) -> PointCloud:
 @pytest.mark.parametrize("number", range(3))
 def test_the_surface_covariance_is_symmetric_and_positive_definite(number: int) -> None:
     view = baked.unseen()[number]
-    cost = baked.point_search(view).judge()
+    cost = PointSearch(baked.toy(), baked.cloud(view)).judge()
     found = surface_covariance(cost, view.T_ref_camera)
     assert torch.equal(found, found.mT)
     assert torch.linalg.eigvalsh(found).min() > 0
@@ -61,7 +63,7 @@ def test_the_surface_covariance_is_symmetric_and_positive_definite(number: int) 
 
 def test_an_uncertain_scale_of_the_depth_makes_the_way_to_the_scene_uncertain() -> None:
     view = baked.unseen()[0]
-    cost = baked.point_search(view).judge()
+    cost = PointSearch(baked.toy(), baked.cloud(view)).judge()
     exact, uncertain = (
         surface_covariance(cost, view.T_ref_camera, sensor=s) for s in (EXACT, replace(EXACT, scale=0.02))
     )
@@ -214,7 +216,7 @@ def test_at_the_truth_no_step_leads_away() -> None:
 
 def test_a_field_that_shows_something_else_leads_no_pose_off_a_surface_that_determines_it() -> None:
     view = baked.unseen()[0]
-    search, problem = baked.point_search(view), baked.problem(view)
+    search, problem = PointSearch(baked.toy(), baked.cloud(view)), baked.problem(view)
     stage, finest = RefinementStage(3, 256), finest_cost(search.surface, search.cloud)
     together, alone = (
         take_few_steps(problem, view.T_ref_camera, stage, rendered(), Generator().manual_seed(0), surface)

@@ -14,7 +14,7 @@ import module_fields
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.localization import AutoConfig, settings_of
 from bidnerf_core.results import pose_error
-from bidnerf_core.testing import DEVICE, Elsewhere, MapWithLandmarks, textured_field
+from bidnerf_core.testing import DEVICE, Elsewhere, MapWithLandmarks, textured_map, unseen
 from flights import INTERVAL, flight_frame, flight_pose
 from localizations import without_depth
 from module_fields import AsModule
@@ -44,7 +44,7 @@ def blobs() -> FieldMap:
 
 @functools.cache
 def ground() -> MapWithLandmarks:
-    found = textured_field.textured_map(surface=True)
+    found = textured_map(surface=True)
     return replace(found, field=AsModule(found.field))  # type: ignore[arg-type]
 
 
@@ -89,7 +89,7 @@ def test_auto_by_colour() -> None:
 
 @pytest.mark.parametrize("depth", [True, False])
 def test_auto_by_landmarks(depth: bool) -> None:
-    view = textured_field.unseen()
+    view = unseen()
     here = on_both(ground(), view.frame if depth else without_depth(view.frame), **SETTINGS)
     assert here.converged, here.reason
     assert ("fused with depth and rendering" if depth else "fused with rendering") in here.reason

@@ -15,6 +15,8 @@ from torch import Generator, Tensor
 import baked
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
+
+# Inside: fits of the exposure are compared with numpy's least squares
 from bidnerf_core.localization.by_depth import STRONGEST, cloud_with_exposure_of_map
 from bidnerf_core.localization.exposure import clipped, fit_exposure, robust_exposure
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
@@ -40,12 +41,13 @@ from bidnerf_core.localization import (
     rig,
     settings_of,
 )
+
+# Inside: torch's Adam as an oracle, the rule of the best pose, and the convolution of the image
 from bidnerf_core.localization.costs.sampled import Blurred
 from bidnerf_core.localization.solvers.history import WINDOW, History
 from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.scenes import GaussianBlobs
 from bidnerf_core.settings import to_flat
-from bidnerf_core.testing.scene import CAMERA as SMALL_CAMERA
 from blob_images import BOUNDS, CAMERA, TRUTH
 from problems import FieldMap, localize, single
 
@@ -251,6 +253,7 @@ def test_a_batch_adds_its_best_pose_after_each_step() -> None:
     xi[..., 0] = torch.tensor([[0.0, 10.0], [1.0, 11.0], [2.0, 12.0]])
     costs = torch.tensor([[4.0, 6.0], [3.0, 2.0], [1.0, 2.0]], dtype=torch.float64)
     seen = History([SE3.identity()])
+    assert len(seen.poses) == 1
     seen.add_batch(SE3.exp(xi), costs)
     assert [float(T.translation[0]) for T in seen.poses] == pytest.approx([0.0, 11.0, 2.0])
     assert seen.losses == [2.0, 1.0]
@@ -271,6 +274,7 @@ class Ball:
 
 
 BALL = Ball()
+SMALL_CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 AHEAD = SE3(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, -3.0], dtype=torch.float64))
 
 

@@ -26,6 +26,8 @@ from bidnerf_core.localization import (
     SurfaceCost,
     rig,
 )
+
+# Inside: terms one by one, against numerical derivatives
 from bidnerf_core.localization.covariance import finest_cost, position_deviation
 from bidnerf_core.localization.depth_scale import (
     LANDMARK_SCALE_NOISE,

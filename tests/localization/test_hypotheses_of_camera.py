@@ -12,10 +12,11 @@ from scipy.stats import multivariate_normal
 
 from bidnerf_core import Intrinsics
 from bidnerf_core.localization import Posterior, Stated
+
+# Inside: probabilities of hypotheses are compared with integrals and samples
 from bidnerf_core.localization.landmarks.hypotheses import camera_hypotheses, posterior
 from bidnerf_core.localization.landmarks.map_camera import map_cameras
-from bidnerf_core.mapping import GIVEN, NOMINAL, Calibration, EliminatedPose
-from bidnerf_core.mapping.geometry.reprojection import RobustEquations
+from bidnerf_core.mapping import GIVEN, NOMINAL, Calibration, EliminatedPose, RobustEquations
 from observed_points import TRUE, observed
 
 CAMERA = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)

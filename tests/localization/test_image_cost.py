@@ -21,6 +21,8 @@ from bidnerf_core.fields import SceneBounds, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import NormalEquations, SurfaceRenderer
+
+# Inside: derivatives of the cost and of its pyramid, compared with differences
 from bidnerf_core.localization.costs.images import (
     UNKNOWN_COST,
     ColourScales,

@@ -12,7 +12,11 @@ import torch
 
 from bidnerf_core import SE3, InputError, Intrinsics
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, propose
+
+# Inside: the number of false alarms, the matches around a known pose, and one verdict
 from bidnerf_core.localization.landmarks.chance import log10_nfa
+from bidnerf_core.localization.landmarks.correspondences import query_images
+from bidnerf_core.localization.landmarks.guided import guided_matches
 from bidnerf_core.mapping import LandmarkMap, build_landmarks, squared_distances
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
@@ -200,3 +204,19 @@ def test_fewer_landmarks_than_asked_for_are_filled_up_with_infinity() -> None:
     distances, index = LandmarkMatcher(many(20)[torch.arange(2)]).nearest(many(20).descriptors[:3], 4)
     assert bool(distances[:, 2:].isinf().all())
     assert bool((index < 2).all())
+
+
+def test_guided_matching_finds_the_same_with_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, truth = Points(count=600, noise=0.3), looking_in(0.43)
+    landmarks, image = build_landmarks(ring(points), points), query_images([points.view(truth)], points)
+
+    def matches(known: LandmarkMap) -> list[list[int]]:
+        found = guided_matches(image, known, truth, radius=5.0, most_distance=200.0**2)
+        return sorted(torch.stack([found.keypoint, found.landmark], dim=-1).tolist())
+
+    assert landmarks.cells is None
+    plain = matches(landmarks)
+    assert len(plain) > 50
+    monkeypatch.setattr("bidnerf_core.mapping.landmarks.landmark_map.FEW", 10)
+    assert replace(landmarks).cells is not None
+    assert matches(replace(landmarks)) == plain

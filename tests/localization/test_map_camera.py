@@ -13,9 +13,10 @@ import pytest
 import torch
 
 from bidnerf_core import Intrinsics
-from bidnerf_core.camera import stretched_cameras
-from bidnerf_core.camera.orientation import QUARTER_TURNS
+from bidnerf_core.camera import Orientation, stretched_cameras
 from bidnerf_core.localization import LandmarkMatcher, propose
+
+# Inside: the corrections between cameras and their prior odds, before any image is seen
 from bidnerf_core.localization.landmarks.map_camera import (
     MapCamera,
     correction_between,
@@ -181,7 +182,7 @@ def test_quarter_turns_go_to_both_sides() -> None:
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_turned_camera_sees_what_a_turned_image_shows(number: int) -> None:
-    turned, orientation = LANDSCAPE.quarter_turns()[number], QUARTER_TURNS[number]
+    turned, orientation = LANDSCAPE.quarter_turns()[number], Orientation.from_exif((6, 8)[number])
     angle = math.pi / 2 * (1 if orientation.mirrors_rows else -1)
     turn = torch.tensor(
         [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]],

@@ -13,7 +13,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import Localizer, Tracker
 from bidnerf_core.mapping import surface_tensors
-from bidnerf_core.maps.files import load_surface
+from bidnerf_core.maps import load_surface
 from bidnerf_core.testing import textured_map
 from flights import flight
 

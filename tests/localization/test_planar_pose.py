@@ -15,6 +15,8 @@ from torch import Generator, Tensor
 import conditions
 from bidnerf_core import Localizer, Outcome
 from bidnerf_core.geometry import SE3
+
+# Inside: the geometry of the two minima, of which an answer keeps the deeper one
 from bidnerf_core.localization.landmarks.twins import second_pose, tilted_to_the_other_side
 from bidnerf_core.mapping import ObservedPoints, resect
 from bidnerf_core.registry import registered

@@ -28,6 +28,8 @@ from bidnerf_core.localization import (
     objective_of,
     rig,
 )
+
+# Inside: residuals of single rays and their derivatives, compared with differences
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.rendered import (
     LEAST_WITH_DEPTH,

@@ -20,6 +20,8 @@ from bidnerf_core.localization import (
     mirror_image,
     rig,
 )
+
+# Inside: the log odds of two poses, which an answer only compares with zero
 from bidnerf_core.localization.alternatives import NOISIEST, log_odds_by_rendering
 from bidnerf_core.testing import CAMERA, TexturedGround, textured_map, unseen
 from conditions import ground_landmarks

@@ -15,6 +15,8 @@ import pytest
 import torch
 
 from bidnerf_core import InputError, Localizer, Tracker
+
+# Inside: the calibrated levels, and poses on either side of them
 from bidnerf_core.localization import AutoConfig, Outcome, risk
 from bidnerf_core.testing import textured_map, unseen
 from localizations import answer

@@ -18,9 +18,12 @@ from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View, all_pixels, observe
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import NormalEquations, Pivot, SurfaceRenderer
+
+# Inside: the distribution of proposals and the margin between them, of which one is left
 from bidnerf_core.localization.costs.images import FieldRenderer
 from bidnerf_core.localization.refinement import centred, rendered_middle
 from bidnerf_core.localization.search.by_images import APART, IMAGE_STAGES, TURNED, ImageSearch
+from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import Distinct, SearchStage, search
 from bidnerf_core.localization.search.starts import (
     Surroundings,
@@ -38,7 +41,9 @@ from blob_images import BOUNDS, FIELD, FRAME, TRUTH, photograph
 def test_they_are_as_many_as_were_asked_for(count: int, started: bool, generator: Generator) -> None:
     view = baked.unseen()[0]
     start = view.T_ref_camera if started else None
-    pool = hypotheses_for_points(baked.point_search(view).surroundings, start, count, generator)
+    pool = hypotheses_for_points(
+        PointSearch(baked.toy(), baked.cloud(view)).surroundings, start, count, generator
+    )
     assert pool.rotation.shape == (count, 3, 3)
     assert pool.translation.shape == (count, 3)
     assert pool.rotation.dtype == torch.float64
@@ -50,7 +55,7 @@ def test_they_are_as_many_as_were_asked_for(count: int, started: bool, generator
 
 def test_those_about_a_start_keep_what_was_seen_about_where_it_was(generator: Generator) -> None:
     view, surface = baked.unseen()[0], baked.toy()
-    known = baked.point_search(view).surroundings
+    known = PointSearch(baked.toy(), baked.cloud(view)).surroundings
     near = hypotheses_for_points(known, view.T_ref_camera, 400, generator)[:100]
     middle = known.seen_middle.double()
     off = torch.linalg.vector_norm(near.apply(middle) - view.T_ref_camera.apply(middle), dim=-1)
@@ -71,7 +76,7 @@ def test_rotations_are_uniform(generator: Generator) -> None:
 
 def test_what_was_seen_is_put_on_the_middle_of_the_scene(generator: Generator) -> None:
     """The second half of the hypotheses: orientations, each placed so that the cloud's middle lies on the map's."""
-    search = baked.point_search(baked.unseen()[0])
+    search = PointSearch(baked.toy(), baked.cloud(baked.unseen()[0]))
     poses = hypotheses_for_points(search.surroundings, None, 40, generator)[20:]
     middle = baked.toy().surfels.positions.median(0).values.double()
     assert torch.allclose(poses.apply(search.cloud.middle.double()), middle.expand(20, 3), atol=1e-6)

@@ -34,6 +34,8 @@ from bidnerf_core.localization import (
     descend,
     rig,
 )
+
+# Inside: each stage of a method alone, to see at which of them the host waits
 from bidnerf_core.localization.covariance import finest_cost, weight
 from bidnerf_core.localization.search.by_images import IMAGE_STAGES, ImageSearch
 from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from bidnerf_core import SE3, InputError
 from bidnerf_core.geometry import retracted, update_between
+
+# Inside: the filter is compared with an independent smoother on motions that no video has
 from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Clock, Motion, PoseEstimate, pixel_radius
 
 VELOCITY = torch.tensor([0.3, -0.1, 0.2, 0.2, 0.4, -0.1], dtype=torch.float64)

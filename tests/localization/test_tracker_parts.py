@@ -23,6 +23,8 @@ from bidnerf_core.localization import (
     SurfaceCost,
     descend,
 )
+
+# Inside: odometry, flow and fusion, each against its own oracle
 from bidnerf_core.localization.covariance import FINEST
 from bidnerf_core.localization.tracking.flow import alike
 from bidnerf_core.localization.tracking.measuring import followed

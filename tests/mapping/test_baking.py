@@ -18,6 +18,8 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
+
+# Inside: the size of cells and the noise of depth are compared with those of the scene
 from bidnerf_core.mapping.surface.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
 from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, measured_image
 from bidnerf_core.scenes import Box, HomogeneousBall, Sphere, blotches, orbit

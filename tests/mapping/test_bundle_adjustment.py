@@ -11,6 +11,8 @@ from torch import Tensor
 from bidnerf_core import SE3
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.mapping import Adjustment, PosePrior, Sightings, adjusted
+
+# Inside: the linear system and its elimination are compared with numerical derivatives
 from bidnerf_core.mapping.geometry.bundle_adjustment import SMALL_DECREASE, linearized
 from landmark_scene import looking_in
 

@@ -24,6 +24,8 @@ from bidnerf_core.mapping import (
     tracked_views,
     unrelated_distance,
 )
+
+# Inside: the normalization of descriptors, before they are rounded to bytes
 from bidnerf_core.mapping.landmarks.features import root_normalized
 
 

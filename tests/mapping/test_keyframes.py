@@ -13,9 +13,11 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, propose
 from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
+
+# Inside: the limits on number and size of keyframes, which fewer images than that do not reach
 from bidnerf_core.mapping.surface.baking import KEYFRAME_SIDE, MOST
 from bidnerf_core.scenes import HomogeneousBall, orbit
-from bidnerf_core.testing import BOUNDS, CAMERA, ground, textured_field, training_views, unseen
+from bidnerf_core.testing import BOUNDS, CAMERA, ground, training_views, unseen
 from localizations import assert_near
 
 BALL = HomogeneousBall(0.5, 400.0, rgb=(0.8, 0.3, 0.2), sampler=Stratified(256))
@@ -79,7 +81,7 @@ def test_colour_noise_is_that_of_all_views_together() -> None:
 
 
 def test_colour_noise_needs_no_seed_and_keeps_no_gradient() -> None:
-    some = textured_field.training_views()[:2]
+    some = training_views()[:2]
     first = colour_noise(ground(1), BOUNDS, some)
     torch.manual_seed(99)
     assert colour_noise(ground(1), BOUNDS, some) == first

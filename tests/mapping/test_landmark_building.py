@@ -11,8 +11,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
-from bidnerf_core.localization.landmarks.correspondences import query_images
-from bidnerf_core.localization.landmarks.guided import guided_matches
 from bidnerf_core.mapping import (
     LandmarkConfig,
     LandmarkMap,
@@ -24,8 +22,9 @@ from bidnerf_core.mapping import (
     tracked_views,
     update_scatter,
 )
+
+# Inside: triangulation, tracks and cells, each against an exhaustive computation
 from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
-from bidnerf_core.mapping.landmarks import landmark_map
 from bidnerf_core.mapping.landmarks.landmark_cells import MOST_IN_CELL, LandmarkCells
 from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks
 from landmark_scene import PINHOLE, Points, looking_in, ring
@@ -310,19 +309,3 @@ def test_each_landmark_is_in_one_cell_which_holds_it() -> None:
     cell = torch.arange(len(cells.counts)).repeat_interleave(cells.counts)
     apart = (positions[cells.order] - cells.centres[cell]).norm(dim=-1)
     assert bool((apart <= cells.radii[cell] + 1e-4).all())
-
-
-def test_guided_matching_finds_the_same_with_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    points, truth = Points(count=600, noise=0.3), looking_in(0.43)
-    landmarks, image = build_landmarks(ring(points), points), query_images([points.view(truth)], points)
-
-    def matches(known: LandmarkMap) -> list[list[int]]:
-        found = guided_matches(image, known, truth, radius=5.0, most_distance=200.0**2)
-        return sorted(torch.stack([found.keypoint, found.landmark], dim=-1).tolist())
-
-    assert landmarks.cells is None
-    plain = matches(landmarks)
-    assert len(plain) > 50
-    monkeypatch.setattr(landmark_map, "FEW", 10)
-    assert replace(landmarks).cells is not None
-    assert matches(replace(landmarks)) == plain

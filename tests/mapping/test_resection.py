@@ -15,6 +15,8 @@ from torch import Tensor
 from bidnerf_core import SE3, Intrinsics
 from bidnerf_core.camera import MotionPrior, exposure_times
 from bidnerf_core.localization import Motion, Posterior
+
+# Inside: probabilities of a motion for given observations, of which a pose shows the decision
 from bidnerf_core.localization.landmarks.hypotheses import (
     MIN_POINTS,
     SHARE_MOVING,

@@ -16,6 +16,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds, VoxelGrid
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import SurfelIndex
+
+# Inside: merging and the blocks of the index are compared with a search of all surfels
 from bidnerf_core.mapping.surface.surface_map import fused_surfels, merged
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, block_levels, block_shape, index_bytes
 from voxels import cell_centres

@@ -11,6 +11,8 @@ import bidnerf_core as bn
 import tiny
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import Cancelled, InputError
+
+# Inside: the location of new photos alone, without the training that follows
 from bidnerf_core.maps.extending import locate
 from bidnerf_core.testing import training_views, view
 from commands import Run

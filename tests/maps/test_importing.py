@@ -19,6 +19,8 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, RayHits, Rays, SceneBounds, Stratified
 from bidnerf_core.geometry import SE3, Similarity
 from bidnerf_core.maps import ImportedField, bounds_about, importer_of
+
+# Inside: the viewpoints of imported fields, whose number a map does not state
 from bidnerf_core.maps.viewpoints import VIEWS, viewpoints
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes import demo_object

@@ -26,6 +26,8 @@ from bidnerf_core.evaluation import (
     write_record,
 )
 from bidnerf_core.io import is_temporary, write_file
+
+# Inside: each writer is called by itself and stopped at each of its writes
 from bidnerf_core.localization.tracking.motion import Clock
 from bidnerf_core.localization.tracking.state import TrackerState, save_state
 from bidnerf_core.maps import Anchor, load_info, load_map, save_map

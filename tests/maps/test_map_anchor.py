@@ -14,8 +14,9 @@ from torch import nn
 
 import tiny
 from bidnerf_core import resume, train
-from bidnerf_core.captures import CaptureReport
-from bidnerf_core.captures.report import CoverageRecord
+from bidnerf_core.captures import CaptureReport, CoverageRecord
+
+# Inside: anchors and records are written while another process saves the map
 from bidnerf_core.maps import Anchor, Map, files, load_info, load_map, save_map
 from bidnerf_core.maps.anchor import anchor_bytes, load_anchor, save_anchor
 from bidnerf_core.maps.files import save_capture

@@ -12,6 +12,8 @@ import pytest
 import torch
 
 import bidnerf_core as bn
+
+# Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError

@@ -17,6 +17,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, locked
 from bidnerf_core.maps import Anchor, Map, MapInfo
+
+# Inside: the file of an anchor beside a map that is then scaled
 from bidnerf_core.maps.anchor import load_anchor, save_anchor
 from bidnerf_core.maps.scaling import place_of
 from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen

@@ -22,13 +22,14 @@ from torch import Tensor, nn
 import baked
 import tiny
 from bidnerf_core.backend import load_backend
-from bidnerf_core.captures import CaptureReport, PoseRefinement, StoredCamera, stored_cameras
-from bidnerf_core.captures.report import CoverageRecord
+from bidnerf_core.captures import CaptureReport, CoverageRecord, PoseRefinement, StoredCamera, stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.mapping import LandmarkMap, build_landmarks, landmark_tensors, surface_tensors
+
+# Inside: single parts of a map are saved, damaged and read again
 from bidnerf_core.maps import Map, MapInfo, files, load_info, load_map, save_map
 from bidnerf_core.maps import map as map_module
 from bidnerf_core.maps.description import FieldFrame

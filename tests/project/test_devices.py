@@ -23,7 +23,7 @@ from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import MapInfo
 from bidnerf_core.scenes import HomogeneousBall
-from bidnerf_core.testing import DEVICE, Elsewhere, textured_field
+from bidnerf_core.testing import DEVICE, Elsewhere, textured_map
 from problems import FieldMap
 
 CPU = torch.device("cpu")
@@ -57,7 +57,7 @@ def elsewhere_of(value: Any, device: torch.device) -> list[str]:
 
 @functools.cache
 def landmarks() -> LandmarkMap:
-    found = textured_field.textured_map().landmarks
+    found = textured_map().landmarks
     assert found is not None
     return found
 

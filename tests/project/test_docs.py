@@ -28,11 +28,9 @@ import tiny
 from bidnerf_core import Localization, Localizer, Map, Outcome
 from bidnerf_core.cli import COMMANDS, main
 from bidnerf_core.evaluation import perturb
-from bidnerf_core.fields import residuals
+from bidnerf_core.fields import DEPTH_RESIDUALS
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, ByColourConfig, Problem, settings_of
-from bidnerf_core.localization.auto import auto
-from bidnerf_core.localization.settings import ColourRefinementSettings
+from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, Problem, settings_of
 from bidnerf_core.maps import MapInfo
 from bidnerf_core.registry import registered
 from bidnerf_core.results import pose_error
@@ -116,15 +114,21 @@ def inside(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.fixture
 def quick_auto(monkeypatch: pytest.MonkeyPatch) -> None:
     """Method ``auto`` with few hypotheses and one round: that it finds poses is tested elsewhere."""
-    steps = ColourRefinementSettings(coarse_steps=1, coarse_rays=32, fine_steps=1, fine_rays=64)
+    auto, by_colour = METHODS["auto"], AutoConfig().by_colour
+    steps = dataclasses.replace(by_colour.steps, coarse_steps=1, coarse_rays=32, fine_steps=1, fine_rays=64)
 
     def quick(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         few = dataclasses.replace(
-            config, points=200, hypotheses=8, rounds=1, refine_rays=64, by_colour=ByColourConfig(steps)
+            config,
+            points=200,
+            hypotheses=8,
+            rounds=1,
+            refine_rays=64,
+            by_colour=dataclasses.replace(by_colour, steps=steps),
         )
-        return auto(problem, few, seed)
+        return auto.solve(problem, few, seed)
 
-    monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(METHODS["auto"], solve=quick))
+    monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(auto, solve=quick))
     # Other processes take the real one.
     monkeypatch.setattr("bidnerf_core.evaluation.trials.registered_names", tuple)
 
@@ -158,7 +162,7 @@ def executed(page: Path) -> dict[str, Any]:
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.usefixtures("quick_auto")
 def test_python_blocks_run(page: Path, inside: Path) -> None:
-    with patch.dict(residuals.DEPTH_RESIDUALS), patch.dict(registered):  # what a page registers ends with it
+    with patch.dict(DEPTH_RESIDUALS), patch.dict(registered):  # what a page registers ends with it
         executed(page)
 
 

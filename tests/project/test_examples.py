@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bidnerf_core import registry
-from bidnerf_core.fields import residuals
+from bidnerf_core.fields import DEPTH_RESIDUALS
 
 pytestmark = pytest.mark.slow
 
@@ -29,12 +29,12 @@ def test_example_runs(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(example), *words])
     monkeypatch.setattr(registry, "registered", dict(registry.registered))
-    before = dict(residuals.DEPTH_RESIDUALS)
+    before = dict(DEPTH_RESIDUALS)
     try:
         runpy.run_path(str(example), run_name="__main__")
     finally:
-        residuals.DEPTH_RESIDUALS.clear()
-        residuals.DEPTH_RESIDUALS.update(before)
+        DEPTH_RESIDUALS.clear()
+        DEPTH_RESIDUALS.update(before)
     printed = capsys.readouterr().out
     assert "off by" in printed or "success" in printed
 

@@ -20,8 +20,7 @@ from bidnerf_core.cli import _warnings_as_lines
 from bidnerf_core.datasets import Dataset, Reader, ReadOptions, find_reader, open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.localization import find_method
-from bidnerf_core.mapping import find_features
-from bidnerf_core.mapping.landmarks.features import FEATURES
+from bidnerf_core.mapping import FEATURES, find_features
 from bidnerf_core.registry import (
     GROUPS,
     ONLY_STRANGERS,

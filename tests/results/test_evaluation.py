@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import bid_start, perturb
-from bidnerf_core.evaluation.protocols import bid_hard_start, random_units, rotation_of_size
+from bidnerf_core.evaluation import bid_hard_start, bid_start, perturb, random_units, rotation_of_size
 from bidnerf_core.geometry import SE3
 from bidnerf_core.results import (
     CRITERIA,
@@ -26,6 +25,8 @@ from bidnerf_core.results import (
     success_rate,
     success_rate_by_frame,
 )
+
+# Inside: angles near zero and near pi, and criteria that no command offers
 from bidnerf_core.results.errors import Criterion, Within, rotation_angle
 
 tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(

@@ -12,7 +12,7 @@ import torch
 
 import bidnerf_core as bn
 from bidnerf_core.captures import stored_cameras
-from bidnerf_core.datasets.transforms_json import read_frames
+from bidnerf_core.datasets import read_frames
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import read_record
 from bidnerf_core.maps import Map, MapInfo

@@ -13,6 +13,8 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import convergence_plot
 from bidnerf_core.results import PoseError, as_picture, depth_to_rgb, save_gif, tile
+
+# Inside: single tiles of an overlay, before they are put together
 from bidnerf_core.results.overlays import NO_DEPTH, blend, chequered, comparison, edges
 
 

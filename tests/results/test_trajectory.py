@@ -11,6 +11,8 @@ import torch
 
 from bidnerf_core import SE3, InputError
 from bidnerf_core.results import TrajectoryErrors, spans
+
+# Inside: errors after each alignment, compared with evo's, and the paths that are drawn
 from bidnerf_core.results.trajectory import ErrorSummary, alignment_errors, relative_errors, rigid_alignment
 from bidnerf_core.results.trajectory_plot import PlottedPath, plot_path
 

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes import Box, Primitive, Shape, Sphere, blotches
+
+# Inside: a solid and two textures that only the scenes for demonstrations use
 from bidnerf_core.scenes.primitives import Cylinder
 from bidnerf_core.scenes.textures import checker, stripes
 from refusals import refused

@@ -19,9 +19,10 @@ from PIL import Image
 
 from bidnerf_core import SE3, InputError, Intrinsics, Localization, Outcome
 from bidnerf_core.geometry import Geodetic, geodetic
-from bidnerf_core.maps import Anchor, GeographicPose
-from bidnerf_core.maps.anchor import load_anchor
+from bidnerf_core.maps import Anchor, GeographicPose, load_anchor
 from bidnerf_core.results import Answer
+
+# Inside: axes and fields of single answers, compared with the standard, without a server
 from bidnerf_core.service import geopose
 
 places = st.builds(Geodetic, st.floats(-90, 90), st.floats(-179.99, 179.99), st.floats(-5000, 20000))

@@ -38,6 +38,8 @@ from bidnerf_core import (
     settings_of,
 )
 from bidnerf_core.service import Access
+
+# Inside: workers are killed, and the description is compared with the parameters that are read
 from bidnerf_core.service.description import description
 from bidnerf_core.service.pool import Pool
 from bidnerf_core.service.requests import PARAMETERS

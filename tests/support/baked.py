@@ -13,7 +13,6 @@ from bidnerf_core.fields import SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import PointCloud, Problem, rig
-from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
 from bidnerf_core.scenes import (
     Box,
@@ -86,10 +85,6 @@ def points(
     return PointCloud(
         places, rgb, origins, torch.ones(len(places), dtype=torch.bool) if coloured is None else coloured
     )
-
-
-def point_search(*views: View, surface: SurfaceMap | None = None, count: int = 1000) -> PointSearch:
-    return PointSearch(toy() if surface is None else surface, cloud(*views, count=count))
 
 
 def of_points(

@@ -13,7 +13,9 @@ from bidnerf_core import SE3, Intrinsics, View
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import Features, Keypoints, LandmarkMap, Sift, build_landmarks
-from bidnerf_core.testing import MapWithLandmarks, textured_field, textured_map
+from bidnerf_core.testing import CAMERA, MapWithLandmarks, textured_map
+from bidnerf_core.testing import POSES as GROUND_POSES
+from bidnerf_core.testing import view as view_of_ground
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from localizations import colour_only
 
@@ -144,7 +146,7 @@ def ground_landmarks(features: str = "sift", scatter: float = 0.01) -> LandmarkM
     landmarks = textured_map().landmarks
     assert landmarks is not None
     deviations = torch.full((4,), scatter, dtype=torch.float64)
-    cameras = (textured_field.CAMERA,)
+    cameras = (CAMERA,)
     return replace(
         landmarks, features=features, calibration_scatter=deviations, correlation=1.0, cameras=cameras
     )
@@ -153,7 +155,7 @@ def ground_landmarks(features: str = "sift", scatter: float = 0.01) -> LandmarkM
 @functools.cache
 def ground_view(number: int, seed: int = 0) -> View:
     """Return an image of the ground, with depth and noisy colours; another ``seed`` is another ground."""
-    view = textured_field.view(textured_field.POSES[number], f"{number}", seed)
+    view = view_of_ground(GROUND_POSES[number], f"{number}", seed)
     noise = torch.randn(view.frame.rgb.shape, generator=torch.Generator().manual_seed(number))
     return replace(view, frame=replace(view.frame, rgb=(view.frame.rgb + 0.02 * noise).clamp(0, 1)))
 

@@ -21,8 +21,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.maps import MapInfo, save_map
-from bidnerf_core.maps.files import save_surface
+from bidnerf_core.maps import MapInfo, save_map, save_surface
 from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.scenes import views as views_of
 from bidnerf_core.training import Silent, TrainingState

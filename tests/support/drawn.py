@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation.trial import Trace
+from bidnerf_core.evaluation import Trace
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 

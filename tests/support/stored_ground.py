@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-import bidnerf_core.cli.localize as localize_module
-import bidnerf_core.cli.track as track_module
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import write_transforms
@@ -45,8 +43,8 @@ def open_ground(
     assert known.landmarks is not None
     landmarks = replace(known.landmarks, cameras=assumed) if assumed else known.landmarks
     ground = StoredGround(known.field, known.bounds, landmarks, known.surface, cameras=tuple(cameras))
-    for module in (localize_module, track_module):
-        patch.setattr(module, "load_map", lambda folder: ground)
+    for command in ("localize", "track"):
+        patch.setattr(f"bidnerf_core.cli.{command}.load_map", lambda folder: ground)
 
 
 def write_flight(folder: Path, frames: Sequence[tuple[Frame, SE3]]) -> Path:

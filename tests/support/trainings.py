@@ -9,8 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from bidnerf_core.maps import load_info
-from bidnerf_core.maps.checkpoints import Checkpoints
+from bidnerf_core.maps import Checkpoints, load_info
 from bidnerf_core.training import TrainingStep
 
 

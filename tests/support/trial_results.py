@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from bidnerf_core.evaluation import Trial, TrialResult
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trace
+from bidnerf_core.evaluation import ScalarPoseError, Trace, Trial, TrialResult
 
 
 def trial_result(

@@ -20,7 +20,6 @@ from bidnerf_core.devices import constant
 from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, render_image
 from bidnerf_core.localization import captured, settings_of
-from bidnerf_core.localization.solvers import adam
 from bidnerf_core.maps import load_map
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf_core.testing import rgbd_views
@@ -66,7 +65,7 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
         found.append(replay is not step)
         return replay
 
-    monkeypatch.setattr(adam, "captured", noted)
+    monkeypatch.setattr("bidnerf_core.localization.solvers.adam.captured", noted)
     return found
 
 
@@ -79,7 +78,7 @@ def test_replayed_steps_are_those_that_are_launched(
     field = backend.build(backend.config_type(), BOUNDS)
     replayed = descent(field, BOUNDS, method)
     assert captures == [True]
-    monkeypatch.setattr(adam, "captured", lambda step, *_: step)
+    monkeypatch.setattr("bidnerf_core.localization.solvers.adam.captured", lambda step, *_: step)
     launched = descent(field, BOUNDS, method)
     assert len(replayed) == len(launched) == 51
     torch.testing.assert_close(replayed, launched, rtol=0, atol=1e-4)

@@ -16,6 +16,8 @@ from bidnerf_core.fields import Rays, RaySamples, Rendering, render, rendering_w
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination, supervised_loss
+
+# Inside: single terms of the loss are compared with their definitions, integrals and differences
 from bidnerf_core.training.loss import distortion, expected_distance
 from bidnerf_core.training.ray_bank import LANDMARK_SHARE
 from bidnerf_hashgrid import backend as hashgrid

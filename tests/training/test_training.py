@@ -30,6 +30,8 @@ from bidnerf_core.training import (
     cosine,
     fit,
 )
+
+# Inside: the share of rays with depth, compared with the rays of many batches
 from bidnerf_core.training.ray_bank import MEASURED_SHARE
 from bidnerf_hashgrid import HashGridField, backend
 

@@ -15,14 +15,8 @@ import torch
 
 import viewed
 from bidnerf_core import SE3, InputError, Intrinsics, Localization, Localizer, Map, view
-from bidnerf_core.cli.report import link_to
 from bidnerf_core.datasets import Query
 from bidnerf_core.errors import Cancelled
-from bidnerf_core.evaluation import ResultTable
-from bidnerf_core.evaluation.report import doubtful
-from bidnerf_core.evaluation.report import page as report_page
-from bidnerf_core.evaluation.summary import usual_criterion
-from bidnerf_core.evaluation.trial import ScalarPoseError
 from bidnerf_core.fields import render_image
 from bidnerf_core.localization import (
     ADVICE,
@@ -35,10 +29,11 @@ from bidnerf_core.localization import (
     Support,
     recorded,
 )
-from bidnerf_core.localization.recording import current_record
 from bidnerf_core.progress import stopped_by
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.viewer import ShownAnswer, shown_trajectory
+
+# Inside: what a page states of one answer is read from its parts, without a browser
 from bidnerf_core.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
 from bidnerf_core.viewer.explanations import EARLIER, HERE, KEPT, contests
 from bidnerf_core.viewer.figures import Bar, acceptance_figures
@@ -228,7 +223,6 @@ def test_a_localization_is_not_recorded_unless_asked_for(
     with_record, record = recording
     steps = len(record.steps)
     without = localizer(query.views)
-    assert current_record() is None
     assert len(record.steps) == steps > 0
     assert torch.equal(with_record.T_world_camera.matrix(), without.T_world_camera.matrix())
 
@@ -358,21 +352,6 @@ def test_view_saves_a_page_of_photos(bidnerf: Run, room: Map, tmp_path: Path) ->
     assert (good["name"], good["accepted"]) == ("photo", True), good["reason"]
     assert not bad["accepted"]
     assert "none.png" in bad["reason"]  # the page says what is wrong, too
-
-
-def test_a_report_links_to_the_frames_that_are_wrong_or_refused() -> None:
-    table = ResultTable.load(Path(__file__).parents[1] / "evaluation" / "earlier_results.jsonl")
-    first = table.rows[0]
-    wrong = replace(first, converged=True, error=ScalarPoseError(0.3, 1.0), frame="wrong #1")
-    right = replace(first, converged=True, error=ScalarPoseError(0.01, 1.0), frame="right")
-    refused = replace(first, converged=False, error=ScalarPoseError(0.01, 1.0), frame=viewed.HOSTILE)
-    rows = (refused, right, wrong)
-    assert [row.frame for row in doubtful(rows)] == ["wrong #1", viewed.HOSTILE]
-    html_text = report_page("t", ResultTable(rows), [], [], usual_criterion(rows), "view.html")
-    assert 'href="view.html#frame=wrong%20%231"' in html_text
-    assert viewed.HOSTILE not in html_text
-    assert 'href="view.html' not in report_page("t", ResultTable(rows), [], [], usual_criterion(rows))
-    assert link_to(Path("/a/pages/my map.html"), Path("/a/report")) == "../pages/my%20map.html"
 
 
 def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted(room: Map) -> None:

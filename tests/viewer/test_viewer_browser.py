@@ -25,6 +25,8 @@ import viewed
 from bidnerf_core import SE3, Localizer, Map
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.viewer import page_of, shown_row, shown_trajectory
+
+# Inside: pages of answers that were changed, so that rare refusals are shown
 from bidnerf_core.viewer.answer import shown_answer
 from bidnerf_core.viewer.saving import save_page
 from bidnerf_core.viewer.view import localized

@@ -22,6 +22,8 @@ from PIL import Image
 import viewed
 from bidnerf_core import Localizer, Map, settings_of
 from bidnerf_core.camera import CameraSource
+
+# Inside: the queue of localizations, of which requests show only the results
 from bidnerf_core.viewer.jobs import Jobs
 from bombs import png_of
 from photo_room import CAMERA

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
+
+# Inside: the refinement of poses is tested without a training around it
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
 from bidnerf_core.mapping import tracked_views
 from landmark_scene import Points, looking_in

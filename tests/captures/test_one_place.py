@@ -10,6 +10,8 @@ import torch
 
 import tiny
 from bidnerf_core import SE3, InputError, Localizer, Outcome, Tracker, View, load_map, train
+
+# Inside: whether photos show distances, before a map of them is trained
 from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.mapping import LandmarkConfig, tracked_views
