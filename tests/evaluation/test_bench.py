@@ -10,6 +10,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +159,7 @@ def test_a_turned_camera_sees_its_middle_in_the_same_place() -> None:
 
 @pytest.fixture
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.scenes.closed_form_data.DEMO_CAMERA", tiny.CAMERA)
+    monkeypatch.setattr(import_module("bidnerf_core.scenes.closed_form_data"), "DEMO_CAMERA", tiny.CAMERA)
 
 
 @pytest.mark.usefixtures("small_images")

@@ -7,6 +7,7 @@ import json
 import signal
 import threading
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -147,9 +148,15 @@ def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPa
     assert isinstance(scene.field, torch.nn.Module)
     elsewhere = dataclasses.replace(scene, field=scene.field.to("meta"))
     seen: list[Any] = []
-    monkeypatch.setattr("bidnerf_core.evaluation.evaluate.run_plan", lambda plan, *_, **__: seen.append(plan))
     monkeypatch.setattr(
-        "bidnerf_core.evaluation.evaluate.compare_maps", lambda starts, *_: seen.extend(starts[0])
+        import_module("bidnerf_core.evaluation.evaluate"),
+        "run_plan",
+        lambda plan, *_, **__: seen.append(plan),
+    )
+    monkeypatch.setattr(
+        import_module("bidnerf_core.evaluation.evaluate"),
+        "compare_maps",
+        lambda starts, *_: seen.extend(starts[0]),
     )
     bn.evaluate(elsewhere, tiny.views(2), trials=1, **QUICK)
     bn.compare([elsewhere, BLOBS], tiny.views(2), trials=1, method="bid", protocol="bid")
