@@ -20,8 +20,9 @@ import pytest
 from PIL import Image
 
 from bidnerf_core.datasets import open_dataset, open_sequence
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputWarning
 from bidnerf_core.io import archives
+from refusals import refused
 from scan_layouts import (
     LAYOUTS,
     edit_frame,
@@ -290,14 +291,14 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
 def test_unknown_split_and_frame(tmp_path: Path) -> None:
     dataset = open_dataset(LAYOUTS["transforms"].write(tmp_path, small_views(COUNT)))
     for call in (dataset.frame_names, dataset.views):
-        with pytest.raises(InputError, match=f"{tmp_path}.*no split 'tset', expected one of train, test"):
+        with refused(where=tmp_path, found="no split 'tset'", expected="one of train, test"):
             call("tset")
-    for name, said in (
-        ("r_11", r"among its 5 frames, did you mean 'r_1'\?"),
-        ("r_0", "which is in split 'test'"),
-        ("chair", "among its 5 frames, expected a name such as 'r_1'"),
+    for name, said, expected in (
+        ("r_11", " among its 5 frames, did you mean 'r_1'?", None),
+        ("r_0", ", which is in split 'test'", None),
+        ("chair", " among its 5 frames", "a name such as 'r_1'"),
     ):
-        with pytest.raises(InputError, match=f"split 'train': no frame '{name}',? {said}"):
+        with refused(where=f"{tmp_path}: split 'train'", found=f"no frame '{name}'{said}", expected=expected):
             dataset.views("train", ["r_2", name])
 
 

@@ -14,7 +14,7 @@ import torch
 
 from bidnerf_core.datasets import open_dataset, open_sequence, unique_names
 from bidnerf_core.datasets.file_names import FileNames
-from bidnerf_core.errors import InputError
+from refusals import refused
 from scan_layouts import (
     SMALL,
     camera_keys,
@@ -153,7 +153,7 @@ def test_a_given_unit_of_depth_replaces_that_of_the_file(capture: Path) -> None:
         for name, found in views.items():
             torch.testing.assert_close(found.frame.depth, 2 * usual[name].frame.depth)
     for unit in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match=r"depth_unit is .* expected a positive number of metres"):
+        with refused(found=f"depth_unit is {unit:g}", expected="a positive number of metres"):
             open_dataset(capture, depth_unit=unit)
 
 
