@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import json
 import os
@@ -157,7 +158,9 @@ def test_a_turned_camera_sees_its_middle_in_the_same_place() -> None:
 
 @pytest.fixture
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.scenes.closed_form_data.DEMO_CAMERA", tiny.CAMERA)
+    # The package has a function of the same name, which a dotted path would find.
+    module = importlib.import_module("bidnerf_core.scenes.closed_form_data")
+    monkeypatch.setattr(module, "DEMO_CAMERA", tiny.CAMERA)
 
 
 @pytest.mark.usefixtures("small_images")
