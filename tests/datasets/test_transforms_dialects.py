@@ -19,7 +19,6 @@ from scan_layouts import (
     SMALL,
     camera_keys,
     edit_keys,
-    message,
     read_all,
     remarks_of,
     small_views,
@@ -171,7 +170,10 @@ def test_missing_images_are_left_out_and_counted(capture: Path) -> None:
     assert [name for name, view in views.items() if view.frame.depth is None] == ["r_6"]
     for file in (capture / "images").iterdir():
         file.unlink()
-    assert "r_1.png, expected that file" in message(capture)
+    image = capture / "images/r_1.png"
+    where = f"{capture / 'transforms.json'}: frame 1 (images/r_1.png)"
+    with refused(where=where, found=f"no image {image}", expected="that file"):
+        read_all(capture)
 
 
 def test_lists_of_names_that_no_frame_has(capture: Path) -> None:
