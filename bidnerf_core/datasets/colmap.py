@@ -148,7 +148,7 @@ class SparsePoints:
             misfit = float(_off(there[fits], here[fits]).median()) / spread(here[fits])
         except InputError as error:
             raise InputError(
-                f"the unit cannot be estimated from the training cameras: {error}", where=self.folder
+                error, where=f"{self.folder}: the unit cannot be estimated from the training cameras"
             ) from error
         if misfit > LARGEST_MISFIT:
             raise InputError(

@@ -118,15 +118,18 @@ def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
 
 def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
     number, model, width, height = file.take(CAMERA_RECORD)
-    where = f"{file.path}: camera {number}"
     name = MODEL_IDS.get(model)
     if name is None:
         expected = ", ".join(MODEL_IDS.values())
         raise InputError(
-            f"{where} has the model {model}", expected=f"one of {expected}; undistort the images with COLMAP"
+            f"camera {number} has the model {model}",
+            where=file.path,
+            expected=f"one of {expected}; undistort the images with COLMAP",
         )
     parameters = file.array(np.dtype("<f8"), colmap_parameters(name)).tolist()
-    return int(number), colmap_camera(where, name, int(width), int(height), parameters)
+    return int(number), colmap_camera(
+        f"{file.path}: camera {number}", name, int(width), int(height), parameters
+    )
 
 
 def _is_model(folder: Path, suffix: str) -> bool:

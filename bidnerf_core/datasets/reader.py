@@ -157,15 +157,17 @@ def opened_sequence(reader: Reader, folder: Path, options: ReadOptions) -> Frame
 def _answer(reader: Reader, folder: Path, expected: type, ask: Callable[[], Answer]) -> Answer:
     if any(reader is READERS[name] for name in ORDER):
         return ask()
-    who = f"{folder}: reader {type(reader).__name__}"
+    who = f"reader {type(reader).__name__}"
     try:
         answer = ask()
     except (InputError, OSError, MemoryError):
         raise
     except Exception as error:
-        raise InputError(f"{who} failed to open it: {type(error).__name__}: {error}") from error
+        raise InputError(f"{who} failed to open it: {type(error).__name__}: {error}", where=folder) from error
     if not isinstance(answer, expected):
-        raise InputError(f"{who} returned a {type(answer).__name__}", expected=f"a {expected.__name__}")
+        raise InputError(
+            f"{who} returned a {type(answer).__name__}", where=folder, expected=f"a {expected.__name__}"
+        )
     return answer
 
 

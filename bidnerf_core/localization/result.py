@@ -144,11 +144,9 @@ class Localization:
         if saved.T_world_camera is None:
             raise InputError("T_world_camera is null", where=where, expected="a finite pose")
         T = pose_from_matrix(
-            _matrix(saved.T_world_camera, 4, f"{where}: T_world_camera"), f"{where}: T_world_camera"
+            _matrix(saved.T_world_camera, 4, "T_world_camera", where), f"{where}: T_world_camera"
         )
-        covariance = (
-            None if saved.covariance is None else _matrix(saved.covariance, 6, f"{where}: covariance")
-        )
+        covariance = None if saved.covariance is None else _matrix(saved.covariance, 6, "covariance", where)
         try:
             outcome = Outcome(saved.outcome)
         except ValueError as error:
@@ -181,9 +179,11 @@ class _Saved:
     unit: LengthUnit = "units"
 
 
-def _matrix(rows: list[list[float]], size: int, what: str) -> Float[Tensor, "n n"]:
+def _matrix(rows: list[list[float]], size: int, what: str, where: str) -> Float[Tensor, "n n"]:
     if {len(row) for row in rows} != {size} or len(rows) != size:
-        raise InputError(f"{what} has {len(rows)} rows", expected=f"{size} rows of {size} numbers")
+        raise InputError(
+            f"{what} has {len(rows)} rows", where=where, expected=f"{size} rows of {size} numbers"
+        )
     return torch.tensor(rows, dtype=torch.float64)
 
 

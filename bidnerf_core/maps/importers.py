@@ -102,12 +102,13 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
         raise InputError(f"{names} can each read it; choose one of them (--as)", where=path)
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
     raise InputError(
-        f"{path}: no installed importer recognizes it"
+        "no installed importer recognizes it"
         + (
             f" ({known})"
             if known
             else ", since none is installed (pip install bidnerf-gaussians adds one for splats)"
-        )
+        ),
+        where=path,
     )
 
 

@@ -287,15 +287,15 @@ def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
             return {name: pose.translation for name, pose in read_poses(path).items()}
         except InputError as error:
             raise InputError(error, expected=EXPECTED_POSITIONS) from error
-    return {name: _position(f"{path}: {name!r}", value) for name, value in found.items()}
+    return {name: _position(path, name, value) for name, value in found.items()}
 
 
-def _position(where: str, value: Any) -> Float[Tensor, "3"]:
+def _position(path: Path, name: str, value: Any) -> Float[Tensor, "3"]:
     """Return three coordinates, or those of a pose of 4x4 rows. Raises ``InputError`` for anything else."""
     if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
-        return _pose(where, value, EXPECTED_POSITIONS).translation
+        return _pose(f"{path}: {name!r}", value, EXPECTED_POSITIONS).translation
     if not isinstance(value, list) or len(value) != 3 or any(type(x) not in (int, float) for x in value):
-        raise InputError(f"{where} has no three coordinates", expected=EXPECTED_POSITIONS)
+        raise InputError(f"{name!r} has no three coordinates", where=path, expected=EXPECTED_POSITIONS)
     return torch.tensor(value, dtype=torch.float64)
 
 

@@ -17,6 +17,7 @@ from bidnerf_core.camera import STILL
 # Inside: the evidence of a common motion, of which a capture only shows the decision
 from bidnerf_core.captures import (
     PoseRefinement,
+    TrainingPoses,
     at_stored_poses,
     pose_sentences,
     stored_cameras,
@@ -25,7 +26,7 @@ from bidnerf_core.captures import (
 )
 from bidnerf_core.captures.cameras import moved_from
 from bidnerf_core.captures.shutter_evidence import common_motion
-from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
+from bidnerf_core.captures.training_poses import training_poses
 from bidnerf_core.fields import render, render_image
 from bidnerf_core.frames import all_pixels, observe
 from bidnerf_core.localization import LandmarkMatcher, Motion, propose

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import SE3, InputError, Localizer, Outcome, Tracker, View, load_map, train
+from bidnerf_core import SE3, Localizer, Outcome, Tracker, View, load_map, train
 
 # Inside: whether photos show distances, before a map of them is trained
 from bidnerf_core.captures.coverage import shows_distances
@@ -18,6 +18,7 @@ from bidnerf_core.mapping import LandmarkConfig, tracked_views
 from bidnerf_core.maps import load_info
 from bidnerf_core.testing import MapWithLandmarks, textured_map, unseen
 from landmark_scene import Points, looking_in, ring
+from refusals import refused
 
 CENTRE = looking_in(0.0)
 
@@ -52,7 +53,7 @@ def test_landmarks_of_one_place_have_the_right_directions() -> None:
     points = Points()
     views = turned(points)
     tracked = tracked_views(views, points)
-    with pytest.raises(InputError, match="no landmark"):
+    with refused(found=f"no landmarks found in {len(views)} images", expected="different places"):
         tracked.landmarks(LandmarkConfig())
     found = tracked.at_distance(5.0).landmarks(LandmarkConfig())
     off = (found.descriptors[:, None].float() - points.descriptors.float()).square().sum(-1)
@@ -87,7 +88,7 @@ def test_an_accepted_pose_is_imprecise_and_a_rejected_one_stays_rejected() -> No
 
 def test_there_is_no_tracking_without_distances() -> None:
     scene = textured_map()
-    with pytest.raises(InputError, match="tracking needs positions"):
+    with refused(found="tracking needs positions", expected="a map of photos from several places"):
         Tracker(Localizer(WithoutDistances(scene.field, scene.bounds, scene.landmarks)))
 
 

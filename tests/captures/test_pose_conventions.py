@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
-from bidnerf_core import SE3, InputError, register
+from bidnerf_core import SE3, register
 from bidnerf_core.captures import pose_contradiction, prepared
 
 # Inside: every reading of poses is applied and taken back, also those that no message proposes
@@ -18,6 +18,7 @@ from bidnerf_core.captures.pose_conventions import PoseContradiction
 from bidnerf_core.captures.pose_readings import AS_GIVEN, Y_AND_Z_REVERSED, readings, signed_permutations
 from bidnerf_core.mapping import ImageKeypoints, posed_keypoints
 from landmark_scene import Points, looking_in, ring
+from refusals import refused
 
 REVERSED = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 COUNT = 150  # points: as many as tell all readings apart
@@ -268,6 +269,8 @@ def test_training_refuses_contradicting_poses_unless_they_are_trusted() -> None:
     views = ring(points, 14)
     register("features", "points", points)
     wrong = [replace(view, T_ref_camera=view.T_ref_camera.inverse()) for view in views]
-    with pytest.raises(InputError, match=r"contradict the photos.*inverses.*--trust-poses"):
+    with refused(found="the poses contradict the photos") as caught:
         prepared(wrong, features="points")
+    assert "if they are inverses" in caught.error.found
+    assert "--trust-poses" in caught.error.found
     assert prepared(wrong, "never", features="points", trust_poses=True).cameras

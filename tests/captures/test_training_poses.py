@@ -14,6 +14,7 @@ from torch import Tensor
 from bidnerf_core import SE3, View
 from bidnerf_core.captures import (
     PoseRefinement,
+    TrainingPoses,
     as_given,
     at_stored_poses,
     moved_cameras,
@@ -24,7 +25,7 @@ from bidnerf_core.captures import (
 # Inside: how far each pose was refined, and the checks of depth that precede a training
 from bidnerf_core.captures.cameras import moved_from
 from bidnerf_core.captures.pose_refinement import adjusted_poses
-from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
+from bidnerf_core.captures.training_poses import training_poses
 from bidnerf_core.captures.training_views import check_depth_unit
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError

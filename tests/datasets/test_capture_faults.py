@@ -20,7 +20,8 @@ import pytest
 from PIL import Image
 
 from bidnerf_core.datasets import open_dataset, open_sequence
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputWarning
+from refusals import refused
 from scan_layouts import (
     LAYOUTS,
     edit_frame,
@@ -254,7 +255,10 @@ def test_frames_without_a_pose_are_left_out_and_counted(pose: Edit, tmp_path: Pa
         assert sorted(read_all(folder)) == ["r_0", "r_2", "r_3", "r_4", "r_5"]
     for number in range(COUNT):
         frame(number, transform_matrix=None)(folder / JSON)
-    assert "no transform_matrix, expected a 4x4" in message(folder)
+    with refused(
+        where=f"{folder / JSON}: frame 0 (images/r_0.png)", found="no transform_matrix", expected="a 4x4"
+    ):
+        read_all(folder)
 
 
 def test_pipes_are_refused_or_left_out_and_do_not_hang(tmp_path: Path) -> None:
@@ -274,29 +278,35 @@ def test_pipes_are_refused_or_left_out_and_do_not_hang(tmp_path: Path) -> None:
 
 def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     folder = LAYOUTS["transforms"].write(tmp_path / "sound", small_views(2))
-    assert message(tmp_path / "none") == f"{tmp_path / 'none'}: no such folder"
-    assert "is a file of a dataset; give its folder" in message(folder / JSON)
     (tmp_path / "scan.zip").write_bytes(b"PK")
-    assert "unpack the archive first" in message(tmp_path / "scan.zip")
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert message(empty).startswith(f"{empty}: the folder is empty; expected photos or a dataset in one of")
-    (empty / "notes.txt").touch()
-    assert message(empty).startswith(f"{empty}: contains no photos and is no dataset; expected photos or a")
-    assert len(message(empty)) - len(str(empty)) < 300
+    for name in ("empty", "notes"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "notes/notes.txt").touch()
+    for name, found, expected in (
+        ("none", "no such folder", None),
+        (f"sound/{JSON}", f"is a file of a dataset; give its folder, {folder}", None),
+        ("scan.zip", "is a file", "the folder of a dataset; unpack the archive first"),
+        ("empty", "the folder is empty", "photos or a dataset in one of"),
+        ("notes", "contains no photos and is no dataset", "photos or a dataset in one of"),
+    ):
+        with refused(where=tmp_path / name, found=found, expected=expected) as caught:
+            read_all(tmp_path / name)
+        assert caught.error.where == str(tmp_path / name)
+        assert expected is not None or caught.error.expected is None
+        assert len(f"{caught.error.found}{caught.error.expected}".replace(str(tmp_path), "")) < 300
 
 
 def test_unknown_split_and_frame(tmp_path: Path) -> None:
     dataset = open_dataset(LAYOUTS["transforms"].write(tmp_path, small_views(COUNT)))
     for call in (dataset.frame_names, dataset.views):
-        with pytest.raises(InputError, match=f"{tmp_path}.*no split 'tset', expected one of train, test"):
+        with refused(where=tmp_path, found="no split 'tset'", expected="one of train, test"):
             call("tset")
-    for name, said in (
-        ("r_11", r"among its 5 frames, did you mean 'r_1'\?"),
-        ("r_0", "which is in split 'test'"),
-        ("chair", "among its 5 frames, expected a name such as 'r_1'"),
+    for name, said, expected in (
+        ("r_11", " among its 5 frames, did you mean 'r_1'?", None),
+        ("r_0", ", which is in split 'test'", None),
+        ("chair", " among its 5 frames", "a name such as 'r_1'"),
     ):
-        with pytest.raises(InputError, match=f"split 'train': no frame '{name}',? {said}"):
+        with refused(where=f"{tmp_path}: split 'train'", found=f"no frame '{name}'{said}", expected=expected):
             dataset.views("train", ["r_2", name])
 
 
@@ -306,13 +316,16 @@ def test_unknown_split_and_frame(tmp_path: Path) -> None:
 def test_an_archive_that_is_cut_or_none_or_empty(tmp_path: Path) -> None:
     files = record3d_files(small_views(2))
     whole = packed(tmp_path, files).read_bytes()
-    for content, said in ((whole[: len(whole) // 2], "ends too early"), (b"no zip at all", "is not a zip")):
+    for content, found in ((whole[: len(whole) // 2], "ends too early"), (b"no zip at all", "is not a zip")):
         (tmp_path / "scan.r3d").write_bytes(content)
-        assert f"scan.r3d: {said}" in message(tmp_path / "scan.r3d")
+        with refused(where=tmp_path / "scan.r3d", found=found, expected="a Record3D recording (.r3d)"):
+            read_all(tmp_path / "scan.r3d")
     file = packed(tmp_path, {"icon": b""})
-    assert "scan.r3d/metadata: not found in the archive, which holds 1 file" in message(file)
+    with refused(where=file / "metadata", found="not found in the archive, which holds 1 file"):
+        read_all(file)
     file = packed(tmp_path, {name: files[name] for name in files if not name.endswith(".jpg")})
-    assert "rgbd/0.jpg: no such photo" in message(file)
+    with refused(where=file / "rgbd/0.jpg", found="no such photo", expected="one for each pose"):
+        read_all(file)
 
 
 def test_members_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -321,10 +334,13 @@ def test_members_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.Mon
         tmp_path, {**record3d_files(small_views(2)), "metadata": bytes(10**6)}, zipfile.ZIP_DEFLATED
     )
     monkeypatch.setattr("bidnerf_core.io.archives.LARGEST_MEMBER", 10**5)
-    assert "scan.r3d/metadata: unpacks to 1 MiB, expected at most 0 MiB" in message(file)
+    with refused(where=file / "metadata", found="unpacks to 1 MiB", expected="at most 0 MiB"):
+        read_all(file)
     content = file.read_bytes().replace((10**6).to_bytes(4, "little"), (10**4).to_bytes(4, "little"))
     file.write_bytes(content)
-    assert "metadata: cannot be unpacked" in message(file) or "metadata: unpacks to" in message(file)
+    with refused(where=file / "metadata") as caught:
+        read_all(file)
+    assert caught.error.found.startswith(("cannot be unpacked", "unpacks to"))
 
 
 def test_the_package_that_decodes_depth_is_named_where_it_is_missing(
@@ -333,6 +349,8 @@ def test_the_package_that_decodes_depth_is_named_where_it_is_missing(
     for name in ("lzfse", "liblzfse"):
         monkeypatch.setitem(sys.modules, name, None)
     files = record3d_files(small_views(2))
-    assert "pip install 'bidnerf[record3d]'" in message(packed(tmp_path, files))
+    file = packed(tmp_path, files)
+    with refused(where=file, found="pip install 'bidnerf[record3d]'"):
+        read_all(file)
     colour = {name: files[name] for name in files if not name.endswith((".depth", ".conf"))}
     assert all(view.frame.depth is None for view in read_all(packed(tmp_path, colour)).values())

@@ -25,12 +25,13 @@ from bidnerf_core.datasets import (
 from bidnerf_core.datasets.polycam import PolycamDataset
 from bidnerf_core.datasets.record3d import Record3DDataset
 from bidnerf_core.datasets.whole import WholeDataset
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.maps import read_views
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.testing import ReaderContract, training_views
+from refusals import refused
 from scan_layouts import LAYOUTS, PERIOD, SMALL, message, read_all, small_views
 
 COUNT = 10
@@ -116,8 +117,9 @@ def test_images_are_not_decoded_before_their_turn(kind: str, tmp_path: Path) -> 
         image.write_bytes(image.read_bytes()[:-40])
     sequence = open_sequence(folder, **LAYOUTS[kind].options)
     assert len(sequence) == 4
-    with pytest.raises(InputError, match="not readable as an image"):
+    with refused(found="not readable as an image", expected="a complete image file") as caught:
         next(iter(sequence))
+    assert caught.error.where in map(str, images)
 
 
 @pytest.mark.parametrize("kind", OF_IMAGE_FILES)

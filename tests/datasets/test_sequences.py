@@ -26,8 +26,8 @@ from bidnerf_core.datasets import (
     open_sequence,
     write_transforms,
 )
-from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from refusals import refused
 from scan_layouts import edit_frame, edit_keys, small_views, write_nerfstudio
 
 NAMES = ("b_10", "b_2", "a_3", "b_1")
@@ -111,7 +111,7 @@ def test_sequences_are_indexed_and_reversed_without_reading(tmp_path: Path) -> N
     assert names(sequence[::2]) == ["b_10", "a_3"]
     assert names(sequence[::-1][:2]) == ["b_1", "a_3"]
     assert sequence[-1].frame.name == "b_1"
-    with pytest.raises(InputError, match=r"b_2\.png: no such file"):
+    with refused(where=tmp_path / "images/b_2.png", found="no such file"):
         sequence[1]
     with pytest.raises(IndexError):
         sequence[4]
@@ -142,7 +142,7 @@ def test_datasets_of_other_readers_have_sequences(tmp_path: Path) -> None:
     sequence = open_sequence(tmp_path, readers=[Anything()])
     assert names(sequence) == list(Others.seen)
     assert [timed.split for timed in sequence] == ["train", "train", "test"]
-    with pytest.raises(InputError, match="with its own cameras"):
+    with refused(where=tmp_path, found="its own cameras"):
         open_sequence(tmp_path, readers=[Anything()], focal=100.0)
 
 
@@ -157,7 +157,7 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
     assert frames[0].frame.depth is not None
     assert float(frames[0].frame.depth.mean()) == pytest.approx(1.5)
     assert frames[1].frame.depth is None
-    with pytest.raises(InputError, match="no focal length in EXIF, expected a camera"):
+    with refused(where=tmp_path / "9.png", found="no focal length in EXIF", expected="a camera"):
         list(open_sequence(tmp_path))
     assumed = next(iter(open_sequence(tmp_path, assumed=[Intrinsics.from_focal(20, 16, 12)]))).frame
     assert assumed.intrinsics == Intrinsics.from_focal(10, 8, 6)
@@ -171,17 +171,17 @@ def test_image_names_may_be_times(tmp_path: Path) -> None:
 
 
 def test_places_without_a_sequence(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file or folder"):
+    with refused(where=tmp_path / "gone", found="no such file or folder"):
         open_sequence(tmp_path / "gone")
-    with pytest.raises(InputError, match="no images in it"):
+    with refused(where=tmp_path, found="no images in it", expected="image files or a dataset"):
         open_sequence(tmp_path)
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(
-        InputError, match=r"notes\.txt: is a file, expected the folder of a dataset, or a video \(\.mp4"
+    with refused(
+        where=tmp_path / "notes.txt", found="is a file", expected="the folder of a dataset, or a video (.mp4"
     ):
         open_sequence(tmp_path / "notes.txt")
     write_transforms(tmp_path, {"train": tiny.views(1)})
-    with pytest.raises(InputError, match="is a dataset with its own cameras; leave out the camera"):
+    with refused(where=tmp_path, found="a dataset with its own cameras; leave out the camera"):
         open_sequence(tmp_path, camera=tiny.CAMERA)
 
 

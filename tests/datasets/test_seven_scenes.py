@@ -16,8 +16,8 @@ from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
 # Inside: the published calibration, with which the recording is rendered
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
 from bidnerf_core.depth import DepthCamera
-from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
+from refusals import refused
 
 SIZE = (160, 120)
 COLOUR, DEPTH = COLOUR_CAMERA.resized(*SIZE), DEPTH_CAMERA.resized(*SIZE)
@@ -131,7 +131,7 @@ def test_a_sequence_may_lack_all_poses(scene: Path) -> None:
         file.unlink()
     frames = list(open_sequence(scene / "seq-01"))
     assert [(timed.truth, timed.time) for timed in frames] == [(None, None)] * 3
-    with pytest.raises(InputError, match=r"frame-00000\d\.pose\.txt: no such file"):
+    with refused(where=scene / "seq-01/frame-000001.pose.txt", found="no such file"):
         open_dataset(scene / "seq-01")
 
 
@@ -142,17 +142,20 @@ def test_a_camera_in_the_folder_is_that_of_the_images(scene: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "line", "found", "expected"),
     [
-        ("", r"TestSplit\.txt: lists no sequence"),
-        ("sequence2\nsequence7", r"TestSplit\.txt: line 2: no folder for sequence7, expected seq-07"),
-        ("sequence2\n\nsequence2", r"TestSplit\.txt: line 3: sequence2 is repeated"),
-        ("the second", r"TestSplit\.txt: line 1: 'the second', expected a sequence"),
+        ("", "", "lists no sequences", "lines such as sequence1"),
+        ("sequence2\nsequence7", ": line 2", "no folder for sequence7", "seq-07"),
+        ("sequence2\n\nsequence2", ": line 3", "sequence2 is repeated", "each sequence once"),
+        ("the second", "", "line 1: 'the second'", "a sequence such as sequence1"),
     ],
 )
-def test_broken_split_files_name_the_line(text: str, message: str, scene: Path) -> None:
-    (scene / "TestSplit.txt").write_text(text)
-    with pytest.raises(InputError, match=message):
+def test_broken_split_files_name_the_line(
+    text: str, line: str, found: str, expected: str, scene: Path
+) -> None:
+    file = scene / "TestSplit.txt"
+    file.write_text(text)
+    with refused(where=f"{file}{line}", found=found, expected=expected):
         open_dataset(scene)
 
 

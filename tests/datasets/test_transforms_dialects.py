@@ -16,12 +16,11 @@ from bidnerf_core.datasets import open_dataset, open_sequence, unique_names
 
 # Inside: a lookup of names that differ by case, which few file systems can hold
 from bidnerf_core.datasets.file_names import FileNames
-from bidnerf_core.errors import InputError
+from refusals import refused
 from scan_layouts import (
     SMALL,
     camera_keys,
     edit_keys,
-    message,
     read_all,
     remarks_of,
     small_views,
@@ -155,7 +154,7 @@ def test_a_given_unit_of_depth_replaces_that_of_the_file(capture: Path) -> None:
         for name, found in views.items():
             torch.testing.assert_close(found.frame.depth, 2 * usual[name].frame.depth)
     for unit in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match=r"depth_unit is .* expected a positive number of metres"):
+        with refused(found=f"depth_unit is {unit:g}", expected="a positive number of metres"):
             open_dataset(capture, depth_unit=unit)
 
 
@@ -173,7 +172,10 @@ def test_missing_images_are_left_out_and_counted(capture: Path) -> None:
     assert [name for name, view in views.items() if view.frame.depth is None] == ["r_6"]
     for file in (capture / "images").iterdir():
         file.unlink()
-    assert "r_1.png, expected that file" in message(capture)
+    image = capture / "images/r_1.png"
+    where = f"{capture / 'transforms.json'}: frame 1 (images/r_1.png)"
+    with refused(where=where, found=f"no image {image}", expected="that file"):
+        read_all(capture)
 
 
 def test_lists_of_names_that_no_frame_has(capture: Path) -> None:

@@ -13,7 +13,6 @@ import pytest
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.errors import InputError
 
 # Inside: rows and costs of single trials, from which a comparison is put together
 from bidnerf_core.evaluation import (
@@ -30,6 +29,7 @@ from bidnerf_core.evaluation.comparison import map_bytes, map_labels, map_row, p
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
 from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
 from bidnerf_core.io import from_plain
+from refusals import refused
 from trial_results import trial_result
 
 pytestmark = pytest.mark.slow
@@ -169,20 +169,20 @@ def test_the_plan_is_the_protocols(plan: Plan, data: Path) -> None:
     assert [len(trials) for trials in planned] == [2] * 4
     assert all(a.map == "a" and b == replace(a, map="b") for a, b in planned)
     assert {a.frames for a, _ in planned[:3]} == {("t_0000",), ("t_0001",), ("t_0002",)}
-    with pytest.raises(InputError, match="named twice"):
+    with refused(where="maps", found="a, ./a: one is named twice", expected="different ones"):
         run_comparison(plan, ["a", "./a"])
-    with pytest.raises(InputError, match="no maps"):
+    with refused(found="no maps", expected="at least one"):
         run_comparison(plan, [])
 
 
 def test_a_trial_that_cannot_be_is_told_in_one_line(maps: list[Path], usual: Trial) -> None:
     with TrialProcess() as process:
-        with pytest.raises(InputError, match="no frame"):
+        with refused(found="split 'test': no frame 'r_9999'"):
             process.run(replace(usual, map=str(maps[0]), frames=("r_9999",)))
         found = process.run(replace(usual, map=str(maps[0]), frames=("t_0000",)))  # it lives on
         assert found.result.frame == "t_0000"
         process._process.kill()
-        with pytest.raises(InputError, match="ended with status -9"):
+        with refused(where=maps[0], found="frame t_0000 ended with status -9"):
             process.run(replace(usual, map=str(maps[0]), frames=("t_0000",)))
 
 

@@ -24,6 +24,7 @@ from bidnerf_core.evaluation import ResultTable, TrialResult, opened, read_resul
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.scenes import closed_form_data, closed_form_map
+from refusals import refused
 
 QUICK: dict[str, Any] = {
     "method": "bid",
@@ -120,7 +121,7 @@ def test_results_of_another_map_in_memory_are_not_taken_for_its_own(tmp_path: Pa
     (row,) = bn.evaluate(first, **given).rows
     assert row.weights == first.training
     assert timeless(bn.evaluate(first, **given).rows) == timeless([row])
-    with pytest.raises(bn.InputError, match="results of another training"):
+    with refused(where=tmp_path / "r.jsonl", found=f"({first.training}, expected {second.training})"):
         bn.evaluate(second, **given)
 
 
@@ -133,9 +134,9 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
     bn.register("methods", "bid", mine, replace=True)
     bn.register("methods", "unused", mine)
     said = "method 'bid' was registered in one process but is unknown in another"
-    with pytest.raises(bn.InputError, match=said):
+    with refused(found=said):
         bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **QUICK)
-    with pytest.raises(bn.InputError, match=said):
+    with refused(found=said):
         bn.compare([BLOBS], BLOBS, trials=1, method="bid", config=QUICK["config"])
     assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=1, **QUICK).rows) == 2
     other = {**QUICK, "method": "bid-lm", "config": {}, "sizes": [0.1]}
@@ -197,8 +198,9 @@ def test_frames_that_masks_hide_wholly_are_named_and_left_out(
     with pytest.warns(bn.InputWarning, match="1 whole frame"):
         found = bn.compare([bn.load_map(scene)], data, **COMPARED, trials=6, masks=place)
     assert {row.frame for row in found.results[0]} == set(names[1:])
-    with pytest.raises(bn.InputError, match=f"not tried: {names[0]}; .*inverted"):
+    with refused(where=place, found=f"1 whole frame of 1, not tried: {names[0]};") as caught:
         bn.evaluate(scene, data, **QUICK, frames=names[:1], masks=place)
+    assert "--mask-hides" in caught.error.found
 
 
 def test_all_splits_are_evaluated_together(shared: Path, tmp_path: Path) -> None:
@@ -227,14 +229,15 @@ def test_folders_without_masks_are_refused(
 
 def test_frames_of_one_name_are_refused() -> None:
     views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
-    with pytest.raises(bn.InputError, match="2 frames named 'image'"):
+    with refused(found="2 frames named 'image'", expected="different names"):
         bn.evaluate(BLOBS, views, trials=1, **QUICK)
 
 
 def test_a_file_of_results_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(bn.InputError, match=r"r\.jsonl: cannot be written"):
-        bn.evaluate(BLOBS, BLOBS, trials=1, out=tmp_path / "file" / "r.jsonl", **QUICK)
+    out = tmp_path / "file" / "r.jsonl"
+    with refused(where=out, found="cannot be written", expected="a file"):
+        bn.evaluate(BLOBS, BLOBS, trials=1, out=out, **QUICK)
 
 
 def test_any_thread_evaluates_and_leaves_no_trace() -> None:
@@ -288,30 +291,30 @@ def test_an_error_of_the_callback_is_the_callers_and_its_trial_is_kept(tmp_path:
 
 @pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_evaluated_is_refused() -> None:
-    for one in (BLOBS, Path("map"), closed_form_map(BLOBS)):
-        with pytest.raises(bn.InputError, match=r"scenes is the one map .*, expected a list of maps"):
+    for one, named in ((BLOBS, BLOBS), (Path("map"), "map"), (closed_form_map(BLOBS), "closed-form")):
+        with refused(found=f"scenes is the one map {named}", expected="a list of maps"):
             bn.compare(one, BLOBS)  # type: ignore[arg-type]
     scene = closed_form_map(BLOBS)
-    wrong: dict[str, dict[str, Any]] = {
-        "workers is 2, expected 1": {"workers": 2},
-        "trials is 0, expected a whole number, 1 to": {"trials": 0},
-        "trials is 2.5": {"trials": 2.5},
-        "workers is 0, expected 1 or more": {"scene": BLOBS, "workers": 0},
-        "workers is -1, expected 1 or more": {"scene": BLOBS, "workers": -1},
-        "seed is -1": {"seed": -1},
-        "size is 0.3:1, expected e_t": {"sizes": [(0.3, 1.0)]},
-        "did you mean 'rays'": {"config": {"ray": 3}},
-        "names 0001 more than once": {"frames": ["0001", "0001"]},
-        "no fault 'blurr'": {"faults": ["blurr:1"]},
-        r"faults is 'blur:1', expected a list, such as \['blur:1'\]": {"faults": "blur:1"},
-        "frames is '0001', expected a list": {"frames": "0001"},
-        "sizes is .*'far'.*, expected a list of numbers": {"sizes": ["far"]},
-        "data is a int": {"data": 3},
-        "data is a list": {"data": [1]},
-    }
-    for said, change in wrong.items():
+    wrong: list[tuple[dict[str, Any], str, str | None]] = [
+        ({"workers": 2}, "workers is 2", "1: other processes read the map"),
+        ({"trials": 0}, "trials is 0", "a whole number, 1 to 100,000"),
+        ({"trials": 2.5}, "trials is 2.5", "a whole number, 1 to 100,000"),
+        ({"scene": BLOBS, "workers": 0}, "workers is 0", "1 or more"),
+        ({"scene": BLOBS, "workers": -1}, "workers is -1", "1 or more"),
+        ({"seed": -1}, "seed is -1", "a whole number, 0 to 2,147,483,647"),
+        ({"sizes": [(0.3, 1.0)]}, "size is 0.3:1", "e_t (m)"),
+        ({"config": {"ray": 3}}, "'ray', did you mean 'rays'?", None),
+        ({"frames": ["0001", "0001"]}, "frames names 0001 more than once", "each once"),
+        ({"faults": ["blurr:1"]}, "no fault 'blurr'", None),
+        ({"faults": "blur:1"}, "faults is 'blur:1'", "a list, such as ['blur:1']"),
+        ({"frames": "0001"}, "frames is '0001'", "a list, such as ['0001']"),
+        ({"sizes": ["far"]}, "sizes is ['far']", "a list of numbers"),
+        ({"data": 3}, "data is a int", "a folder, a dataset or a list of views"),
+        ({"data": [1]}, "data is a list", "a folder, a dataset or a list of views"),
+    ]
+    for change, found, expected in wrong:
         given = {"scene": scene, "data": BLOBS, "trials": 1, **QUICK, **change}
-        with pytest.raises(bn.InputError, match=said):
+        with refused(found=found, expected=expected):
             bn.evaluate(**given)
 
 

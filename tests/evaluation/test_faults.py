@@ -12,7 +12,6 @@ import torch
 from scipy.ndimage import label
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
     FAULTS,
     NO_FAULT,
@@ -26,6 +25,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes import demo_object, demo_room, look_at, orbit
 from bidnerf_core.scenes import views as seen_from
+from refusals import refused
 
 CAMERA = Intrinsics(70.0, 72.0, 41.0, 29.5, 80, 60)
 LENS = dataclasses.replace(CAMERA, distortion=(0.05, -0.01, 0.001, 0.002))
@@ -134,7 +134,7 @@ def test_images_without_depth_have_every_fault_but_those_of_depth(name: str, vie
     fault, size = FAULTS[name], FAULTS[name].sizes[-1]
     blind = View(dataclasses.replace(view.frame, depth=None), view.T_ref_camera)
     if fault.needs_depth:
-        with pytest.raises(InputError, match="no measured depth"):
+        with refused(found=f"frame {view.frame.name} has no measured depth"):
             faulty(blind, f"{name}:{size}", 0)
         return
     changed = faulty(blind, f"{name}:{size}", 0).frame
@@ -145,10 +145,17 @@ def test_images_without_depth_have_every_fault_but_those_of_depth(name: str, vie
 @every_fault
 def test_sizes_out_of_range_are_refused(name: str) -> None:
     fault = FAULTS[name]
-    bad = [fault.allowed.least - 1, "nan", "inf", "", "much"]
-    bad += [] if math.isinf(fault.allowed.most) else [fault.allowed.most + 1]
-    for size in bad:
-        with pytest.raises(InputError, match=f"^fault {name}"):
+    with refused(
+        found=f"fault {name} has no size",
+        expected=f"NAME:SIZE such as depth-scale:1.02; its unit is: {fault.unit}",
+    ):
+        parse_faults(f"{name}:")
+    beyond = [x for x in (fault.allowed.least - 1, fault.allowed.most + 1) if math.isfinite(x)]
+    for size, found in [
+        *((f"{x:.12g}", f"{x:.12g}") for x in beyond),
+        *((word, repr(word)) for word in ("nan", "inf", "much")),
+    ]:
+        with refused(where=f"fault {name}", found=f"size is {found}", expected=fault.allowed):
             parse_faults(f"{name}:{size}")
 
 
@@ -176,23 +183,23 @@ def test_words_name_single_and_composed_faults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    ("word", "found", "expected"),
     [
-        ("depth-scal:1.02", "no fault 'depth-scal', did you mean 'depth-scale'"),
-        ("gravity:2", "installed: added, blur, "),
-        ("depth-scale", "has no size, expected NAME:SIZE"),
-        ("mirror:", "has no size"),
-        ("mirror:0.5", "expected a whole number, 0 to 1"),
-        ("jpeg:50.5", "expected a whole number, 1 to 100"),
-        ("depth-scale:0", "expected more than 0"),
-        ("blur:1,1", "given twice"),
-        ("blur:1+blur:2", "has blur twice"),
-        ("none+blur:1", "no fault 'none'"),
-        ("", "no fault ''"),
+        ("depth-scal:1.02", "no fault 'depth-scal', did you mean 'depth-scale'?", None),
+        ("gravity:2", "no fault 'gravity'; installed: added, blur,", None),
+        ("depth-scale", "fault depth-scale has no size", "NAME:SIZE"),
+        ("mirror:", "fault mirror has no size", "NAME:SIZE"),
+        ("mirror:0.5", "size is 0.5", "a whole number, 0 to 1"),
+        ("jpeg:50.5", "size is 50.5", "a whole number, 1 to 100"),
+        ("depth-scale:0", "size is 0", "more than 0, at most 100"),
+        ("blur:1,1", "fault blur:1 is given twice", "different ones"),
+        ("blur:1+blur:2", "fault blur:1+blur:2 has blur twice", "each once"),
+        ("none+blur:1", "no fault 'none'", None),
+        ("", "no fault ''", None),
     ],
 )
-def test_bad_words_are_explained(word: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_bad_words_are_explained(word: str, found: str, expected: str | None) -> None:
+    with refused(found=found, expected=expected):
         expand_faults([word])
 
 
@@ -520,5 +527,5 @@ def test_a_covered_lens_shows_one_colour_and_measures_nothing(view: View) -> Non
 def test_a_fault_that_returns_no_frame_is_named(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = dataclasses.replace(FAULTS["blur"], change=lambda frame, size, generator: None)  # type: ignore[arg-type, return-value]
     monkeypatch.setattr("bidnerf_core.registry.registered", {("faults", "nothing"): nothing})
-    with pytest.raises(InputError, match="fault nothing:2: returned a NoneType, expected a Frame"):
+    with refused(where="fault nothing:2", found="returned a NoneType", expected="a Frame"):
         faulty(view, "nothing:2", seed=0)

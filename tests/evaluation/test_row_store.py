@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
     Comparison,
     ResultTable,
@@ -22,8 +21,9 @@ from bidnerf_core.evaluation import (
 
 # Inside: records of runs with any content, of which a script makes only its own
 from bidnerf_core.evaluation.provenance import Provenance
-from bidnerf_core.io import from_plain
+from bidnerf_core.io import FileInUse, from_plain
 from drawn import record
+from refusals import refused
 
 
 @given(results=st.lists(record(TrialResult), max_size=2, unique_by=lambda result: result.weights))
@@ -64,7 +64,7 @@ def test_a_script_goes_on_where_it_was_killed(tmp_path: Path) -> None:
         assert store.get(["a", 1], make) == {"value": 1}
         assert made == []
         assert store.get(["a", 2], make) == store.get(["a", 2], make) == {"value": 2}
-        with pytest.raises(InputError, match="another process"), RowStore(path):
+        with refused(where=path, found="another process", error=FileInUse), RowStore(path):
             pass
     assert made == [2]
     assert path.read_bytes() == whole
@@ -72,9 +72,14 @@ def test_a_script_goes_on_where_it_was_killed(tmp_path: Path) -> None:
 
 def test_rows_of_something_else_are_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
-    for content in ("notes\n", '{"a": 1}\n', "[1]\n"):
+    for content, found in (
+        ("notes\n", "not JSON"),
+        ('{"a": 1}\n', "no key and row"),
+        ("[1]\n", "no key and row"),
+    ):
         path.write_text(content)
-        with pytest.raises(InputError, match="expected lines in the format of benchmark"), RowStore(path):
+        expected = "lines in the format of benchmark rows"
+        with refused(where=f"{path}: line 1", found=found, expected=expected), RowStore(path):
             pass
         assert path.read_text() == content
 

@@ -15,7 +15,6 @@ import torch
 
 import tiny
 from bidnerf_core.cli import main
-from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
     Trace,
     Trial,
@@ -27,6 +26,7 @@ from bidnerf_core.evaluation import (
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import pose_error
+from refusals import refused
 
 QUICK = '{"max_steps": 4, "rays": 64}'
 
@@ -111,17 +111,18 @@ def test_a_trial_without_depth_is_given_none(trial: Trial, tmp_path: Path) -> No
 def test_a_trial_that_cannot_be_is_refused(trial: Trial) -> None:
     """Plans refuse most of it before; a trial may come from elsewhere."""
     without: dict[str, Any] = {"protocol": "none", "size": ()}
-    for said, change in {
-        "no protocol 'bit', did you mean 'bid'": {"protocol": "bit"},
-        "size is missing, expected e_t": {"size": ()},
-        "did you mean 'rays'": {"config": '{"ray": 1}'},
-        "config: not JSON": {"config": "{"},
-        "'bid' needs a start": without,
-        "the map has no surface": without | {"method": "auto", "config": "{}"},
-        "method 'magic'": {"method": "magic"},
-        "no frame 'nope'": {"frames": ("nope",)},
-    }.items():
-        with pytest.raises(InputError, match=said):
+    wrong: list[tuple[dict[str, Any], str | None, str, str | None]] = [
+        ({"protocol": "bit"}, None, "no protocol 'bit', did you mean 'bid'?", None),
+        ({"size": ()}, None, "size is missing", "e_t (m)"),
+        ({"config": '{"ray": 1}'}, "config", "'ray', did you mean 'rays'?", None),
+        ({"config": "{"}, "config", "not JSON", "settings of bid"),
+        (without, None, "method 'bid' needs a start", None),
+        (without | {"method": "auto", "config": "{}"}, "the map has no surface", "method 'auto'", None),
+        ({"method": "magic"}, None, "no method 'magic'", None),
+        ({"frames": ("nope",)}, "split 'test'", "no frame 'nope'", "'t_0000'"),
+    ]
+    for change, where, found, expected in wrong:
+        with refused(where=where, found=found, expected=expected):
             run_trial(dataclasses.replace(trial, **change))
 
 

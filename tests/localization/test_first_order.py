@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
@@ -50,6 +49,7 @@ from bidnerf_core.scenes import GaussianBlobs
 from bidnerf_core.settings import to_flat
 from blob_images import BOUNDS, CAMERA, TRUTH
 from problems import FieldMap, localize, single
+from refusals import refused
 
 FIELD = GaussianBlobs.random()
 XI = torch.tensor([0.02, -0.01, 0.03, 0.05, -0.07, 0.04], dtype=torch.float64)
@@ -370,11 +370,11 @@ def test_depth_that_has_no_weight_is_not_used(frame: Frame) -> None:
 def test_a_preset_can_be_changed_and_is_checked() -> None:
     changed = settings_of("bid", {"rays": 64}, preset="paper")
     assert to_flat(changed) == to_flat(METHODS["bid"].settings("paper")) | {"rays": 64}
-    with pytest.raises(InputError, match="preset 'papers' is unknown, this method offers paper, paper-scene"):
+    with refused(found="preset 'papers' is unknown, this method offers paper, paper-scene"):
         settings_of("bid", {}, preset="papers")
-    with pytest.raises(InputError, match="offers none"):
+    with refused(found="preset 'paper' is unknown, this method offers none"):
         METHODS["auto"].settings("paper")
     world = FieldMap(BALL, BOX)
     assert Localizer(world, "bid", preset="paper", warm_up=False).config == METHODS["bid"].settings("paper")
-    with pytest.raises(InputError, match="preset 'paper' and a BidConfig, expected one"):
+    with refused(found="preset 'paper' and a BidConfig", expected="one"):
         Localizer(world, "bid", METHODS["bid"].settings(), preset="paper")

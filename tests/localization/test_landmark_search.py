@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core import SE3, InputError, Intrinsics
+from bidnerf_core import SE3, Intrinsics
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, propose
 
 # Inside: the number of false alarms, the matches around a known pose, and one verdict
@@ -19,6 +19,7 @@ from bidnerf_core.localization.landmarks.correspondences import query_images
 from bidnerf_core.localization.landmarks.guided import guided_matches
 from bidnerf_core.mapping import LandmarkMap, build_landmarks, squared_distances
 from landmark_scene import PINHOLE, Points, looking_in, ring
+from refusals import refused
 
 TRUE = looking_in(0.43, 0.45, 3.6)
 
@@ -157,7 +158,7 @@ def test_an_empty_map_has_no_pose(exact: LandmarkMap) -> None:
 def test_what_cannot_be_asked_is_refused(exact: LandmarkMap) -> None:
     points = Points()
     matcher = LandmarkMatcher(exact)
-    with pytest.raises(InputError, match="at least one view"):
+    with refused(expected="at least one view"):
         propose(matcher, [], points)
 
 

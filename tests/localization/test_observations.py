@@ -7,11 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from bidnerf_core.datasets import read_depth_points
-from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import Observations, render
 from bidnerf_core.frames import View
@@ -29,6 +27,7 @@ from bidnerf_core.localization import (
 )
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, TRUTH, photograph
 from problems import localize, single
+from refusals import refused
 from tiny import depth_rays_of
 
 OBJECTIVE = objective_of(ColourSettings(), DepthSettings())
@@ -132,7 +131,7 @@ def test_sparse_depth_images_become_rays() -> None:
 
 def test_nothing_measured_is_told() -> None:
     for points in (torch.zeros(3, 3), torch.full((2, 3), torch.nan), torch.zeros(0, 3)):
-        with pytest.raises(InputError, match="nothing was measured"):
+        with refused(where="depth rays", found="nothing was measured", expected="one finite point in front"):
             Observations.from_points(points, SE3.identity())
 
 
@@ -170,7 +169,7 @@ def test_files_that_are_none_are_told(tmp_path: Path) -> None:
     np.savez(tmp_path / "flat.npz", points=np.ones((2, 3)), T_camera_sensor=np.eye(3))
     np.savez(tmp_path / "text.npz", points=np.ones((2, 3)), T_camera_sensor=np.array("no"))
     for name in [*(path.name for path in tmp_path.iterdir()), "missing.txt"]:
-        with pytest.raises(InputError, match=name):
+        with refused(where=tmp_path / name):
             read_depth_points(tmp_path / name)
 
 
@@ -180,7 +179,11 @@ def test_a_window_is_the_last_items() -> None:
     assert window(items, 7, 3, stride=2) == ("d", "f", "h")
     assert window(items, 1, 3) == ("a", "b")
     assert window(items, 0, 1) == ("a",)
-    for wrong in ((8, 1), (-1, 1), (0, 0)):
-        with pytest.raises(InputError, match="window"):
+    for wrong, found in (
+        ((8, 1), "at item 8 of 8"),
+        ((-1, 1), "at item -1 of 8"),
+        ((0, 0), "size 0 and stride 1"),
+    ):
+        with refused(found=found):
             window(items, *wrong)
     assert len(window(items, 7, 100)) == 8

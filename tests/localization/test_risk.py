@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import InputError, Localizer, Tracker
+from bidnerf_core import Localizer, Tracker
 
 # Inside: the calibrated levels, and poses on either side of them
 from bidnerf_core.localization import AutoConfig, Outcome, risk
 from bidnerf_core.testing import textured_map, unseen
 from localizations import answer
+from refusals import refused
 
 LEVELS = ((0.01, 0.97), (0.05, 0.9), (0.1, 0.8))
 
@@ -162,14 +163,14 @@ def test_a_rejection_stays_what_it_is() -> None:
 @pytest.mark.usefixtures("levels")
 @pytest.mark.parametrize("share", [0.0, 0.009, 0.11, 1.0, -1.0, math.nan, math.inf, "0.05"])
 def test_a_risk_that_was_not_calibrated_is_refused(share: Any) -> None:
-    with pytest.raises(InputError, match=r"risk is .*, expected 0.01 to 0.1"):
+    with refused(found=f"risk is {share!r}", expected="0.01 to 0.1"):
         AutoConfig(risk=share)
 
 
 def test_without_calibration_every_risk_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(risk, "levels", lambda: ())
     AutoConfig()
-    with pytest.raises(InputError, match="no risk was calibrated"):
+    with refused(found="risk is 0.05, but no risk was calibrated"):
         AutoConfig(risk=0.05)
 
 

@@ -10,13 +10,14 @@ import pytest
 import bidnerf_core as bn
 import tiny
 from bidnerf_core.captures import stored_cameras
-from bidnerf_core.errors import Cancelled, InputError
+from bidnerf_core.errors import Cancelled
 
 # Inside: the location of new photos alone, without the training that follows
 from bidnerf_core.maps.extending import locate
 from bidnerf_core.testing import training_views, view
 from commands import Run
 from photo_files import write_photo
+from refusals import refused
 
 STEPS = 6
 BAKE = bn.BakeConfig(rays=10_000, measured=30_000, cells=10_000)
@@ -78,7 +79,7 @@ def test_a_photo_that_was_added_under_another_name_is_known(stored: Path) -> Non
 def test_another_scene_is_refused(map_folder: Path) -> None:
     before = files(map_folder)
     others = [replace(view(each.T_ref_camera, f"x{n}", 9)) for n, each in enumerate(training_views()[:1])]
-    with pytest.raises(InputError, match="localizes 0 of 1 photo"):
+    with refused(where=map_folder, found="localizes 0 of 1 photo", expected="photos of its scene"):
         bn.extend(map_folder, others, steps=STEPS, config=BAKE)
     assert files(map_folder) == before
 
@@ -103,7 +104,7 @@ def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
     assert after.folder is None
     truth = training_views()[7].T_ref_camera.translation
     assert float((after.info.cameras[7].pose.translation - 2 * truth).norm()) < 0.06
-    with pytest.raises(InputError, match="none of the images that the map was built from"):
+    with refused(where="map in memory", found="none of the images that the map was built from"):
         bn.extend(large, training_views()[7:8], [replace(old[0], frame=replace(old[0].frame, name="z"))])
 
 
@@ -118,17 +119,21 @@ def test_photos_that_cannot_be_read_are_left_out(
         assert len(bn.extend(scene, photos).info.cameras) == 7
     assert "0 of 2 photos localized, 1 already in the map, 1 left out" in caplog.text
     (photos / f"{known.name}.png").unlink()
-    with pytest.raises(InputError, match=r"none of 1 photo can be read: .*b\.png"):
+    with refused(found=f"none of 1 photo can be read: {photos / 'b.png'}"):
         bn.extend(scene, photos)
 
 
 @pytest.mark.parametrize(
-    ("photos", "message"),
-    [([], "no photos to add"), ([3], "photos holds a int"), (Path("nowhere"), "nowhere")],
+    ("photos", "found", "expected"),
+    [
+        ([], "no photos to add", "at least one"),
+        ([3], "photos holds a int", "frames, views, or a path"),
+        (Path("nowhere"), "none of 1 photo can be read: nowhere", None),
+    ],
 )
 @pytest.mark.usefixtures("unchecked")
-def test_what_is_no_photo_is_refused(stored: Path, photos: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_what_is_no_photo_is_refused(stored: Path, photos: object, found: str, expected: str | None) -> None:
+    with refused(found=found, expected=expected):
         bn.extend(stored, photos)  # type: ignore[arg-type]
 
 

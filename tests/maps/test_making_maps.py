@@ -22,6 +22,7 @@ from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import load_info
 from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
+from refusals import refused
 
 BAKE = BakeConfig(cells=5000)
 DESCENT = bn.settings_of("bid", {"rays": 64, "max_steps": 3})
@@ -70,7 +71,7 @@ def test_a_map_in_memory_answers_as_the_one_that_is_saved_and_loaded(scene: bn.M
     assert loaded.info == saved.info
     assert loaded.capture == scene.capture
     assert to_plain(loaded.describe().bounds) == to_plain(scene.describe().bounds)
-    with pytest.raises(bn.InputError, match="exists already"):
+    with refused(where=tmp_path / "map", found="exists already"):
         scene.save(tmp_path / "map")
     assert bn.load_map(scene.save(tmp_path / "map", overwrite=True).folder or "").surface is not None
 
@@ -112,10 +113,10 @@ def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Pat
     resumed = bn.resume(tmp_path / "half", tiny.views(), bake=False)
     assert resumed.info.complete
     assert_same_field(resumed, whole)
-    with pytest.raises(bn.InputError, match="nothing to resume"):
+    with refused(where=tmp_path / "half", found="complete (12 steps), nothing to resume"):
         bn.resume(tmp_path / "half", tiny.views(), bake=False)
     assert bn.resume(tmp_path / "half", tiny.views(), bake=BAKE).surface is not None
-    with pytest.raises(bn.InputError, match="and baked, nothing to resume"):
+    with refused(where=tmp_path / "half", found="complete (12 steps) and baked, nothing to resume"):
         bn.resume(tmp_path / "half", tiny.views())
 
 
@@ -171,11 +172,11 @@ def test_a_thread_trains_while_another_localizes(scene: bn.Map, whole: bn.Map) -
 
 
 def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_path: Path) -> None:
-    begun, refused = threading.Event(), threading.Event()
+    begun, go_on = threading.Event(), threading.Event()
 
     def wait(now: bn.Progress) -> None:
         begun.set()
-        assert refused.wait(120)
+        assert go_on.wait(120)
 
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(trained, tmp_path / "map", progress=wait)
@@ -183,9 +184,9 @@ def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_pat
         for second in (trained, lambda out, **_: bn.resume(out, tiny.views())):
             with pytest.raises(bn.InputError):
                 second(tmp_path / "map")
-        with pytest.raises(FileInUse, match="another bidnerf process is writing here"):
+        with refused(where=tmp_path / "map", found="another bidnerf process", error=FileInUse):
             trained(tmp_path / "map", overwrite=True)
-        refused.set()
+        go_on.set()
         assert first.result().info.complete
     assert load_info(tmp_path / "map").complete
 
@@ -215,7 +216,7 @@ def test_baking_stores_what_it_made_where_the_map_is(scene: bn.Map, tmp_path: Pa
     assert again.info.surface != baked.info.surface
     with pytest.raises(bn.Cancelled):
         baked.bake(tiny.views(), config=BAKE, cancel=lambda: True)
-    with pytest.raises(bn.InputError, match="rendered_landmarks uses no photos"):
+    with refused(found="rendered_landmarks uses no photos", expected="only one of them"):
         baked.bake(tiny.views(), rendered_landmarks=True)
     assert load_info(tmp_path / "map") == again.info
 
@@ -260,38 +261,41 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
     perfect = bn.rendering_scores(type(image)(view.frame.rgb, view.frame.depth, image.opacity), view.frame)
     assert perfect.depth_error == 0
     assert not torch.equal(scene.render(view, level=0).rgb, image.rgb)
-    with pytest.raises(bn.InputError, match="no level 2, expected 0 to 1"):
+    with refused(where="map in memory", found="no level 2", expected="0 to 1"):
         scene.render(view, level=2)
-    with pytest.raises(bn.InputError, match="view is a Frame, expected a View"):
+    with refused(where="map in memory", found="view is a Frame", expected="a View"):
         scene.render(view.frame)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "where", "found", "expected"),
     [
-        ({"data": []}, "data holds no views"),
-        ({"data": 3}, "data is or holds a int, expected a dataset, a path, or views"),
-        ({"data": [None]}, "data is or holds a NoneType"),
-        ({"data": "/nowhere"}, "/nowhere: no such folder"),
-        ({"backend": "hashgird"}, "hashgird"),
-        ({"config": {"stepps": 3}}, "no field 'stepps', did you mean 'steps'"),
-        ({"config": 7}, "config is a int, expected a HashGridConfig or a dict"),
-        ({"device": "tpu:9"}, "device 'tpu:9' does not work here"),
-        ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
-        ({"bake": "yes"}, "bake is 'yes', expected True, False or a BakeConfig"),
-        ({"progress": 3}, "progress is a int, expected a function"),
+        ({"data": []}, None, "data holds no views", None),
+        ({"data": 3}, None, "data is or holds a int", "a dataset, a path, or views"),
+        ({"data": [None]}, None, "data is or holds a NoneType", "a dataset, a path, or views"),
+        ({"data": "/nowhere"}, "/nowhere", "no such folder", None),
+        ({"backend": "hashgird"}, None, "no backend 'hashgird'", None),
+        ({"config": {"stepps": 3}}, None, "no field 'stepps', did you mean 'steps'?", None),
+        ({"config": 7}, None, "config is a int", "a HashGridConfig or a dict"),
+        ({"device": "tpu:9"}, None, "device 'tpu:9' does not work here", "cpu"),
+        ({"checkpoint_seconds": -1.0}, None, "checkpoint_seconds is -1.0", None),
+        ({"bake": "yes"}, None, "bake is 'yes'", "True, False or a BakeConfig"),
+        ({"progress": 3}, None, "progress is a int", "a function"),
         (
             {"cancel": threading.Event()},
-            "cancel is a Event, expected a function, such as the is_set of an event",
+            None,
+            "cancel is a Event",
+            "a function, such as the is_set of an event",
         ),
-        ({"refine_poses": "maybe"}, "refine_poses is 'maybe', expected one of auto, always, never"),
+        ({"refine_poses": "maybe"}, None, "refine_poses is 'maybe'", "one of auto, always, never"),
     ],
 )
-def test_wrong_arguments_are_refused_before_any_work(options: dict[str, Any], said: str) -> None:
-    with pytest.raises(bn.InputError) as refused:
+def test_wrong_arguments_are_refused_before_any_work(
+    options: dict[str, Any], where: str | None, found: str, expected: str | None
+) -> None:
+    with refused(where=where, found=found, expected=expected):
         bn.train(**({"data": tiny.views(1), "config": tiny.config(1), "bake": False} | options))
-    assert said in str(refused.value)
 
 
 def test_a_backend_whose_module_is_no_field_is_refused_before_training(
@@ -303,8 +307,10 @@ def test_a_backend_whose_module_is_no_field_is_refused_before_training(
 
     kind = Layers(**vars(hashgrid))
     monkeypatch.setattr("bidnerf_core.registry.registered", {("backends", "layers"): kind})
-    with pytest.raises(
-        bn.InputError, match=r"backend 'layers' built a Linear, expected .* query and sampler"
+    with refused(
+        where=tmp_path / "map",
+        found="backend 'layers' built a Linear",
+        expected="an nn.Module with query and sampler",
     ):
         bn.train(tiny.views(2), "layers", out=tmp_path / "map", bake=False)
     assert not (tmp_path / "map").exists()
@@ -315,7 +321,7 @@ def test_a_broken_detector_ends_training_with_an_error_and_the_map_in_its_folder
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("bidnerf_core.registry.registered", {("features", "blind"): lambda rgb: None})
-    with pytest.raises(PluginError, match="returned a NoneType, expected Keypoints"):
+    with refused(where="detector", found="returned a NoneType", expected="Keypoints", error=PluginError):
         trained(tmp_path / "map", features="blind", refine_poses="never", bake=BAKE)
     assert load_info(tmp_path / "map").complete
 

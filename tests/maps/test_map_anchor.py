@@ -17,8 +17,8 @@ from bidnerf_core import resume, train
 from bidnerf_core.captures import CaptureReport, CoverageRecord
 
 # Inside: writes are counted and stopped at each, and an anchor is written as users write it
-from bidnerf_core.maps import Anchor, Map, files, load_info, load_map, save_map
-from bidnerf_core.maps.anchor import anchor_bytes, load_anchor, save_anchor
+from bidnerf_core.maps import Anchor, Map, files, load_anchor, load_info, load_map, save_map
+from bidnerf_core.maps.anchor import anchor_bytes, save_anchor
 from bidnerf_core.maps.files import save_capture
 from bidnerf_core.progress import Progress
 from bidnerf_core.training import TrainingState

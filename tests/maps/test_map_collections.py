@@ -16,7 +16,6 @@ import bidnerf_core as bn
 # Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module
 from bidnerf_core.captures import stored_cameras
-from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in
@@ -24,6 +23,7 @@ from bidnerf_core.service.worker import Served, Worker
 from bidnerf_core.service.worker import _together as together_of
 from bidnerf_core.testing import BOUNDS, CAMERA, POSES, ground, training_views, view
 from commands import Run
+from refusals import refused
 
 SEEDS = (0, 4, 5)
 
@@ -115,11 +115,11 @@ def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:
 
 
 def test_what_is_no_map_is_refused(grounds: list[Map], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no map in it"):
+    with refused(where=tmp_path, found="no map in it", expected="a map or a folder of maps"):
         bn.MapCollection(tmp_path)
-    with pytest.raises(InputError, match="two maps are named 'ground0'"):
+    with refused(found="two maps are named 'ground0'", expected="different names"):
         bn.MapCollection([grounds[0], grounds[0]])
-    with pytest.raises(InputError, match="no map 'x', expected one of ground0"):
+    with refused(found="no map 'x'", expected="one of ground0"):
         bn.MapCollection(grounds[:1]).localizer("x")
     assert maps_in(tmp_path / "none") == []
 

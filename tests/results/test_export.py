@@ -13,11 +13,11 @@ import torch
 import bidnerf_core as bn
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import read_frames
-from bidnerf_core.errors import InputError
 from bidnerf_core.io import read_record
 from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.registry import PluginError, registered
 from bidnerf_core.testing import BOUNDS, textured_map, training_views
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -80,15 +80,15 @@ def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
 
 def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:
     bare = replace(scene, info=replace(scene.info, cameras=()), surface=None, landmarks=None)
-    with pytest.raises(InputError, match=r"no cameras, but \w+ needs some"):
+    with refused(where="ground", found="no cameras, but colmap needs some"):
         bn.export_map(bare, tmp_path / "out", "colmap")
-    with pytest.raises(InputError, match="no surface, landmarks or cameras"):
+    with refused(where="ground", found="no surface, landmarks or cameras"):
         bn.export_map(bare, tmp_path / "out", "ply")
-    with pytest.raises(InputError, match="format 'obj', expected one of ply"):
+    with refused(found="format 'obj'", expected="one of ply"):
         bn.export_map(scene, tmp_path / "out", "obj")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="not empty"):
+    with refused(where=tmp_path / "full", found="exists already and is not empty"):
         bn.export_map(scene, tmp_path / "full", "ply")
 
 
@@ -107,5 +107,7 @@ def test_a_registered_exporter_gets_the_map(
     assert file.read_text() == str(len(scene.landmarks))
 
     monkeypatch.setitem(registered, ("exporters", "count"), lambda: None)
-    with pytest.raises(PluginError, match="not an exporter: it does not take"):
+    with refused(
+        where="exporter 'count'", found="not an exporter: it does not take (scene, out)", error=PluginError
+    ):
         bn.export_map(scene, tmp_path / "out", "count", overwrite=True)

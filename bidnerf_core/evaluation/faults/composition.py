@@ -15,7 +15,6 @@ from bidnerf_core.frames import Frame, View
 
 NO_FAULT = "none"
 """The name that leaves a view unchanged."""
-EXAMPLE = "expected NAME:SIZE such as depth-scale:1.02"
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,8 @@ def _parsed(text: str) -> AppliedFault:
     if not size:
         if fault.is_switch and not colon:
             return AppliedFault(name, 1.0)
-        raise InputError(f"fault {name} has no size, {EXAMPLE}; its unit is: {fault.unit}")
+        example = "NAME:SIZE such as depth-scale:1.02"
+        raise InputError(f"fault {name} has no size", expected=f"{example}; its unit is: {fault.unit}")
     try:
         number = float(size)
     except ValueError:
