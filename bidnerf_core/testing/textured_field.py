@@ -94,8 +94,10 @@ def unseen() -> View:
 
 @functools.cache
 def textured_map(surface: bool = False) -> MapWithLandmarks:
-    baked = bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000)) if surface else None
-    return MapWithLandmarks(ground(), BOUNDS, build_landmarks(training_views()), baked)
+    if surface:
+        baked = bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000))
+        return replace(textured_map(), surface=baked)
+    return MapWithLandmarks(ground(), BOUNDS, build_landmarks(training_views()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -180,7 +180,8 @@ def test_cameras_that_did_not_move_have_one_pose() -> None:
 def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
     data_dir: Path, scene: str, refined: bool
 ) -> None:
-    views = open_dataset(data_dir / scene).views("train")[:24]
+    dataset = open_dataset(data_dir / scene)
+    views = dataset.views("train", dataset.frame_names("train")[:24])
     features = Sift(count=500)
     found = training_poses(tracked_views(views, features), views)
     assert found.refined == refined

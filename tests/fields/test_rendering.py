@@ -254,7 +254,8 @@ def test_levels_fall_back_on_the_field_itself() -> None:
 def test_a_picture_is_nearly_the_image_and_renders_fewer_pixels(size: tuple[int, int]) -> None:
     scene = closed_form_map("demo:blobs")
     camera = Intrinsics.from_hfov(50, *size)
-    pose = closed_form_data("demo:blobs").views("test")[0].T_ref_camera
+    data = closed_form_data("demo:blobs")
+    pose = data.views("test", data.frame_names("test")[:1])[0].T_ref_camera
     counted = 0
 
     class Counting:

@@ -304,7 +304,23 @@ GROUND: dict[str, tuple[Any, Expected]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", GROUND)
+COSTLY = {
+    "focal 1.2",
+    "principal point",
+    "cropped",
+    "moving rows",
+    "moving rows, focal 1.05, RGB-D",
+    "blurred 2",
+    "another ground",
+    "focal 1.03, rendered",
+    "another camera 0.97, rendered",
+}
+"""Rows that need more searches or renderings than most."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in COSTLY)) for name in GROUND]
+)
 def test_ground(name: str) -> None:
     asked, expected = GROUND[name]
     query = asked()

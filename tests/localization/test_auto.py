@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
@@ -23,6 +24,7 @@ from bidnerf_core.localization import (
     PointCloud,
     Problem,
     rig,
+    settings_of,
 )
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import demo_room
@@ -201,8 +203,10 @@ def test_a_map_without_a_surface_needs_a_start(channels: str) -> None:
         found_for(problem)
 
 
-@pytest.mark.slow
-def test_in_a_map_without_a_surface_it_descends_from_the_start() -> None:
+def test_in_a_map_without_a_surface_it_descends_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = {"rays": 256, "max_steps": 60, "learning_rate": 0.08, "decay": 0.5, "decay_steps": 20}
+    auto = import_module("bidnerf_core.localization.auto")
+    monkeypatch.setattr(auto, "BidConfig", lambda: settings_of("bid", few))
     start = perturb(blob_images.TRUTH, 0.1, 3.0, seed=2)
     scene = FieldMap(blob_images.FIELD, blob_images.BOUNDS)
     found = Localizer(scene, warm_up=False)(blob_images.FRAME, start)

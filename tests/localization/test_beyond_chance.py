@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import pytest
 import torch
@@ -28,7 +29,9 @@ from problems import FieldMap, localize
 CAMERA = Intrinsics(70.0, 70.0, 40.0, 30.0, 80, 60)
 BOUNDS = SceneBounds((-2.0, -2.0, -0.2), (2.0, 2.0, 0.2), 0.1, 8.0)
 POSES = [look_at((x, y, 1.8), (x, y + 0.1, 0.0)) for x in (-0.8, -0.3, 0.3, 0.8) for y in (-0.6, 0.0, 0.5)]
-QUICK = AutoConfig(hypotheses=24, rounds=1)
+FEW_STEPS = {"rays": 512, "max_steps": 60}
+CONFIGS: dict[str, Any] = {"auto": AutoConfig(hypotheses=24, rounds=1), "bid": FEW_STEPS, "inerf": FEW_STEPS}
+"""Settings where the default ones take long, by method."""
 MIDDLE = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
 
 
@@ -67,7 +70,7 @@ def found(view: View, texture: float, method: str = "auto") -> Localization:
     scene, surface = wall(texture)
     start = None if method == "auto" else view.T_ref_camera
     problem: Problem = rig(FieldMap(scene, BOUNDS, surface), [View(view.frame, SE3.identity())], start)
-    return localize(problem, method, QUICK if method == "auto" else None)
+    return localize(problem, method, CONFIGS.get(method))
 
 
 QUERY = look_at((0.1, -0.2, 1.6), (0.3, 0.2, 0.0))

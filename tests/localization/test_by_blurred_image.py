@@ -5,6 +5,7 @@ The table of ``test_answers`` has blurred photos; ``refined_if_blurred`` is need
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -38,13 +39,14 @@ from problems import FieldMap
 
 CLOUDS = GaussianBlobs.random(12, density=400.0)
 FIELD = replace(
-    CLOUDS, widths=CLOUDS.widths / 2, waves=8 * CLOUDS.waves, sampler=Stratified(48, baked.BOUNDS)
+    CLOUDS, widths=CLOUDS.widths / 2, waves=8 * CLOUDS.waves, sampler=Stratified(32, baked.BOUNDS)
 )  # with sharp edges
 CAMERA = baked.CAMERA
 TRUTH = orbit(3.5, 3, elevation=(-10.0, 80.0), seed=7)[1]
 ASIDE = TRUTH.retract(torch.tensor([0.03, -0.02, 0.03, 0.006, 0.006, -0.006], dtype=torch.float64))
 
 
+@functools.cache
 def photo(blur: float = 0.0, depth: bool = False) -> View:
     seen = render_image(FIELD, CAMERA, TRUTH, baked.BOUNDS)
     view = View(Frame("photo", seen.rgb, CAMERA, seen.depth if depth else None), TRUTH)
@@ -52,7 +54,7 @@ def photo(blur: float = 0.0, depth: bool = False) -> View:
 
 
 def problem(view: View) -> Problem:
-    return rig(FieldMap(FIELD, baked.BOUNDS, baked.toy()), [view], None)  # any surface: none is rendered
+    return rig(FieldMap(FIELD, baked.BOUNDS, baked.patch()), [view], None)  # any surface: none is rendered
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ from problems import FieldMap, localize
 from refusals import refused
 
 BOUNDS = replace(baked.BOUNDS, lower=(-1.2, -1.2, -1.2), upper=(1.2, 1.2, 1.2))
-FIELD = GaussianBlobs.random(density=60.0)
+FIELD = GaussianBlobs.random(samples=32, density=60.0)
 QUICK = AutoConfig(hypotheses=48, rounds=1)
 SEEN = orbit(3.5, 24, elevation=(-10.0, 80.0), seed=0)
 UNSEEN = orbit(3.5, 3, elevation=(-10.0, 80.0), seed=7)
@@ -41,6 +41,7 @@ def surface() -> SurfaceMap:
     return bake(FIELD, BOUNDS, [(baked.CAMERA, T) for T in SEEN], config=baked.CONFIG)
 
 
+@functools.cache
 def photograph(T: SE3, depth: bool = False) -> View:
     seen = render_image(FIELD, baked.CAMERA, T, BOUNDS)
     return View(Frame("frame", seen.rgb, baked.CAMERA, seen.depth if depth else None), T)

@@ -18,7 +18,6 @@ from bidnerf_core.depth import find_depth_sensor
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     SHARPEST,
-    AutoConfig,
     LandmarkAnswer,
     LandmarkMatcher,
     answer_by_landmarks,
@@ -32,6 +31,7 @@ from bidnerf_core.mapping import Keypoints, Sift
 from bidnerf_core.registry import registered
 from bidnerf_core.results import pose_error
 from bidnerf_core.testing import CAMERA, MapWithLandmarks, textured_map, unseen
+from conditions import QUICK
 from localizations import assert_covered, assert_near, colour_only
 
 TRUTH = unseen().T_ref_camera
@@ -197,11 +197,9 @@ def test_the_answer_tells_its_path_and_what_was_fused() -> None:
 
 # Method ``auto`` decides whether landmarks are trusted.
 
-QUICK = AutoConfig(points=500, hypotheses=32, rounds=1, refine_steps=0, fused_rays=64)
-
 
 def localized(view: View, map: MapWithLandmarks | None = None, start: SE3 | None = None) -> Localization:
-    return Localizer(map or textured_map(), "auto", QUICK)(view.frame, start=start)
+    return Localizer(map or textured_map(), "auto", QUICK, warm_up=False)(view.frame, start=start)
 
 
 def test_auto_takes_landmarks_first_with_a_start_or_without() -> None:

@@ -222,6 +222,9 @@ def test_the_name_of_what_is_wrong_opens_the_message() -> None:
 def test_a_seed_is_a_whole_number(seed: Any) -> None:
     with refused(found=f"seed is {seed!r}", expected="a whole number from 0"):
         poses(FRAME, seed=seed)
+
+
+def test_a_seed_of_numpy_is_that_number() -> None:
     assert torch.equal(poses(FRAME, seed=np.int64(3)), poses(FRAME, seed=3))
 
 

@@ -14,15 +14,15 @@ BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 
 CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
 POSES = orbit(4.0, 3, seed=1)
 TRUTH = POSES[1]
-FIELD = GaussianBlobs.random(density=60.0)
+FIELD = GaussianBlobs.random(samples=32, density=60.0)
 
 
-def photograph(T: SE3 = TRUTH, depth: bool = True) -> Frame:
+def photograph(T: SE3 = TRUTH, depth: bool = True, field: GaussianBlobs = FIELD) -> Frame:
     """Return what a perfect RGB-D camera sees: the rendering's own colour and, where it is opaque, distance."""
     ray = CAMERA.unproject(CAMERA.pixel_centres(torch.float64))
     length = torch.linalg.vector_norm(ray, dim=-1)
     directions = T.rotate(ray / length[..., None])
-    seen = render(FIELD, BOUNDS.rays(T.translation.expand_as(directions), directions), BOUNDS.background)
+    seen = render(field, BOUNDS.rays(T.translation.expand_as(directions), directions), BOUNDS.background)
     opaque = seen.opacity > 0.95
     measured = torch.where(opaque, seen.distance / seen.opacity.clamp(min=0.9) / length, 0)
     return Frame("frame", seen.rgb.float(), CAMERA, measured.float() if depth else None)

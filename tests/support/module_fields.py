@@ -39,7 +39,7 @@ class AsModule(nn.Module):
 
 @functools.cache
 def field() -> AsModule:
-    return AsModule(GaussianBlobs.random(density=1000.0))
+    return AsModule(GaussianBlobs.random(samples=32, density=1000.0))
 
 
 @functools.cache

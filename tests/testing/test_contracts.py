@@ -28,6 +28,9 @@ from bidnerf_core.testing import (
 )
 
 QUICK = AutoConfig(points=1000, hypotheses=64, rounds=1, refine_steps=0, fused_rays=128)
+FEW = {
+    "poses": 8, "search_rays": 64, "coarse_poses": 3, "coarse_rays": 64, "middle_rays": 128, "fine_rays": 512,
+}  # fmt: skip
 
 
 class TestSift(FeaturesContract):
@@ -39,7 +42,7 @@ class TestAuto(MethodContract):
 
 
 class TestBidLm(MethodContract):
-    name, config = "bid-lm", settings_of("bid-lm", {"poses": 8})
+    name, config = "bid-lm", settings_of("bid-lm", FEW)
     largest_error = 0.05
 
 
