@@ -771,10 +771,10 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     assert found["frame"] == view.frame.name
 
 
-# Runs commands in children, to import torch once only: for each line on stdin, a file for what one prints, one for
+# Runs commands in children, to import torch and its compiler once only: for each line on stdin, a file for what one prints, one for
 # what it complains of, and its words. Prints the child's process id, and then how it ended.
 FORKING = """
-import os, sys
+import os, sys, torch._dynamo
 import bidnerf_core.cli.train as _
 from bidnerf_core.cli import main
 for line in sys.stdin:
