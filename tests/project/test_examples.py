@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
-QUICK = {"--steps": "12", "--descent": "3", "--trials": "2"}
+QUICK = {"--steps": "4", "--descent": "3", "--trials": "2"}
 
 
 @pytest.mark.usefixtures("quick_trials")
