@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 from jaxtyping import install_import_hook
 
@@ -112,6 +115,38 @@ def data(shared: Path, tmp_path: Path) -> Path:
 def map_folder(shared: Path, tmp_path: Path) -> Path:
     """A copy of the map of the tiny dataset."""
     return Path(shutil.copytree(shared / "map", tmp_path / "map"))
+
+
+@pytest.fixture
+def quick_trials(monkeypatch: pytest.MonkeyPatch, small_images: None) -> None:
+    """Trials of this process take a tenth of the usual time: small images, and few rays on which a pose is judged."""
+    monkeypatch.setattr("bidnerf_core.localization.first_order.SUPPORTING_RAYS", 64)
+
+
+@pytest.fixture
+def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Closed-form data have images as small as those of the tiny dataset: a thirtieth of the usual pixels."""
+    import tiny
+    from bidnerf_core.scenes import closed_form_data
+
+    module = sys.modules[closed_form_data.__module__]  # a function of the same name shadows it
+    monkeypatch.setattr(module, "DEMO_CAMERA", tiny.CAMERA)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are files without content, since drawing them takes most of a report's time."""
+    target = "bidnerf_core.results.plot_style.write_figure"
+    monkeypatch.setattr(target, lambda figure, path, **options: path.write_text("<svg/>"))
+
+
+@pytest.fixture
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A comparison tries every map in this process: each of its own would spend seconds on importing PyTorch."""
+    from bidnerf_core.evaluation.workers import measured
+
+    here = nullcontext(SimpleNamespace(run=measured))
+    monkeypatch.setattr("bidnerf_core.evaluation.comparison.TrialProcess", lambda: here)
 
 
 @pytest.fixture

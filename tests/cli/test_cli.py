@@ -771,22 +771,67 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     assert found["frame"] == view.frame.name
 
 
+# Runs commands in children, to import torch and its compiler once only: for each line on stdin, a file for what one prints, one for
+# what it complains of, and its words. Prints the child's process id, and then how it ended.
+FORKING = """
+import os, sys, torch._dynamo
+import bidnerf_core.cli.train as _
+from bidnerf_core.cli import main
+for line in sys.stdin:
+    out, err, *words = line.split()
+    child = os.fork()
+    if child == 0:
+        for number, path in ((1, out), (2, err)):
+            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
+        status = main(words)
+        sys.stdout.flush()
+        os._exit(status)
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+class Forking:
+    """A process that runs commands in children, one after the other."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+
+    def begin(self, words: list[str], out: str = os.devnull, err: str = os.devnull) -> int:
+        """Begin a command, and return the id of its process."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(" ".join([out, err, *words]) + "\n")
+        self.process.stdin.flush()
+        return self.ended()
+
+    def ended(self) -> int:
+        """Return the status of the command once it has ended."""
+        assert self.process.stdout is not None
+        return int(self.process.stdout.readline())
+
+
+@pytest.fixture(scope="module")
+def forking() -> Iterator[Forking]:
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([sys.executable, "-c", FORKING], text=True, env=ALONE, **pipes) as process:
+        yield Forking(process)
+        assert process.stdin is not None
+        process.stdin.close()
+
+
 @pytest.mark.slow
 def test_ctrl_c_saves_and_resuming_loses_nothing(
-    bidnerf: Run, shared: Path, whole: Path, tmp_path: Path
+    bidnerf: Run, shared: Path, whole: Path, tmp_path: Path, forking: Forking
 ) -> None:
-    out = tmp_path / "map"
+    out, said, complaints = tmp_path / "map", tmp_path / "said", tmp_path / "complaints"
     train = ["train", str(shared / "data"), "--out", str(out)]
-    command = [*PROGRAM, *train, *tiny.options(LONG), "--checkpoint-every", "0"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ALONE
-    ) as process:
-        wait_for((out / "map.json").exists, process)
-        process.send_signal(signal.SIGINT)
-        said, complaints = process.communicate(timeout=120)
+    options = [*tiny.options(LONG), "--checkpoint-every", "0"]
+    child = forking.begin([*train, *options], str(said), str(complaints))
+    wait_for((out / "map.json").exists, forking.process)
+    os.kill(child, signal.SIGINT)
+    assert (forking.ended(), said.read_text()) == (130, "")
     info = load_info(out)
-    assert (process.returncode, said) == (130, "")
-    assert complaints.splitlines()[-2:] == [
+    assert complaints.read_text().splitlines()[-2:] == [
         f"{out}: saved after step {info.step}; --resume continues from there",
         "bidnerf train: interrupted",
     ]
@@ -795,56 +840,28 @@ def test_ctrl_c_saves_and_resuming_loses_nothing(
     assert_same_map(out, whole)
 
 
-# Trains in children, to import torch once only; a line on stdin starts one, and its process id is printed.
-FORKING = """
-import os, sys
-import bidnerf_core.cli.train as _
-from bidnerf_core.cli import main
-for line in sys.stdin:
-    child = os.fork()
-    if child == 0:
-        os._exit(main(line.split()))
-    print(child, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
-
-
 @pytest.mark.slow
 def test_a_training_that_is_killed_again_and_again_still_comes_to_its_end(
-    shared: Path, whole: Path, tmp_path: Path
+    shared: Path, whole: Path, tmp_path: Path, forking: Forking
 ) -> None:
     out, steps = tmp_path / "map", []
-    train = f"train {shared / 'data'} --out {out} --checkpoint-every 0 "
+    train = ["train", str(shared / "data"), "--out", str(out), "--checkpoint-every", "0"]
     chance = random.Random(0)
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([sys.executable, "-c", FORKING], text=True, env=ALONE, **pipes) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-
-        def tell(line: str) -> None:
-            process.stdin.write(line + "\n")
-            process.stdin.flush()
-
-        for _ in range(3):
-            before = (out / "map.json").read_bytes() if out.exists() else None
-            tell(train + ("--resume --no-bake" if before else " ".join(tiny.options(LONG))))
-            child = int(process.stdout.readline())
-            wait_for(
-                lambda before=before: (
-                    (out / "map.json").exists() and (out / "map.json").read_bytes() != before
-                ),
-                process,
-            )
-            time.sleep(chance.uniform(0, 0.1))
-            os.kill(child, signal.SIGKILL)
-            assert int(process.stdout.readline()) == -signal.SIGKILL
-            stored = load_map(out)
-            assert not stored.info.complete, "raise LONG: it came to its end before it was killed"
-            steps.append(stored.info.step)
-        tell(train + "--resume --no-bake")
-        process.stdout.readline()
-        assert int(process.stdout.readline()) == 0
-        process.stdin.close()
+    for _ in range(3):
+        before = (out / "map.json").read_bytes() if out.exists() else None
+        child = forking.begin([*train, *(["--resume", "--no-bake"] if before else tiny.options(LONG))])
+        wait_for(
+            lambda before=before: (out / "map.json").exists() and (out / "map.json").read_bytes() != before,
+            forking.process,
+        )
+        time.sleep(chance.uniform(0, 0.1))
+        os.kill(child, signal.SIGKILL)
+        assert forking.ended() == -signal.SIGKILL
+        stored = load_map(out)
+        assert not stored.info.complete, "raise LONG: it came to its end before it was killed"
+        steps.append(stored.info.step)
+    forking.begin([*train, "--resume", "--no-bake"])
+    assert forking.ended() == 0
     assert steps == sorted(set(steps))
     assert_same_map(out, whole)
     assert sorted(file.suffix for file in out.iterdir()) == [".json", ".safetensors"]

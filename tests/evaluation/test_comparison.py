@@ -64,8 +64,13 @@ def usual(maps: list[Path], data: Path) -> Trial:
 
 
 @pytest.fixture(scope="module")
-def compared(maps: list[Path], plan: Plan) -> Comparison:
-    return run_comparison(plan, maps)
+def compared(maps: list[Path], plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    """Run from a folder with a file that bears the name of a module of Python's."""
+    folder = tmp_path_factory.mktemp("user")
+    (folder / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return run_comparison(plan, maps)
 
 
 def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResult:
@@ -95,13 +100,8 @@ def test_a_process_elsewhere_finds_what_this_one_finds(
         )
 
 
-def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(
-    tmp_path: Path, usual: Trial, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
-    monkeypatch.chdir(tmp_path)
-    with TrialProcess() as process:
-        assert process.run(usual).result.steps == 3
+def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(compared: Comparison) -> None:
+    assert [r.steps for column in compared.results for r in column] == [3] * 4
 
 
 def test_a_process_keeps_one_map(usual: Trial) -> None:
@@ -195,6 +195,7 @@ def test_the_picture_is_written(compared: Comparison, tmp_path: Path) -> None:
     assert "<svg" in (tmp_path / "a.svg").read_text()
 
 
+@pytest.mark.usefixtures("no_processes")
 def test_the_command_prints_a_table_and_writes_what_it_says(
     maps: list[Path], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,6 +213,7 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
     assert "not empty" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("no_processes")
 def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--rays", "32", "--max-steps", "2", "--size", "0.3", "--frame", "t_0001", "--trials", "1", "--json"]  # fmt: skip
     assert main(["compare", str(maps[0]), str(data), *words]) == 0

@@ -225,15 +225,6 @@ def test_a_file_without_results_is_told_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are files without content, since drawing them takes most of a report's time."""
-    monkeypatch.setattr(
-        "bidnerf_core.results.plot_style.write_figure",
-        lambda figure, path, **options: path.write_text("<svg/>"),
-    )
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_report_replaces_a_report_and_nothing_else(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]

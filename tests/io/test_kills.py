@@ -57,15 +57,8 @@ def test_files_of_others_and_of_whole_maps_are_not_overwritten(
         assert f"{out}: exists already and is not empty" in err
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are files without content, since drawing them takes most of a report's time."""
-    target = "bidnerf_core.results.plot_style.write_figure"
-    monkeypatch.setattr(target, lambda figure, path, **options: path.write_text("<svg/>"))
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn", "quick_trials")
 @pytest.mark.parametrize("command", ["train", "bake", "evaluate", "report"])
 def test_a_disk_that_is_full_at_the_second_write_leaves_whole_files(
     command: str, bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -98,7 +91,7 @@ def test_a_disk_that_is_full_at_the_second_write_leaves_whole_files(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn", "quick_trials")
 def test_a_report_killed_before_its_page_begins_anew(bidnerf: Run, tmp_path: Path) -> None:
     out = tmp_path / "report"
     out.mkdir()

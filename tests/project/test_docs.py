@@ -9,7 +9,6 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
@@ -112,7 +111,7 @@ def inside(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.fixture
-def quick_auto(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick_auto(monkeypatch: pytest.MonkeyPatch, no_processes: None) -> None:
     """Method ``auto`` with few hypotheses and one round: that it finds poses is tested elsewhere."""
     auto, by_colour = METHODS["auto"], AutoConfig().by_colour
     steps = dataclasses.replace(by_colour.steps, coarse_steps=1, coarse_rays=32, fine_steps=1, fine_rays=64)
@@ -129,8 +128,6 @@ def quick_auto(monkeypatch: pytest.MonkeyPatch) -> None:
         return auto.solve(problem, few, seed)
 
     monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(auto, solve=quick))
-    # Other processes take the real one.
-    monkeypatch.setattr("bidnerf_core.evaluation.trials.registered_names", tuple)
 
 
 def given(page: Path) -> dict[str, Any]:
@@ -312,19 +309,16 @@ def test_tables_follow_their_records(tables: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_site_builds_strictly_and_needs_no_network(tmp_path: Path) -> None:
-    pytest.importorskip("mkdocs", reason="the documentation's tools are not installed")
-    command = [
-        sys.executable,
-        "-m",
-        "mkdocs",
-        "build",
-        "--strict",  # not with --quiet, which drops the warnings before they are counted
-        "--site-dir",
-        str(tmp_path / "site"),
-    ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_site_builds_strictly_and_needs_no_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """In this process, which has imported what the pages describe."""
+    program = pytest.importorskip("mkdocs.__main__", reason="the documentation's tools are not installed")
+    monkeypatch.chdir(ROOT)
+    # Not with --quiet, which drops the warnings before they are counted.
+    with pytest.raises(SystemExit) as ended:
+        program.cli(["build", "--strict", "--site-dir", str(tmp_path / "site")])
+    assert ended.value.code == 0, capfd.readouterr()
     pages = list((tmp_path / "site").rglob("*.html"))
     assert len(pages) >= len(PAGES)
     fetched = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=\"?(?:https?:)?//[^\s\">]+")

@@ -9,6 +9,7 @@ import sys
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -98,23 +99,51 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return site
 
 
-PROGRAM = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
+FAULTS = {
+    "broken": ["stranger_broken:backend", "stranger-broken 1.0", "RuntimeError", "no driver"],
+    "lacking": ["stranger_lacking:bakend", "stranger-lacking 1.0", "no attribute 'bakend'"],
+    "odd": ["stranger_odd:backend", "stranger-odd 1.0", "not a backend"],
+    "twice": ["stranger-one 1.0", "stranger-two 4.0", "uninstall one"],
+    "hashgrid": ["bidnerf", "stranger-thief 1.0", "uninstall one"],
+}
+COMMANDS = {
+    "json": ["backends", "--json"],
+    "text": ["backends"],
+    **{name: ["train", "nowhere", "--backend", name, "--out", "map"] for name in (*FAULTS, "renewed")},
+}
+PROGRAM = """
+import contextlib, io, json, pathlib, sys
+from bidnerf_core.cli import main
+site, told = pathlib.Path(sys.argv[1]), {}
+for name, words in json.loads(sys.argv[2]).items():
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        status = main(words)
+    imported = [path.stem for path in site.glob("*.imported")]
+    told[name] = {"status": status, "out": out.getvalue(), "err": err.getvalue(), "imported": imported}
+print(json.dumps(told))
+"""
+Told = dict[str, dict[str, Any]]
 
 
-def bidnerf(site: Path, *words: str, program: str = PROGRAM) -> subprocess.CompletedProcess[str]:
+@pytest.fixture(scope="module")
+def told(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
+    """What each command says where the plugins are installed, and which of these are imported after it. One process runs all."""
     behind = next(site.parent.glob("behind*"))
     path = [str(site), str(behind), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return subprocess.run(
-        [sys.executable, "-c", program, *words], env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, site, json.dumps(COMMANDS)], cwd=tmp_path_factory.mktemp("empty"),
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path)}, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        check=False,
     )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    return dict(json.loads(done.stdout))
 
 
-def test_the_healthy_are_listed_the_broken_marked_and_none_imported(site: Path) -> None:
-    done = bidnerf(site, "backends", "--json")
-    assert done.returncode == 0, done.stderr
+def test_the_healthy_are_listed_the_broken_marked_and_none_imported(told: Told) -> None:
+    done = told["json"]
+    assert done["status"] == 0, done["err"]
     found: dict[str, list[dict[str, str | None]]] = {}
-    for entry in json.loads(done.stdout):
+    for entry in json.loads(done["out"]):
         found.setdefault(entry["name"], []).append(entry)
     assert [e["fault"] for e in found["vanilla"]] == [None]
     (sound,) = found["sound"]
@@ -132,36 +161,18 @@ def test_the_healthy_are_listed_the_broken_marked_and_none_imported(site: Path) 
     (renewed,) = found["renewed"]
     assert (renewed["version"], renewed["fault"]) == ("2.0", None)
     assert {"broken", "lacking", "odd"} <= found.keys()  # nothing but an import can tell
-    assert not list(site.glob("*.imported"))
-    assert bidnerf(site, "backends").returncode == 0
+    assert told["text"]["status"] == 0
+    assert (done["imported"], told["text"]["imported"]) == ([], [])
 
 
-FAULTS = {
-    "broken": ["stranger_broken:backend", "stranger-broken 1.0", "RuntimeError", "no driver"],
-    "lacking": ["stranger_lacking:bakend", "stranger-lacking 1.0", "no attribute 'bakend'"],
-    "odd": ["stranger_odd:backend", "stranger-odd 1.0", "not a backend"],
-    "twice": ["stranger-one 1.0", "stranger-two 4.0", "uninstall one"],
-    "hashgrid": ["bidnerf", "stranger-thief 1.0", "uninstall one"],
-}
-ASK_EACH = """
-import sys
-from bidnerf_core.cli import main
-for name in sys.argv[1:]:
-    print(main(["train", "nowhere", "--backend", name, "--out", "map"]))
-"""
-
-
-def test_a_fault_is_told_in_one_line_when_that_backend_is_asked_for(site: Path) -> None:
-    """One process asks for all of them."""
-    done = bidnerf(site, *FAULTS, program=ASK_EACH)
-    assert done.stdout.split() == ["1"] * len(FAULTS), done.stderr
-    lines = done.stderr.splitlines()
-    assert len(lines) == len(FAULTS)
-    for line, (name, parts) in zip(lines, FAULTS.items(), strict=True):
+def test_a_fault_is_told_in_one_line_when_that_backend_is_asked_for(told: Told) -> None:
+    for name, parts in FAULTS.items():
+        assert (told[name]["status"], told[name]["err"].count("\n")) == (1, 1), told[name]
         for part in [f"'{name}'", *parts]:
-            assert part in line
+            assert part in told[name]["err"]
 
 
-def test_of_two_versions_the_one_that_import_would_take_is_loaded(site: Path) -> None:
-    done = bidnerf(site, "train", "nowhere", "--backend", "renewed", "--out", str(site / "map"))
-    assert "nowhere: no such folder" in done.stderr  # it was loaded, and then there was no data
+def test_of_two_versions_the_one_that_import_would_take_is_loaded(told: Told) -> None:
+    # It was loaded, and then there was no data.
+    assert "nowhere: no such folder" in told["renewed"]["err"]
+    assert "stranger_renewed" in told["renewed"]["imported"]
