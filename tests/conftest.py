@@ -143,6 +143,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A comparison tries every map in this process: each of its own would spend seconds on importing PyTorch."""
+    # Inside: what a process of a comparison does is done in this one
     from bidnerf_core.evaluation.workers import measured
 
     here = nullcontext(SimpleNamespace(run=measured))

@@ -14,11 +14,12 @@ ROOT = Path(__file__).parents[2]
 CORE = ROOT / "bidnerf_core"
 PACKAGES = sorted(face.parent.name for face in CORE.glob("*/__init__.py"))
 OUTSIDE = ("backends", "plugins", "benchmarks", "examples", "docs", "tests")
-REASON = re.compile(r"^# Inside: .{10,}", re.MULTILINE)
+REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 """How a test file says why it needs parts that its package does not offer."""
 
 EXCEPTIONS = {
     "benchmarks/paper_tables.py": "shows the progress of the command line",
+    "tests/conftest.py": "does in this process what a process of a comparison does",
     "tests/captures/test_moving_captures.py": "a capture that moved makes motions likelier in the queries of its map",
     "tests/fields/test_hits.py": "the derivatives of a solver through the layers of a field that only these tests have",
     "tests/frames/test_masks.py": "hides pixels from everything that reads them, in whichever package",
