@@ -266,23 +266,27 @@ def _matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector[..., None])[..., 0]
 
 
-def pose_from_matrix(matrix: Float[Tensor, "..."], what: str) -> SE3:
+def pose_from_matrix(matrix: Float[Tensor, "..."], what: str, where: object = None) -> SE3:
     """Convert a row-major homogeneous 4x4 matrix to T_world_camera.
 
-    Raises ``InputError``, whose message begins with ``what``, unless it is 4x4, ends in 0 0 0 1 and has an
-    orthonormal rotation.
+    Raises ``InputError``, whose message begins with ``where``, if it is given, and ``what``, unless it is 4x4,
+    ends in 0 0 0 1 and has an orthonormal rotation.
     """
     if matrix.shape != (4, 4):
-        raise InputError(f"{what} has shape {tuple(matrix.shape)}", expected="a 4x4 matrix T_world_camera")
+        raise InputError(
+            f"{what} has shape {tuple(matrix.shape)}", where=where, expected="a 4x4 matrix T_world_camera"
+        )
     last = matrix[3].tolist()
     if not _is_last_row(last):
         transposed = _is_last_row(matrix[:, 3].tolist())
         hint = "; its last column is, so the matrix is column-major: transpose it" if transposed else ""
-        raise InputError(f"{what} has the last row {last}", expected=f"[0, 0, 0, 1]{hint}")
+        raise InputError(f"{what} has the last row {last}", where=where, expected=f"[0, 0, 0, 1]{hint}")
     pose = SE3.from_matrix(matrix.to(torch.float64))
     if not bool(pose.is_rigid()):
         raise InputError(
-            f"{what} is not a rigid transform", expected="an orthonormal rotation of determinant 1"
+            f"{what} is not a rigid transform",
+            where=where,
+            expected="an orthonormal rotation of determinant 1",
         )
     return pose.normalized()
 

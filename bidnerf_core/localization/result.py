@@ -143,9 +143,8 @@ class Localization:
         saved = from_plain(_Saved, dict(read_record(Path(path)).values), where)
         if saved.T_world_camera is None:
             raise InputError("T_world_camera is null", where=where, expected="a finite pose")
-        T = pose_from_matrix(
-            _matrix(saved.T_world_camera, 4, "T_world_camera", where), f"{where}: T_world_camera"
-        )
+        rows = _matrix(saved.T_world_camera, 4, "T_world_camera", where)
+        T = pose_from_matrix(rows, "T_world_camera", where)
         covariance = None if saved.covariance is None else _matrix(saved.covariance, 6, "covariance", where)
         try:
             outcome = Outcome(saved.outcome)

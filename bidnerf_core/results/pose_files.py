@@ -269,7 +269,7 @@ def _pose(where: str, rows: Any, expected: str) -> SE3:
         matrix = torch.tensor(rows, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError("contains no matrix of numbers", where=where, expected=expected) from error
-    return pose_from_matrix(matrix, f"{where}: T_world_camera")
+    return pose_from_matrix(matrix, "T_world_camera", where)
 
 
 def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:

@@ -106,6 +106,6 @@ def _posed(entry: dict[str, Any], path: Path) -> _Posed:
     unit = entry.get("unit")
     finite = sigma is not None and math.isfinite(sigma)
     return _Posed(
-        pose_from_matrix(rows, f"{path}: T_world_camera"), str(entry.get("frame", "")), time,
+        pose_from_matrix(rows, "T_world_camera", path), str(entry.get("frame", "")), time,
         sigma if finite else None, str(entry.get("outcome", "")), unit if isinstance(unit, str) else None,
     )  # fmt: skip
