@@ -7,6 +7,7 @@ import json
 import signal
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,10 @@ import bidnerf_core as bn
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
+
+# Inside: counts how often a map is opened for its trials, and lets processes outlive an evaluation
 from bidnerf_core.evaluation import ResultTable, TrialResult, opened, read_results
+from bidnerf_core.evaluation.workers import InThisProcess, local_processes
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.scenes import closed_form_data, closed_form_map
@@ -35,6 +39,8 @@ QUICK: dict[str, Any] = {
 COMPARED = {name: value for name, value in QUICK.items() if name != "sizes"}
 WORDS = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--size", "0.3", "--workers", "1"]
 BLOBS = "demo:blobs"
+
+pytestmark = pytest.mark.usefixtures("quick_trials")
 
 
 def timeless(rows: Any) -> list[TrialResult]:
@@ -86,6 +92,7 @@ def test_a_table_has_what_the_command_writes(
     assert placeless(bn.evaluate(loaded, dataset.views("test"), **given).rows) == placeless(table.rows)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = bn.evaluate(BLOBS, BLOBS, trials=4, **QUICK)
     (row,) = table.summary
@@ -129,18 +136,29 @@ def test_results_of_another_map_in_memory_are_not_taken_for_its_own(tmp_path: Pa
 def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_installed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """One other process answers for all: each of its own would import PyTorch anew."""
     monkeypatch.setattr("bidnerf_core.registry.registered", {})
     mine = dataclasses.replace(find_method("bid"), summary="mine")
     bn.register("methods", "bid", mine, replace=True)
     bn.register("methods", "unused", mine)
     said = "method 'bid' was registered in one process but is unknown in another"
-    with refused(found=said):
-        bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **QUICK)
+    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=1, **QUICK).rows) == 2
+    with local_processes(2) as pool:
+
+        class Lasting(InThisProcess):
+            """The pool, which the end of an evaluation does not end and one process serves."""
+
+            def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+                future = pool.submit(fn, *args, **kwargs)
+                wait([future])
+                return future
+
+        monkeypatch.setattr("bidnerf_core.evaluation.workers.local_processes", lambda count: Lasting())
+        with refused(found=said):
+            bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **QUICK)
+        assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **{**QUICK, "method": "inerf"}).rows) == 2
     with refused(found=said):
         bn.compare([BLOBS], BLOBS, trials=1, method="bid", config=QUICK["config"])
-    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=1, **QUICK).rows) == 2
-    other = {**QUICK, "method": "bid-lm", "config": {}, "sizes": [0.1]}
-    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **other).rows) == 2
 
 
 def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,7 +337,10 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_maps_in_memory_and_in_folders_are_compared(shared: Path, tmp_path: Path) -> None:
+def test_maps_in_memory_and_in_folders_are_compared(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()  # the process of a map in a folder judges as usual
     given = {"trials": 2, "method": "bid", "config": QUICK["config"], "protocol": "bid", "size": 0.3}
     scene, data = bn.load_map(shared / "map"), shared / "data"
     seen: list[str] = []

@@ -66,21 +66,12 @@ class Reply:
 
 
 class Service:
-    """An application in an event loop of its own, asked as a server would."""
+    """An application that is served in an event loop, asked without HTTP as its server would."""
 
-    def __init__(self, app: Any) -> None:
-        self.app, self.loop = app, asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self.loop.run_forever, daemon=True)
-        self._thread.start()
-        self._life = app.router.lifespan_context(app)
-        self.run(self._life.__aenter__())
+    def __init__(self, app: Any, loop: asyncio.AbstractEventLoop) -> None:
+        self.app, self.loop = app, loop
         self.pool: Pool = app.state.pool
         self.said = description(list(self.pool.described), self.pool.limits)
-
-    def close(self) -> None:
-        self.run(self._life.__aexit__(None, None, None))
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self._thread.join()
 
     def gauge(self, name: str) -> float:
         """A number that the service tells of itself now."""
@@ -167,14 +158,54 @@ def place(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Place:
     return Place(folder, (folder / "photo.png").read_bytes(), json.dumps(pose).replace(" ", ""))
 
 
+@dataclass(frozen=True)
+class Served:
+    service: Service
+    address: tuple[str, int]
+
+
 @pytest.fixture(scope="module")
-def service(place: Place) -> Iterator[Service]:
+def served(place: Place) -> Iterator[Served]:
+    """One service for all tests, on a port of its own: its start takes seconds."""
+    ready, stop, told, made = threading.Event(), threading.Event(), [], []
     maps = [place.folder / "map", place.folder / "hall"]
+
+    def tell(url: str, token: str | None) -> None:
+        told.extend([url, token, asyncio.get_running_loop()])
+        ready.set()
+
+    def kept(*given: Any, **more: Any) -> Any:
+        made.append(service_app(*given, **more))
+        return made[-1]
+
+    options: Any = {"port": 0, "limits": LIMITS, "method": "bid", "config": QUICK}
+    options |= {"ready": tell, "stop": stop}
+    running = threading.Thread(target=serve, args=[maps], kwargs=options)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(place.folder / "uploads"))
-        running = Service(service_app(maps, limits=LIMITS, method="bid", config=QUICK))
-    yield running
-    running.close()
+        patch.setattr("bidnerf_core.service.server.service_app", kept)
+        running.start()
+        started = ready.wait(60)
+    try:
+        assert started
+        assert told[1] is None  # this machine only needs no token
+        parts = urlsplit(told[0])
+        yield Served(Service(made[0], told[2]), (str(parts.hostname), int(parts.port or 0)))
+    finally:
+        stop.set()
+        running.join(30)
+    with pytest.raises(ServiceError, match="refused"):
+        ServiceClient(told[0]).ask("/maps")
+
+
+@pytest.fixture(scope="module")
+def service(served: Served) -> Service:
+    return served.service
+
+
+@pytest.fixture(scope="module")
+def address(served: Served) -> tuple[str, int]:
+    return served.address
 
 
 def form(**parts: bytes | str) -> bytes:
@@ -462,34 +493,9 @@ def test_every_path_is_described(service: Service) -> None:
     assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
 
 
-@pytest.fixture(scope="module")
-def address(place: Place) -> Iterator[tuple[str, int]]:
-    """A service on a port of its own."""
-    ready, stop, told = threading.Event(), threading.Event(), []
-
-    def tell(url: str, token: str | None) -> None:
-        told.extend([url, token])
-        ready.set()
-
-    options: Any = {"port": 0, "limits": LIMITS, "method": "bid", "config": QUICK}
-    options |= {"ready": tell, "stop": stop}
-    running = threading.Thread(target=serve, args=[place.folder / "map"], kwargs=options)
-    running.start()
-    try:
-        assert ready.wait(60)
-        assert told[1] is None  # this machine only needs no token
-        parts = urlsplit(told[0])
-        yield str(parts.hostname), int(parts.port or 0)
-    finally:
-        stop.set()
-        running.join(30)
-    with pytest.raises(ServiceError, match="refused"):
-        ServiceClient(told[0]).ask("/maps")
-
-
 def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> None:
     client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
-    found = client.localize(place.folder / "photo.png", focal=32, start=json.loads(place.start))
+    found = client.localize(place.folder / "photo.png", map="map", focal=32, start=json.loads(place.start))
     assert (found["frame"], found["method"]) == ("photo", "bid")
     with pytest.raises(ServiceError, match="no map with that name") as refused:
         client.localize(place.photo, map="other")
@@ -509,7 +515,7 @@ def spoken(address: tuple[str, int], content: bytes) -> bytes:
 
 
 def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, int]) -> None:
-    drawn, body = random.Random(1), form(photo=place.photo, focal="32", start=place.start)
+    drawn, body = random.Random(1), form(photo=place.photo, focal="32", start=place.start, map="map")
     head = f"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: {FORM}\r\nConnection: close\r\n"
     statuses = set()
     for number in range(150):
@@ -556,11 +562,11 @@ def test_a_body_without_end_and_a_client_without_haste_are_cut_off(
     assert time.monotonic() - began < 10
     for _ in range(5):  # clients that leave before the answer
         with socket.create_connection(address, timeout=20) as connection:
-            body = form(photo=place.photo, focal="32", start=place.start)
+            body = form(photo=place.photo, focal="32", start=place.start, map="map")
             kind = f"Content-Type: {FORM}\r\nContent-Length: {len(body)}\r\n\r\n".encode()
             connection.sendall(head + kind + body)
     client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
-    assert client.localize(place.photo, focal=32, start=json.loads(place.start))["method"] == "bid"
+    assert client.localize(place.photo, map="map", focal=32, start=json.loads(place.start))["method"] == "bid"
     quickly(lambda: client.ask("/health")["waiting"] == 0)
 
 
@@ -628,4 +634,9 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     with pytest.raises(InputError, match="timeout is 0"):
         ServiceLimits(timeout=0)
     assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
+
+
+@pytest.mark.slow
+def test_a_folder_without_a_map_is_refused(place: Place, bidnerf: Run) -> None:
+    """By the process that would hold the maps."""
     assert_refused(bidnerf("serve", place.folder / "data"), 1, place.folder / "data", "no map.json")
