@@ -1,13 +1,13 @@
 from .box_tree import level_sizes as level_sizes
 from .box_tree import tree_of as tree_of
+from .contract import LARGEST_LENGTH as LARGEST_LENGTH
 from .contract import FieldValues as FieldValues
 from .contract import HitField as HitField
-from .contract import LARGEST_LENGTH as LARGEST_LENGTH
 from .contract import RadianceField as RadianceField
 from .contract import RayHits as RayHits
+from .contract import Rays as Rays
 from .contract import RaySampler as RaySampler
 from .contract import RaySamples as RaySamples
-from .contract import Rays as Rays
 from .contract import SceneBounds as SceneBounds
 from .contract import SplatField as SplatField
 from .contract import Splats as Splats
