@@ -21,6 +21,7 @@ from .queries import QuerySource as QuerySource
 from .queries import depth_files as depth_files
 from .queries import photo_files as photo_files
 from .reader import READERS as READERS
+from .reader import Background as Background
 from .reader import DepthCamera as DepthCamera
 from .reader import DepthRegistration as DepthRegistration
 from .reader import Reader as Reader

@@ -14,7 +14,8 @@ from bidnerf_core.datasets.sequence import FrameSequence, sequence_of
 from bidnerf_core.depth import FARTHEST
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
 from bidnerf_core.errors import InputError, InputWarning, enumeration
-from bidnerf_core.io import IMAGE_SUFFIXES, Background
+from bidnerf_core.io import IMAGE_SUFFIXES
+from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
@@ -95,7 +96,7 @@ def test_in_known_shapes_the_same_is_seen(
     expected = render(field, along)
     points = rays(50, 5).at(torch.full((50, 1), 3.0))[:, 0]
     density = field.query(points, along.directions[:50])
-    monkeypatch.setattr("bidnerf_core.fields.met_pieces.may_wait", lambda device: False)
+    monkeypatch.setattr(import_module("bidnerf_core.fields.met_pieces"), "may_wait", lambda device: False)
     with without_waiting():
         found = render(field, along)
         again = field.query(points, along.directions[:50])
