@@ -641,5 +641,5 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
 
 @pytest.mark.slow
 def test_a_folder_without_a_map_is_refused(place: Place, bidnerf: Run) -> None:
-    """By the process that would hold the maps."""
+    """The process that would hold the maps refuses it, and the command prints its line."""
     assert_refused(bidnerf("serve", place.folder / "data"), 1, place.folder / "data", "no map.json")
