@@ -12,10 +12,10 @@ from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.depth import DepthNoise
 
 # Inside: estimates of noise and steps are compared with the true values, of which users see a remark
-from bidnerf_core.depth.noise import DepthSteps, depth_steps, estimated_depth_noise
+from bidnerf_core.depth import DepthNoise, depth_steps, estimated_depth_noise
+from bidnerf_core.depth.noise import DepthSteps
 from bidnerf_core.depth.sensors import KINECT
 
 CAMERA = Intrinsics.from_hfov(60.0, 320, 240)

@@ -23,8 +23,8 @@ from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 
 # Inside: counts how often a map is opened for its trials, and lets processes outlive an evaluation
-from bidnerf_core.evaluation import ResultTable, TrialResult, opened, read_results
-from bidnerf_core.evaluation.workers import InThisProcess, local_processes
+from bidnerf_core.evaluation import ResultTable, TrialResult, local_processes, opened, read_results
+from bidnerf_core.evaluation.workers import InThisProcess
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.scenes import closed_form_data, closed_form_map
