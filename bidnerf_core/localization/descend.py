@@ -1,0 +1,83 @@
+"""Levenberg-Marquardt for h hypotheses at once: damping and acceptance are tensors, so an accelerator's host need not wait."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.localization.states import P, States
+
+SETTLED = 0.01
+"""Predicted decrease of the cost below which a hypothesis has converged."""
+FIRST_DAMPING, WHEN_BETTER, WHEN_WORSE = 1e-3, 1 / 5, 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """A cost (a negative log likelihood) with its gradient and Gauss-Newton Hessian, for h states."""
+
+    cost: Float[Tensor, "h"]
+    gradient: Float[Tensor, "h P"]
+    hessian: Float[Tensor, "h P P"]
+
+    def __add__(self, other: Normal) -> Normal:
+        return Normal(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
+
+    def where(self, mask: Bool[Tensor, "h"], other: Normal) -> Normal:
+        return Normal(
+            torch.where(mask, self.cost, other.cost), torch.where(mask[:, None], self.gradient, other.gradient),
+            torch.where(mask[:, None, None], self.hessian, other.hessian),
+        )  # fmt: skip
+
+
+Term = Callable[[States], Normal]
+"""Evaluates one kind of measurement at h states."""
+
+
+def prior(states: States) -> Normal:
+    """Return the standard normal prior of the nuisances; that of the pose is flat."""
+    z = states.z
+    eye = torch.eye(P, dtype=z.dtype, device=z.device)
+    eye[:6] = 0
+    return Normal(
+        0.5 * z.square().sum(-1), torch.cat([z.new_zeros(len(z), 6), z], -1), eye.expand(len(z), P, P)
+    )
+
+
+def total(states: States, terms: Sequence[Term]) -> Normal:
+    return sum((term(states) for term in terms), start=prior(states))
+
+
+def descend(states: States, terms: Sequence[Term], steps: int) -> tuple[States, Normal]:
+    """Minimize the sum of ``terms`` and the prior from each state; a step that does not lower the sum is not taken."""
+    here = total(states, terms)
+    damping = torch.full_like(here.cost, FIRST_DAMPING)
+    for _ in range(steps):
+        step = damped_solution(here, damping)
+        if step.device.type == "cpu" and bool(((step * here.gradient).sum(-1) < SETTLED).all()):
+            break  # where the host need not wait for this
+        moved = states.retract(-step)
+        there = total(moved, terms)
+        better = there.cost < here.cost  # false for NaN
+        states, here = moved.where(better, states), there.where(better, here)
+        damping = torch.where(better, damping * WHEN_BETTER, damping * WHEN_WORSE)
+    return states, here
+
+
+def damped_solution(normal: Normal, damping: Float[Tensor, "h"]) -> Float[Tensor, "h P"]:
+    diagonal = normal.hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
+    factor, _ = torch.linalg.cholesky_ex(
+        normal.hessian + torch.diag_embed((damping[:, None] + 1e-12) * diagonal)
+    )
+    return torch.cholesky_solve(normal.gradient[..., None], factor)[..., 0]
+
+
+def log_det(hessian: Float[Tensor, "h p p"]) -> Float[Tensor, "h"]:
+    """Return the log determinants of positive matrices, infinite for others."""
+    factor, info = torch.linalg.cholesky_ex(hessian)
+    found = 2 * factor.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).log().sum(-1)
+    return torch.where(info == 0, found, torch.inf)

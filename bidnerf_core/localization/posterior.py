@@ -1,0 +1,169 @@
+"""The posterior of the explanations of one query: probabilities by Laplace's approximation, and the pose as their mixture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.descend import Normal, log_det
+from bidnerf_core.localization.states import P, States
+from bidnerf_core.localization.terms.landmarks import Landmarks
+
+BY_SHARE = 10.0
+"""Log odds per factor e between the evidence for two places: it is not proportional to the number of matches, since the right
+place rarely has fewer than two thirds as many as another."""
+LEAST_DOUBT = 0.005
+"""Standard deviation of a camera's parameters that no photo rules out: lenses move with focus and image stabilisers."""
+LEAST_CURVATURE = 0.2
+"""Smallest curvature, relative to the reweighted Hessian."""
+DRAWS = 256
+"""Draws of the pose from each explanation's Gaussian, with which the probability mass within a tolerance is integrated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The explanations (h) with their probabilities; poses are right updates of that of the most probable one."""
+
+    states: States
+    normal: Normal
+    probability: Float[Tensor, "h"]
+    covariance: Float[Tensor, "h 6 6"]  # of the pose under each
+    update: Float[Tensor, "h 6"]  # from the pose of the most probable explanation
+    by_mode: Float[Tensor, "g"]  # evidence for each mode, relative to outliers alone
+    best: int
+
+    @staticmethod
+    def of(
+        states: States,
+        normal: Normal,
+        landmarks: Landmarks,
+        parents: Int[Tensor, "g"],
+        scatter: Float[Tensor, "4"],
+        systematic: Float[Tensor, "h P P"] | float = 0.0,
+    ) -> Posterior:
+        """Compare explanations within a mode by their cost, and modes by the evidence of landmarks; ``parents`` are the modes
+        whose matches each mode shares.
+        """
+        log = states.log_prior - normal.cost - 0.5 * log_det(normal.hessian)
+        log = torch.where(log.isfinite(), log, -torch.inf)
+        member = states.mode[None] == torch.arange(len(parents), device=log.device)[:, None]
+        within = torch.where(member, log[None], -torch.inf)
+        norm = within.logsumexp(-1)
+        evidence = landmarks.evidence(states)
+        by_mode = (torch.where(member, (within - norm[:, None]).exp(), 0).nan_to_num(0.0) * evidence).sum(-1)
+        # Modes with the same matches are compared as any explanations are, others by their numbers of matches.
+        weight = BY_SHARE * by_mode[parents].clamp(min=1e-3).log() + norm - norm[parents]
+        log = log - norm[states.mode] + weight[states.mode]
+        probability = log.nan_to_num(-torch.inf).softmax(0)
+        best = int(probability.argmax())  # host
+        states, covariance = _true_cameras(
+            states, normal, robust_covariance(states, normal, landmarks, systematic), scatter
+        )
+        anchor = states.T[best]
+        return Posterior(
+            states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), by_mode, best
+        )
+
+    @property
+    def mode(self) -> int:
+        return int(self.states.mode[self.best])
+
+    @property
+    def _own(self) -> Float[Tensor, "h"]:
+        """Probabilities given the most probable mode."""
+        own = self.probability * (self.states.mode == self.mode)
+        return own / own.sum()
+
+    @property
+    def mean(self) -> Float[Tensor, "6"]:
+        """The update to the mean pose of the most probable mode."""
+        return (self._own[:, None] * self.update).sum(0)
+
+    def pose(self) -> SE3:
+        return self.states.T[self.best].retract(self.mean)
+
+    def mixture(self) -> Float[Tensor, "6 6"]:
+        """Return the covariance of the pose over the most probable mode."""
+        off = self.update - self.mean
+        spread = self.covariance + off[:, :, None] * off[:, None]
+        own = self._own
+        return torch.where(own[:, None, None] > 1e-12, own[:, None, None] * spread, 0).sum(0)
+
+    def mass(
+        self,
+        distance: float,
+        shared: Float[Tensor, "6 6"],
+        tolerance: float,
+        angle: float,
+        credible: Bool[Tensor, "h"],
+    ) -> float:
+        """Return the probability that the pose is within ``tolerance`` (relative to ``distance``) and ``angle`` (radians), and
+        right under an explanation that is ``credible``.
+        """
+        draws = torch.distributions.Normal(0.0, 1.0).icdf(
+            torch.quasirandom.SobolEngine(6, scramble=True, seed=0).draw(DRAWS).double().clamp(1e-6, 1 - 1e-6)
+        )
+        covariance = self.covariance + shared
+        sane = covariance.isfinite().all(-1).all(-1)
+        factor, info = torch.linalg.cholesky_ex(
+            torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
+        )
+        off = (self.update - self.mean)[:, None] + draws @ factor.mT
+        inside = (off[..., :3].norm(dim=-1) <= tolerance * distance) & (off[..., 3:].norm(dim=-1) <= angle)
+        return float(
+            (self.probability * inside.double().mean(-1) * (sane & (info == 0) & credible)).sum()
+        )  # host
+
+
+def robust_covariance(
+    states: States, normal: Normal, landmarks: Landmarks, systematic: Float[Tensor, "h P P"] | float
+) -> Float[Tensor, "h P P"]:
+    """Return the covariance of the unknowns: that of an M-estimator for landmarks, and of a Gaussian likelihood for all else."""
+    hessian, curvature, scatter = landmarks.sandwich(states)
+    rest = normal.hessian - hessian * (landmarks.share * landmarks.correlation)[states.mode][:, None, None]
+    unit = (hessian + rest).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    scatter = scatter + systematic
+    hessian, curvature, scatter = (
+        unit[..., None] * (x + rest) * unit[..., None, :] for x in (hessian, curvature, scatter)
+    )
+    factor, info = torch.linalg.cholesky_ex(
+        hessian + 1e-12 * torch.eye(P, dtype=hessian.dtype, device=hessian.device)
+    )
+    half = torch.linalg.solve_triangular(factor, curvature, upper=False)
+    values, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(factor, half.mT, upper=False))
+    # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
+    basis = (
+        torch.linalg.solve_triangular(factor.mT, vectors, upper=True)
+        / values.clamp(min=LEAST_CURVATURE)[:, None]
+    )
+    bread = basis @ torch.linalg.solve_triangular(factor.mT, vectors, upper=True).mT
+    found = unit[..., None] * (bread @ scatter @ bread.mT) * unit[..., None, :]
+    return torch.where((info == 0)[:, None, None], found, torch.inf)
+
+
+def _true_cameras(
+    states: States, normal: Normal, covariance: Float[Tensor, "h P P"], scatter: Float[Tensor, "4"]
+) -> tuple[States, Float[Tensor, "h 6 6"]]:
+    """Return the states with the most probable true cameras, and the covariance of their poses.
+
+    The apparent camera is the true one plus a spurious part of standard deviation ``scatter``, by errors of the landmarks. The pose
+    follows the true one: it is linear in the camera with the rest eliminated.
+    """
+    H = normal.hessian
+    apparent = states.deviation[:, :4].square()  # = prior + scatter^2
+    prior = (apparent - scatter.square()).clamp(min=0)
+    share, doubt = torch.ones_like(states.z), torch.zeros_like(states.z)
+    share[:, :4] = prior / apparent.clamp(min=1e-24)
+    least = prior.clamp(min=LEAST_DOUBT**2)
+    doubt[:, :4] = least * scatter.square() / (least + scatter.square()) / apparent.clamp(min=1e-24)
+    follows = -torch.linalg.solve_ex(H[:, :6, :6], H[:, :6, 6:])[0]  # (h 6 N) by the whitened nuisances
+    step = (share - 1) * states.z
+    eye = torch.eye(6, dtype=H.dtype, device=H.device).expand(len(H), 6, 6)
+    linear = torch.cat([eye, follows * (share - 1)[:, None]], -1)
+    pose = linear @ covariance @ linear.mT + (follows * doubt[:, None]) @ follows.mT
+    moved = states.retract(torch.cat([(follows @ step[..., None])[..., 0], step], -1))
+    return moved, (pose + pose.mT) / 2

@@ -1,0 +1,129 @@
+"""Proposals: poses from which to refine, the cheapest first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import poselib
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.explanations import Seed, cameras_of_map
+from bidnerf_core.localization.matching import Matches, log10_nfa
+from bidnerf_core.localization.query import Query
+from bidnerf_core.localization.states import N, States, rays_through
+from bidnerf_core.mapping import LandmarkMap
+
+LADDER = (-0.35, 0.35, -0.7, 0.7)
+"""Logarithms of the focal lengths, relative to the stated one, that are tried if it gives no consensus."""
+CONVINCING = -20.0
+"""Log10 of the number of false alarms below which no other camera is tried."""
+SUCCESS = 0.9999
+"""RANSAC stops once a sample without outliers has been drawn with this probability."""
+LEAST_DRAWS, MOST_DRAWS = 50, 5_000
+LEAST_AGREEING = 6
+"""Least number of matches that agree on a pose."""
+
+
+def best_consensus(query: Query, landmarks: LandmarkMap, matches: Matches) -> tuple[Seed, float] | None:
+    """Return the seed with the fewest false alarms, over the stated camera, the map's and a ladder of focal lengths."""
+    best = None
+    for camera in cameras(query, landmarks):
+        found = consensus(query, landmarks, matches, camera)
+        if found is not None and (best is None or found[1] < best[1]):
+            best = found
+        if best is not None and best[1] < CONVINCING:
+            break
+    return best
+
+
+def cameras(query: Query, landmarks: LandmarkMap) -> Iterator[Float[Tensor, "6"]]:
+    """Yield the cameras to try: the stated one, the map's, and others with the principal point in the middle."""
+    yield torch.zeros(6, dtype=torch.float64)
+    yield from cameras_of_map(query, landmarks)
+    if not query.has_one_camera:
+        return
+    c = query.camera
+    for log_focal in LADDER:
+        middle = [log_focal, (c.width / 2 - c.cx) / c.fx, (c.height / 2 - c.cy) / c.fy]
+        yield torch.tensor([*middle, 0.0, 0.0, 0.0], dtype=torch.float64)
+
+
+def consensus(
+    query: Query,
+    landmarks: LandmarkMap,
+    matches: Matches,
+    camera: Float[Tensor, "6"],
+    name: str = "landmarks",
+) -> tuple[Seed, float] | None:
+    """Return the pose with the most inliers by a given camera, with log10 of its false alarms; None if too few agree.
+
+    The solvers are poselib's in LO-RANSAC with progressive sampling: P3P for each image (Persson and Nordberg 2018) and, for a rig,
+    the generalized P3P (Kukelova et al. 2016) besides, as that is unstable if the camera centres almost coincide.
+    """
+    still = States.known(SE3.identity(), camera)
+    flat = query.sights.image[matches.keypoint]
+    flat = rays_through(still, flat)[0, :, :2] if bool(camera.any()) else flat
+    focal = query.focal[matches.keypoint] * math.exp(float(camera[0]))
+    points, view = landmarks.positions[matches.landmark].double(), query.view[matches.keypoint]
+    parts = [
+        part for part in ((view == v).nonzero()[:, 0] for v in range(len(query.images))) if len(part) >= 4
+    ]
+    options = {
+        "max_reproj_error": query.threshold, "seed": 0, "success_prob": SUCCESS, "progressive_sampling": True,
+        "min_iterations": LEAST_DRAWS, "max_iterations": MOST_DRAWS, "max_prosac_iterations": MOST_DRAWS,
+    }  # fmt: skip
+    found: list[SE3] = []
+    of_view = [image.T_ref_camera for image in query.images]
+    data = [
+        ((flat[p] * focal[p, None]).numpy(), points[p].numpy(), _camera(float(focal[p[0]]))) for p in parts
+    ]  # host
+    for part, (pixels, there, model) in zip(parts, data, strict=True):
+        pose, _ = poselib.estimate_absolute_pose(pixels, there, model, options, {})
+        found.append(_transform(pose).inverse() @ of_view[int(view[part[0]])].inverse())
+    if len(parts) > 1:
+        poses = []
+        for part in parts:
+            T = of_view[int(view[part[0]])].inverse()
+            pose = poselib.CameraPose()
+            pose.R, pose.t = T.rotation.numpy(), T.translation.numpy()
+            poses.append(pose)
+        pixels, there, models = (list(x) for x in zip(*data, strict=True))
+        generalized = options | {"progressive_sampling": False}
+        pose, _ = poselib.estimate_generalized_absolute_pose(pixels, there, poses, models, generalized, {})
+        found.append(_transform(pose).inverse())
+    scored = [
+        (T, inliers(query, landmarks, matches, States.known(T, camera))) for T in found if bool(T.is_rigid())
+    ]
+    if not scored:
+        return None
+    T, agreeing = max(scored, key=lambda pair: int(pair[1].sum()))
+    if int(agreeing.sum()) < LEAST_AGREEING:
+        return None
+    distance = float(T.inverse().apply(points[agreeing]).norm(dim=-1).median())
+    nfa = log10_nfa(len(matches), int(agreeing.sum()), query.by_chance)
+    return Seed(name, T, camera, distance), nfa
+
+
+def inliers(query: Query, landmarks: LandmarkMap, matches: Matches, state: States) -> Bool[Tensor, "m"]:
+    """Return a mask of the matches that agree with a state."""
+    from bidnerf_core.localization.states import project
+
+    keypoint = matches.keypoint
+    seen = project(state, landmarks.positions[matches.landmark].double()[None], query.sights[keypoint])
+    off = ((seen.image[0] - query.sights.image[keypoint]) * query.focal[keypoint, None]).norm(dim=-1)
+    return (off <= query.threshold) & seen.front[0]
+
+
+def _camera(focal: float) -> dict[str, object]:
+    """Return poselib's description of a pinhole camera with its principal point at the origin."""
+    return {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+
+
+def _transform(pose: poselib.CameraPose) -> SE3:
+    rotation = torch.from_numpy(np.array(pose.R, dtype=np.float64))
+    return SE3(rotation, torch.from_numpy(np.array(pose.t, dtype=np.float64).reshape(3)))

@@ -1,0 +1,181 @@
+"""The unknowns of a query under h hypotheses at once, and the projection of points with its derivatives.
+
+Shapes: h hypotheses, m points, P = 19 unknowns: the pose (6: translation, rotation; a right update, metres and radians) and the N = 13
+nuisances below. All in float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.geometry import SE3
+
+NUISANCES = (
+    "log_focal",
+    "cx",
+    "cy",
+    "k1",
+    "log_aspect",
+    "skew",
+    *("vx", "vy", "vz", "wx", "wy", "wz"),
+    "log_depth",
+)
+"""Corrections of the stated camera (the principal point as a fraction of the focal length, the aspect fx / fy), the motion
+from the first row of the image to the last (metres, radians), and the scale of measured depth."""
+N, P = len(NUISANCES), 6 + len(NUISANCES)
+CAMERA, MOTION, DEPTH = slice(0, 6), slice(6, 12), 12
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """A pose and nuisances for each of h hypotheses.
+
+    The nuisances are in standard deviations of their prior, ``mean + deviation * z`` with ``z ~ N(0, I)``, so that all priors are
+    alike and a fixed nuisance is one with deviation 0.
+    """
+
+    T: SE3  # T_world_rig (h)
+    z: Float[Tensor, "h N"]
+    mean: Float[Tensor, "h N"]
+    deviation: Float[Tensor, "h N"]
+    log_prior: Float[Tensor, "h"]
+    noise: Float[Tensor, "h"]  # pixels: standard deviation of a keypoint along each axis
+    mode: Int[Tensor, "h"]  # number of the matches (see ``terms.landmarks``) that belong to the hypothesis
+    row: Int[Tensor, "h"]  # number of the explanation (see ``explanations``)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def __getitem__(self, index: Tensor | slice) -> States:
+        return States(self.T[index], *(getattr(self, name)[index] for name in PARTS))
+
+    @property
+    def nuisances(self) -> Float[Tensor, "h N"]:
+        return self.mean + self.deviation * self.z
+
+    def retract(self, step: Float[Tensor, "h P"]) -> States:
+        return replace(self, T=self.T.retract(step[:, :6]).polished(), z=self.z + step[:, 6:])
+
+    def where(self, mask: Bool[Tensor, "h"], other: States) -> States:
+        """Return these poses and nuisances where ``mask`` holds, and the ``other`` ones elsewhere."""
+        R = torch.where(mask[:, None, None], self.T.rotation, other.T.rotation)
+        t = torch.where(mask[:, None], self.T.translation, other.T.translation)
+        return replace(self, T=SE3(R, t), z=torch.where(mask[:, None], self.z, other.z))
+
+    @staticmethod
+    def cat(parts: list[States]) -> States:
+        joined = (torch.cat([getattr(part, name) for part in parts]) for name in PARTS)
+        return States(SE3.cat([part.T for part in parts]), *joined)
+
+    @staticmethod
+    def known(T: SE3, camera: Float[Tensor, "6"]) -> States:
+        """Return the single state of a known camera at rest."""
+        mean = torch.cat([camera, camera.new_zeros(N - len(camera))])[None]
+        zero = torch.zeros_like(mean)
+        number = torch.zeros(1, dtype=torch.long)
+        return States(T[None], zero, mean, zero, zero[:, 0], zero[:, 0] + 1, number, number)
+
+
+PARTS = ("z", "mean", "deviation", "log_prior", "noise", "mode", "row")
+
+
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """Where and when the points of a rig's images were seen; leading axes broadcast against the hypotheses."""
+
+    image: Float[Tensor, "*h m 2"]  # on the plane z = 1 of the stated camera
+    times: Float[Tensor, "*h m"]  # of exposure, as fractions of the readout (-0.5 to 0.5)
+    rotation: Float[Tensor, "*h m 3 3"]  # T_camera_rig
+    translation: Float[Tensor, "*h m 3"]
+
+    def __getitem__(self, index: Tensor) -> Sights:
+        return Sights(self.image[index], self.times[index], self.rotation[index], self.translation[index])
+
+
+@dataclass(frozen=True, eq=False)
+class Projections:
+    """Where h states see m points, on the plane z = 1 of the stated camera."""
+
+    image: Float[Tensor, "h m 2"]
+    local: Float[Tensor, "h m 3"]  # metres, in the frame of the camera when the point's row was exposed
+    flat: Float[Tensor, "h m 2"]  # of the ideal camera
+    front: Bool[Tensor, "h m"]
+
+
+def project(states: States, points: Float[Tensor, "*h m 3"], sights: Sights) -> Projections:
+    """Project world points."""
+    local = (points - states.T.translation[:, None]) @ states.T.rotation
+    local = (sights.rotation @ local[..., None])[..., 0] + sights.translation
+    nuisances, times = states.nuisances, sights.times[..., None]
+    v, w = nuisances[:, None, 6:9], nuisances[:, None, 9:12].expand_as(local)
+    speed = v + torch.linalg.cross(w, local)  # the camera moves by exp(time * motion), to second order
+    local = local - times * speed + 0.5 * times**2 * torch.linalg.cross(w, speed)
+    front = local[..., 2] > 1e-9
+    flat = local[..., :2] / torch.where(front, local[..., 2], 1.0)[..., None]
+    bent = flat * (1 + nuisances[:, None, 3:4] * flat.square().sum(-1, keepdim=True))
+    image = (linear(states)[:, None] @ bent[..., None])[..., 0] + nuisances[:, None, 1:3]
+    return Projections(image, local, flat, front)
+
+
+def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor, "h m 2 P"]:
+    """Return the derivative of ``seen.image`` with respect to the unknowns."""
+    flat, k1, A = seen.flat, states.nuisances[:, None, 3:4], linear(states)[:, None]
+    square = flat.square().sum(-1, keepdim=True)
+    eye = torch.eye(2, dtype=flat.dtype, device=flat.device)
+    bent = flat * (1 + k1 * square)
+    lens = A @ (
+        eye * (1 + k1 * square)[..., None] + 2 * k1[..., None] * flat[..., :, None] * flat[..., None, :]
+    )
+    depth = torch.where(seen.front, seen.local[..., 2], 1.0)
+    by_point = (
+        torch.cat([lens, -lens @ flat[..., None]], -1) / depth[..., None, None]
+    )  # in the camera's frame
+    turning = torch.linalg.cross(by_point, seen.local[..., None, :].expand_as(by_point))
+    by_row = torch.cat([-by_point, turning], -1)  # by a right update of the camera of the row
+    by_point = by_point @ sights.rotation
+    rig = (sights.rotation.mT @ (seen.local - sights.translation)[..., None])[..., 0]
+    by_pose = torch.cat([-by_point, torch.linalg.cross(by_point, rig[..., None, :].expand_as(by_point))], -1)
+    across, down = A[..., 0] * bent[..., :1], A[..., 1] * bent[..., 1:]
+    skewed = torch.cat([bent[..., 1:], torch.zeros_like(bent[..., 1:])], -1)
+    by_camera = torch.stack([
+        across + down - states.nuisances[:, None, 5:6] * skewed, *(e.expand_as(flat) for e in eye),
+        (A @ (flat * square)[..., None])[..., 0], 0.5 * (across - down + states.nuisances[:, None, 5:6] * skewed), skewed,
+    ], -1)  # fmt: skip
+    by_motion = by_row * sights.times[..., None, None]
+    by_nuisance = torch.cat([by_camera, by_motion, torch.zeros_like(by_motion[..., :1])], -1)
+    return torch.cat([by_pose, by_nuisance * states.deviation[:, None, None]], -1)
+
+
+def linear(states: States) -> Float[Tensor, "h 2 2"]:
+    """Return the map from the plane z = 1 of the true camera to that of the stated one, without the shift: ``[[a, s], [0, b]]``."""
+    log_focal, half, skew = (states.nuisances[:, i] for i in (0, 4, 5))
+    a, b = (log_focal + half / 2).exp(), (log_focal - half / 2).exp()
+    return torch.stack([a, skew, torch.zeros_like(a), b], -1).unflatten(-1, (2, 2))
+
+
+def rays_through(states: States, image: Float[Tensor, "m 2"]) -> Float[Tensor, "h m 3"]:
+    """Return the points on the plane z = 1 of the true cameras that appear at ``image`` on that of the stated camera."""
+    nuisances = states.nuisances
+    shifted = (image - nuisances[:, None, 1:3])[..., None]
+    bent = torch.linalg.solve_triangular(linear(states)[:, None], shifted, upper=True)[..., 0]
+    flat = bent
+    for _ in range(4):  # fixed-point iteration as in OpenCV's undistortPoints
+        flat = bent / (1 + nuisances[:, None, 3:4] * flat.square().sum(-1, keepdim=True))
+    return torch.cat([flat, torch.ones_like(flat[..., :1])], -1)
+
+
+def rays_by_camera(rays: Float[Tensor, "h m 3"], states: States) -> Float[Tensor, "h m 3 6"]:
+    """Return the derivative of ``rays_through`` with respect to the camera's (whitened) nuisances, to first order."""
+    flat = rays[..., :2]
+    one, zero = torch.ones_like(flat[..., :1]), torch.zeros_like(flat[..., :1])
+    square = flat.square().sum(-1, keepdim=True)
+    columns = [
+        flat, torch.cat([one, zero], -1), torch.cat([zero, one], -1), flat * square, flat * flat.new_tensor([0.5, -0.5]),
+        torch.cat([flat[..., 1:], zero], -1),
+    ]  # fmt: skip
+    found = -torch.stack(columns, -1) * states.deviation[:, None, None, CAMERA]
+    return torch.cat([found, torch.zeros_like(found[..., :1, :])], -2)

@@ -1,0 +1,147 @@
+"""Reprojection errors of matched landmarks as a log likelihood.
+
+Residuals are those of a Student-t distribution in two dimensions with two degrees of freedom (Cauchy's loss), mixed with outliers that
+are uniform over the image. As neighbouring errors are correlated, a term of n residuals is scaled to the number of independent ones (a
+composite likelihood, Pauli, Racugno and Ventura 2011).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.localization.descend import Normal
+from bidnerf_core.localization.states import Projections, Sights, States, jacobian, project
+from bidnerf_core.mapping import LandmarkMap
+
+MAD = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
+LEAST_NOISE = 0.05
+"""Pixels: no detector is more accurate."""
+SCALE = 2.0
+"""Residual, in standard deviations, at which the weight of a Student-t residual is one half."""
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Reprojection errors of matched landmarks, in pixels; a hypothesis uses the matches of its mode."""
+
+    points: Float[Tensor, "g m 3"]  # metres, world; g modes, padded to m matches
+    sights: Sights  # (g m)
+    valid: Float[Tensor, "g m"]  # 1, or 0 for padding
+    variance: Float[Tensor, "g m"]  # square pixels: of the landmarks' projections
+    focal: Float[Tensor, "g m"]  # pixels
+    correlation: Float[Tensor, "g"]  # number of matches that count as one measurement
+    share: Float[
+        Tensor, "g"
+    ]  # weight of a match's log likelihood, so that the curvature is that of the estimate's covariance
+    area: float  # of the image, square pixels, over which outliers are spread
+
+    def __call__(self, states: States) -> Normal:
+        cost, rows, pull = self._weighted(states)
+        return Normal(cost, (rows.mT @ pull[..., None])[..., 0], rows.mT @ rows)
+
+    def sandwich(
+        self, states: States
+    ) -> tuple[Float[Tensor, "h P P"], Float[Tensor, "h P P"], Float[Tensor, "h P P"]]:
+        """Return the reweighted Hessian, the curvature, and the scatter of the matches' gradients: the covariance of an M-estimator is
+        curvature^-1 scatter curvature^-1 (Huber 1981, 6.3). Matches with more influence often have larger errors than the others.
+
+        The scatter of few matches is far too small in some directions, so it is shrunk to that of identically distributed residuals
+        (Ledoit and Wolf 2004).
+        """
+        _, rows, pull = self._weighted(states)
+        share, independent = self.share[states.mode], 1 / self.correlation[states.mode]
+        scores = (rows * pull[..., None]).unflatten(1, (-1, 2)).sum(2) / share[:, None, None]
+        hessian = rows.mT @ rows * (independent / share)[:, None, None]
+        scatter = scores.mT @ scores * independent[:, None, None]
+        curvature = hessian - 2 / SCALE**2 * scatter
+        traces = [
+            x.diagonal(dim1=-2, dim2=-1)[:, :6] / hessian.diagonal(dim1=-2, dim2=-1)[:, :6].clamp(min=1e-300)
+            for x in (scatter, curvature)
+        ]
+        excess = traces[0].mean(-1) / traces[1].mean(-1).clamp(min=0.1)
+        count = 2 * self.valid[states.mode].sum(-1) * independent
+        known = (count / (36 + count))[:, None, None]
+        alike = (excess * count / (count - 6).clamp(min=1))[:, None, None] * curvature
+        return hessian, curvature, known * scatter + (1 - known) * alike
+
+    def _weighted(
+        self, states: States
+    ) -> tuple[Float[Tensor, "h"], Float[Tensor, "h r P"], Float[Tensor, "h r"]]:
+        """Return the cost, and the weighted rows and residuals of its least-squares problem."""
+        g, sights = states.mode, self.sights[states.mode]
+        seen = project(states, self.points[g], sights)
+        squared, off, deviation = self.residuals(states, seen)
+        u, odds = 1 + squared / SCALE**2, self._odds(states)
+        inlier = odds / (odds + u.square())  # probability
+        share = self.share[g][:, None] * self.valid[g]
+        cost = -(share * torch.where(seen.front, torch.log1p(odds / u.square()), 0)).sum(-1)
+        weight = (share * seen.front * inlier / u).sqrt()
+        rows = jacobian(states, seen, sights) * (self.focal[g] * weight / deviation)[..., None, None]
+        return cost, rows.flatten(1, 2), (off * (weight / deviation)[..., None]).flatten(1, 2)
+
+    def evidence(self, states: States) -> Float[Tensor, "h"]:
+        """Return the log likelihood relative to that of outliers alone."""
+        squared, _, _ = self.residuals(states)
+        gain = torch.log1p(self._odds(states) / (1 + squared / SCALE**2).square())
+        return (self.share[states.mode][:, None] * self.valid[states.mode] * gain).sum(-1)
+
+    def with_noise(self, states: States) -> States:
+        """Return the states with the noise that follows from their residuals."""
+        _, off, _ = self.residuals(states)
+        valid = self.valid[states.mode] > 0
+        sizes = torch.where(valid[..., None], off.abs(), torch.nan).flatten(1)
+        by_points = torch.where(valid, self.variance[states.mode], torch.nan).nanmedian(-1).values
+        spread = (MAD * sizes.nanmedian(-1).values).square()
+        noise = (spread - by_points).clamp(min=LEAST_NOISE**2).nan_to_num(1.0).sqrt()
+        return replace(states, noise=noise)
+
+    def weighted_for(self, best: States) -> Landmarks:
+        """Return the term with the number of independent matches that follows from the residuals at ``best`` (g).
+
+        The efficiency is the ratio of the information of an M-estimator to its reweighted Hessian (Huber 1981, 6.3).
+        """
+        squared, _, _ = self.residuals(best)
+        valid = self.valid[best.mode]
+        weight = 1 / (1 + squared / SCALE**2)
+        count = valid.sum(-1).clamp(min=1)
+        scatter = 0.5 * (valid * weight.square() * squared).sum(-1) / count
+        curvature = (valid * (weight - weight.square() * squared / SCALE**2)).sum(-1) / count
+        spare = (1 - 3 / count).clamp(min=0.1)  # six unknowns, two residuals of a match
+        hessian = (valid * weight).sum(-1) / count
+        efficiency = spare * curvature.clamp(min=0.1).square() / (scatter * hessian).clamp(min=1e-3)
+        return replace(self, share=efficiency / self.correlation)
+
+    def _odds(self, states: States) -> Float[Tensor, "h m"]:
+        """Return the density of the residual 0, relative to that of an outlier."""
+        return self.area / (
+            math.pi * SCALE**2 * (states.noise[:, None].square() + self.variance[states.mode])
+        )
+
+    def residuals(self, states: States, seen: Projections | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the squared residuals in units of their variance (h m), projection minus observation (h m 2) and its
+        standard deviation (h m), pixels.
+        """
+        g = states.mode
+        seen = project(states, self.points[g], self.sights[g]) if seen is None else seen
+        deviation = (states.noise[:, None].square() + self.variance[g]).sqrt()
+        off = (seen.image - self.sights.image[g]) * self.focal[g][..., None]
+        squared = torch.where(seen.front, off.square().sum(-1) / deviation.square(), 1e6)
+        return squared, off, deviation
+
+
+def point_variance(
+    landmarks: LandmarkMap, index: Int[Tensor, "m"], states: States, focal: Float[Tensor, "m"]
+) -> Float[Tensor, "m"]:
+    """Return the variance (square pixels) of landmarks' projections at the first state, averaged over both axes."""
+    points, towards = landmarks.positions[index].double(), landmarks.directions[index].double()
+    sight = points - states.T.translation[0]
+    distance = sight.norm(dim=-1).clamp(min=1e-9)
+    cosine = ((sight * towards).sum(-1) / distance).square().clamp(max=1)
+    across, along = landmarks.deviations[index].double().square().unbind(-1)
+    return (across * (1 + cosine) + along * (1 - cosine)) / 2 * (focal / distance).square()
