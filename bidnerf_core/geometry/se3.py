@@ -15,7 +15,6 @@ from typing import Any, Literal, get_args
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.conversions import (
-    axis_angle_to_rotation_matrix,
     rotation_matrix_to_axis_angle,
     rotation_matrix_to_quaternion,
 )
@@ -62,7 +61,11 @@ class SE3:
     def exp(tangent: Float[Tensor, "*b 6"]) -> SE3:
         """Return the exponential map (Sola et al., eq. 172): ``[exp(phi), V(phi) rho]``."""
         rho, phi = tangent[..., :3], tangent[..., 3:]
-        return SE3(axis_angle_to_rotation_matrix(phi), _matvec(so3_left_jacobian(phi), rho))
+        squared, small, angle = _guarded_angle(phi)
+        a = torch.where(small, 1 - squared / 6 + squared**2 / 120, angle.sin() / angle)
+        b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - angle.cos()) / angle**2)
+        c = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - angle.sin()) / angle**3)
+        return SE3(_polynomial(phi, a, b), _matvec(_polynomial(phi, b, c), rho))
 
     def log(self) -> Float[Tensor, "*b 6"]:
         """Return the inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173)."""

@@ -27,6 +27,9 @@ class Normal:
     def __add__(self, other: Normal) -> Normal:
         return Normal(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
 
+    def __sub__(self, other: Normal) -> Normal:
+        return Normal(self.cost - other.cost, self.gradient - other.gradient, self.hessian - other.hessian)
+
     def where(self, mask: Bool[Tensor, "h"], other: Normal) -> Normal:
         return Normal(
             torch.where(mask, self.cost, other.cost), torch.where(mask[:, None], self.gradient, other.gradient),
@@ -68,6 +71,41 @@ def descend(states: States, terms: Sequence[Term], steps: int) -> tuple[States, 
     return states, here
 
 
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """The quadratic models of terms about one state of each mode: by linear algebra, they give all explanations of its matches.
+
+    The unknowns are the pose's update (metres, radians) and the nuisances in their own units.
+    """
+
+    here: States  # (g)
+    cost: Float[Tensor, "g"]
+    gradient: Float[Tensor, "g P"]
+    hessian: Float[Tensor, "g P P"]
+
+    @staticmethod
+    def of(found: Normal, here: States) -> Quadratic:
+        """Convert equations without priors at ``here`` (g), where no nuisance is fixed."""
+        unit = unit_of(here)
+        return Quadratic(
+            here, found.cost, found.gradient * unit, unit[:, :, None] * found.hessian * unit[:, None]
+        )
+
+    def __call__(self, states: States) -> Normal:
+        g = states.mode
+        update = (self.here.T[g].inverse() @ states.T).log()
+        off = torch.cat([update, states.nuisances - self.here.nuisances[g]], -1)
+        scale = 1 / unit_of(states)
+        pull = self.gradient[g] + (self.hessian[g] @ off[..., None])[..., 0]
+        cost = self.cost[g] + 0.5 * ((pull + self.gradient[g]) * off).sum(-1)
+        return Normal(cost, pull * scale, scale[:, :, None] * self.hessian[g] * scale[:, None])
+
+
+def unit_of(states: States) -> Float[Tensor, "h P"]:
+    """Return the factors from derivatives by whitened unknowns to derivatives by the unknowns themselves."""
+    return torch.cat([torch.ones_like(states.z[:, :6]), 1 / states.deviation.clamp(min=1e-9)], -1)
+
+
 def damped_solution(normal: Normal, damping: Float[Tensor, "h"]) -> Float[Tensor, "h P"]:
     diagonal = normal.hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
     factor, _ = torch.linalg.cholesky_ex(
@@ -81,3 +119,9 @@ def log_det(hessian: Float[Tensor, "h p p"]) -> Float[Tensor, "h"]:
     factor, info = torch.linalg.cholesky_ex(hessian)
     found = 2 * factor.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).log().sum(-1)
     return torch.where(info == 0, found, torch.inf)
+
+
+def log_evidence(states: States, normal: Normal) -> Float[Tensor, "h"]:
+    """Return Laplace's approximation of the log evidence of each hypothesis at its minimum (MacKay 2003, ch. 28)."""
+    log = states.log_prior - normal.cost - 0.5 * log_det(normal.hessian)
+    return torch.where(log.isfinite(), log, -torch.inf)

@@ -5,7 +5,6 @@ An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a p
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -74,12 +73,23 @@ NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
 """Differences of two good calibrations of one camera."""
 SIMILAR = (0.16, 0.06, 0.06, 0.2, 0.02, 0.01)
 TRUST_AS_MAP = 0.1
-"""Factor of the probability of wrong intrinsics if they are those of the map's images."""
+"""Factor of the probability of other than the stated intrinsics if those are the intrinsics of the map's images."""
 SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
 """Prior probability of a motion during the readout, and the same if the map's images move."""
+SIMILAR_TO_OTHERS = ("exact", "inexact", "map")
+"""Explanations that are not tried by themselves at first."""
 MOVE, TURN = 0.005, 0.01
 """Motion from the first row to the last: relative to the scene's distance, and radians."""
-DEPTH_SCALE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Seed:
+    """A pose from which to refine, found with some camera."""
+
+    name: str
+    T: SE3  # T_world_rig
+    camera: Float[Tensor, "6"]
+    distance: float  # metres: of the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +105,47 @@ class Explanations:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def prior_of_all(self) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """Mean and deviation of a prior that fixes nothing which any explanation frees."""
+        return torch.zeros(N, dtype=torch.float64), self.deviation.amax(0)
 
-def explanations(query: Query, landmarks: LandmarkMap, distance: float) -> Explanations:
-    """Return all explanations of the images; ``distance`` (metres) is that of the scene, for the prior of a motion.
+    def first(self, seed: Seed, mode: int, noise: float) -> States:
+        """Return the states with which the search begins: one of each kind of camera, and the stated one in motion.
+
+        With another focal length or principal point, the camera is moved along its axis and turned so that it sees about the same.
+        """
+        names = [name for name in self.names if name not in SIMILAR_TO_OTHERS and "moving" not in name]
+        row = torch.tensor(
+            [self.names.index(name) for name in [*names, *(n for n in self.names if n == "right moving")]]
+        )
+        k, mean, deviation = len(row), self.mean[row], self.deviation[row]
+        z = torch.zeros((k, N), dtype=torch.float64)
+        # A deviation of 0 holds a nuisance at its mean.
+        off = (seed.camera - mean[:, :6]) / deviation[:, :6].clamp(min=1e-12)
+        z[:, :6] = torch.where(off.abs() <= 3, off, 0)
+        change = (mean + deviation * z)[:, :6] - seed.camera
+        update = torch.zeros((k, 6), dtype=torch.float64)
+        update[:, 2] = seed.distance * (1 - change[:, 0].exp())
+        update[:, 3], update[:, 4] = -change[:, 2], change[:, 1]
+        T = SE3(seed.T.rotation.expand(k, 3, 3), seed.T.translation.expand(k, 3)).retract(update)
+        number = torch.full((k,), mode, dtype=torch.long)
+        noises = torch.full((k,), noise, dtype=torch.float64)
+        return States(T, z, mean, deviation, self.log_prior[row], noises, number, row)
+
+    def about(self, free: States) -> States:
+        """Return a state for each explanation of each mode: the poses of ``free`` (g), with the nuisances at their means."""
+        k, g = len(self), len(free)
+        index = torch.arange(g).repeat_interleave(k)
+        row = torch.arange(k).repeat(g)
+        z = torch.zeros((g * k, N), dtype=torch.float64)
+        parts = self.mean[row], self.deviation[row], self.log_prior[row]
+        return States(free.T[index], z, *parts, free.noise[index], free.mode[index], row)
+
+
+def explanations(query: Query, landmarks: LandmarkMap, distance: float, depth_scale: float) -> Explanations:
+    """Return all explanations of the images; ``distance`` (metres) is that of the scene, for the prior of a motion, and
+    ``depth_scale`` the relative deviation of measured depth.
 
     Images of different cameras are only compared with their stated intrinsics.
     """
@@ -109,7 +157,7 @@ def explanations(query: Query, landmarks: LandmarkMap, distance: float) -> Expla
         for name, focal, centre, k1, aspect, skew, share, credible in (
             APPROXIMATE if query.approximate else STATED
         ):
-            share *= TRUST_AS_MAP if as_map and name not in ("exact", "right", "inexact") else 1
+            share *= TRUST_AS_MAP if as_map and name != "exact" else 1
             rows.append((name, [0.0] * 6, (focal, centre, centre, k1, aspect, skew), share, credible))
         for c in known:
             if bool((c.abs() > nearly).any()):
@@ -129,7 +177,7 @@ def explanations(query: Query, landmarks: LandmarkMap, distance: float) -> Expla
         for name, mean, deviation, odds, good in rows:
             names.append(name + (" moving" if moves else ""))
             means.append([*mean, *[0.0] * 7])
-            deviations.append([*deviation, *motion, DEPTH_SCALE])
+            deviations.append([*deviation, *motion, depth_scale])
             shares.append(odds * share)
             credible.append(good)
     mean, deviation, share = (torch.tensor(x, dtype=torch.float64) for x in (means, deviations, shares))
@@ -145,57 +193,3 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
         return []
     found = map_cameras(query.camera, landmarks.cameras, crops=query.approximate)
     return [torch.cat([camera.correction, camera.correction.new_zeros(1)]) for camera in found]
-
-
-@dataclass(frozen=True, eq=False)
-class Seed:
-    """A pose from which to refine, found with some camera."""
-
-    name: str
-    T: SE3  # T_world_rig
-    camera: Float[Tensor, "6"]
-    distance: float  # metres: of the scene
-
-
-def rows(seed: Seed, given: Explanations, mode: int, noise: float) -> States:
-    """Return a state for each explanation, from one seed.
-
-    With another focal length or principal point, the camera is moved along its axis and turned so that it sees about the same.
-    """
-    k = len(given)
-    z = torch.zeros((k, N), dtype=torch.float64)
-    # A deviation of 0 holds a nuisance at its mean.
-    off = (seed.camera - given.mean[:, :6]) / given.deviation[:, :6].clamp(min=1e-12)
-    z[:, :6] = torch.where(off.abs() <= 3, off, 0)
-    change = (given.mean + given.deviation * z)[:, :6] - seed.camera
-    update = torch.zeros((k, 6), dtype=torch.float64)
-    update[:, 2] = seed.distance * (1 - change[:, 0].exp())
-    update[:, 3], update[:, 4] = -change[:, 2], change[:, 1]
-    T = SE3(seed.T.rotation.expand(k, 3, 3), seed.T.translation.expand(k, 3))
-    numbers = torch.full((k,), mode, dtype=torch.long), torch.arange(k)
-    states = States(
-        T,
-        z,
-        given.mean,
-        given.deviation,
-        given.log_prior,
-        torch.full((k,), noise, dtype=torch.float64),
-        *numbers,
-    )
-    return states.retract(torch.cat([update, 0 * z], -1))
-
-
-def tilted(points: Float[Tensor, "m 3"], T_world_camera: SE3) -> SE3:
-    """Return the pose from which, to first order, the plane of ``points`` looks the same (Schweighofer and Pinz 2006).
-
-    In the camera's frame, the points are reflected in the plane through their middle perpendicular to the line of sight. For
-    coplanar points, which are their own mirror image in their plane, this is a rigid motion.
-    """
-    middle = points.mean(0)
-    normal = torch.linalg.svd(points - middle, full_matrices=False).Vh[-1]
-    T = T_world_camera.inverse()
-    seen = T.apply(middle)
-    eye = torch.eye(3, dtype=points.dtype)
-    across, along = (eye - 2 * torch.outer(v, v) / v.square().sum() for v in (seen, normal))
-    rotation = across @ T.rotation @ along
-    return SE3(rotation, seen - rotation @ middle).inverse()

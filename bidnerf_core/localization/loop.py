@@ -6,32 +6,34 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, accept
-from bidnerf_core.localization.descend import Normal, Term, descend
-from bidnerf_core.localization.explanations import Explanations, Seed, explanations, rows, tilted
+from bidnerf_core.localization.descend import Quadratic, Term, descend, log_evidence, prior, total
+from bidnerf_core.localization.explanations import Explanations, Seed, explanations
 from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, log10_nfa
 from bidnerf_core.localization.posterior import Posterior
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.propose import best_consensus, consensus, inliers
+from bidnerf_core.localization.propose import LEAST_AGREEING, best_consensus, consensus, inliers
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import AutoConfig
 from bidnerf_core.localization.states import Sights, States, project
 from bidnerf_core.localization.terms.landmarks import Landmarks, point_variance
-from bidnerf_core.localization.terms.rays import FIELD_ERRORS, RAYS, Quadratic, Rays
+from bidnerf_core.localization.terms.rays import FIELD_ERRORS, RAYS, Rays
 from bidnerf_core.localization.terms.surface import Surface
 
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which no mirror image is tried."""
+DEPTH_WIDTH = 2.0
+"""Ratio of the prior's deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
 LEAST_RIVAL = 0.3
 """Least number of inliers of another place, as a fraction of those of the first."""
+MOST_FIRST = 100
+"""Number of matches by descriptors to which the first fits are made."""
 RADII = (3.0, 1.5, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 TOLERANCE, ANGLE = 0.03, 0.05
@@ -52,7 +54,6 @@ class Mode:
     query: Query
     matches: Matches
     by_descriptors: Matches  # alone
-    parent: int  # number of the mode whose matches it shares: its own, if these are different
 
 
 class Loop:
@@ -69,9 +70,15 @@ class Loop:
         query = Query.of(self.problem.views, self.matcher.features)
         answer = None
         for seed, nearest, nfa in self._proposals(query):
-            given = explanations(query, self.landmarks, seed.distance)
+            given = explanations(
+                query, self.landmarks, seed.distance, DEPTH_WIDTH * self.problem.sensor.scale
+            )
             modes, states, term = self._modes(query, nearest, seed, given, nfa)
-            answer = self._fused(modes, states, term, given)
+            if not modes:
+                continue
+            found = self._fused(modes, states, term, given)
+            if answer is None or found[1].accepted or found[3].log10_nfa < answer[3].log10_nfa:
+                answer = found
             if answer[1].accepted:
                 break
         return answer
@@ -110,59 +117,84 @@ class Loop:
             [self.landmarks.correlation_of(len(mode.matches)) for mode in modes], dtype=torch.float64
         )
         return Landmarks(
-            points, Sights(*seen), valid, variance, focal, correlation, 1 / correlation, modes[0].query.area
+            points,
+            Sights(*seen),
+            valid,
+            variance,
+            focal,
+            correlation,
+            1 / correlation,
+            modes[0].query.area,
+            modes[0].query.threshold / 2,
         )
-
-    def _best(self, states: States, normal: Normal, modes: list[Mode]) -> States:
-        """Return the most probable state of each mode."""
-        log = states.log_prior - normal.cost
-        member = states.mode[None] == torch.arange(len(modes))[:, None]
-        return states[torch.where(member, log[None], -torch.inf).argmax(-1)]
 
     def _modes(
         self, query: Query, nearest: Nearest, seed: Seed, given: Explanations, nfa: float
-    ) -> tuple[list[Mode], States, Landmarks]:
-        """Return the modes, and a state for each of their hypotheses, refined on matches by projection."""
-        matches, noise = nearest.best, query.threshold / 2
-        modes, states = [Mode("landmarks", query, matches, matches, 0)], rows(seed, given, 0, noise)
-        term = self._term(modes, states[:1])
-        states, normal = descend(states, [term], 8)
-        best = self._best(states, normal, modes)
-        for name, there, found in self._rivals(query, nearest, best, nfa):
-            other = consensus(there, self.landmarks, found, best.nuisances[0, :6], name)
-            if other is None:
+    ) -> tuple[list[Mode], States | None, Landmarks | None]:
+        """Return the modes, and the most probable state of each, refined on matches by projection."""
+        modes: list[Mode] = []
+        best: list[States] = []
+        for name, there, found, start in self._places(query, nearest, seed, given, nfa, best):
+            known = States.known(start.T, start.camera)
+            near = found[inliers(there, self.landmarks, found, known, 3)]
+            if len(near) < LEAST_AGREEING:
                 continue
-            modes.append(Mode(name, there, found, found, len(modes)))
-            states = States.cat([states, rows(other[0], given, len(modes) - 1, noise)])
-        if len(modes) > 1:
-            best = States.cat([best, *(states[states.mode == g][:1] for g in range(1, len(modes)))])
-            term = self._term(modes, best)
-            states, normal = descend(states, [term], 8)
-            best = self._best(states, normal, modes)
+            mode = Mode(name, there, near, found)
+            modes.append(mode)
+            best.append(self._compared(mode, start, given, query.threshold / 2))
+        if not modes:
+            return [], None, None
+        seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
-            modes = [
-                replace(mode, matches=self._guided(mode, best[g : g + 1], radius))
-                for g, mode in enumerate(modes)
-            ]
-            term = self._term(modes, best)
-            best = term.with_noise(best)
-            best, _ = descend(best, [term], 4)
-        best = term.with_noise(best)
-        term = term.weighted_for(best)
-        again = [self._again(best[g : g + 1], term, given) for g in range(len(modes))]
-        return modes, States.cat(again), term
+            for g, mode in enumerate(modes):
+                within = radius * mode.query.threshold
+                seen[g] = Projected(mode.query, self.landmarks, best[g], within, seen[g])
+                found = seen[g].matches(within)
+                modes[g] = mode = replace(
+                    mode, matches=found if len(found) >= LEAST_AGREEING else mode.matches
+                )
+                if radius == RADII[0]:
+                    z = (
+                        best[g]
+                        .T.inverse()
+                        .apply(self.landmarks.positions[mode.matches.landmark].double())
+                        .norm(dim=-1)
+                    )
+                    again = Seed(mode.name, best[g].T[0], best[g].nuisances[0, :6], float(z.median()))
+                    best[g] = self._compared(mode, again, given, float(best[g].noise))
+                term = self._term([mode], best[g])
+                best[g], _ = descend(term.with_noise(best[g]), [term], 4)
+        states = States.cat([replace(state, mode=state.mode + g) for g, state in enumerate(best)])
+        term = self._term(modes, states)
+        states, _ = descend(states, [term], 4)
+        states = term.with_noise(states)
+        return modes, states, term.weighted_for(states)
 
-    def _again(self, best: States, term: Landmarks, given: Explanations) -> States:
-        """Return a state for each hypothesis, from the refined best one of a mode."""
-        g = int(best.mode)
-        z = best.T.inverse().apply(term.points[g]).norm(dim=-1)
-        distance = float(z[term.valid[g] > 0].median())
-        return rows(Seed("again", best.T[0], best.nuisances[0, :6], distance), given, g, float(best.noise))
+    def _compared(self, mode: Mode, seed: Seed, given: Explanations, noise: float) -> States:
+        """Return the most probable state of a mode, comparing kinds of cameras, each with its own noise, on some of the matches."""
+        count = len(mode.matches)
+        some = torch.linspace(0, count - 1, min(count, MOST_FIRST)).long()
+        states = given.first(seed, 0, noise)
+        term = self._term([replace(mode, matches=mode.matches[some])], states[:1])
+        term = replace(term, share=term.share * (count / len(some)))
+        states, _ = descend(states, [term], 5)
+        states, normal = descend(term.with_noise(states), [term], 5)
+        return replace(
+            states[log_evidence(states, normal).argmax()[None]], mode=torch.zeros(1, dtype=torch.long)
+        )
 
-    def _guided(self, mode: Mode, state: States, radius: float) -> Matches:
-        within = radius * mode.query.threshold
-        found = Projected(mode.query, self.landmarks, state, within).matches(within)
-        return found if len(found) >= 6 else mode.matches
+    def _places(
+        self, query: Query, nearest: Nearest, seed: Seed, given: Explanations, nfa: float, best: list[States]
+    ) -> Iterator[tuple[str, Query, Matches, Seed]]:
+        """Yield the seed, and others that compete with it; ``best`` has the state refined from each before the next is asked for."""
+        matches = nearest.best
+        yield "landmarks", query, matches, seed
+        if not best:
+            return
+        for name, there, found in self._rivals(query, nearest, best[0], nfa):
+            other = consensus(there, self.landmarks, found, best[0].nuisances[0, :6], name)
+            if other is not None:
+                yield name, there, found, other[0]
 
     def _rivals(
         self, query: Query, nearest: Nearest, best: States, nfa: float
@@ -185,33 +217,42 @@ class Loop:
             mirrored = query.mirrored
             yield "mirror image", mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best
 
-    def _fused(self, modes: list[Mode], states: States, landmarks: Landmarks, given: Explanations) -> tuple:
+    def _fused(self, modes: list[Mode], best: States, landmarks: Landmarks, given: Explanations) -> tuple:
         """Fuse all measurements under all explanations, and judge the result."""
-        states, normal = descend(states, [landmarks], 3)
-        states = landmarks.with_noise(states)
-        states, normal = descend(states, [landmarks], 5)
-        terms: list[Term] = [landmarks]
-        first = self._posterior(states, normal, landmarks, modes)
+        best, _ = descend(best, [landmarks], 4)
+        free = best.under(*given.prior_of_all)
+        quadratic = Quadratic.of(landmarks(free), free)
+        first = self._posterior(free, quadratic, landmarks, modes, given)
         problem, depth = self.problem, None
+        terms: list[Term] = [landmarks]
         if problem.surface is not None and problem.has_depth:
             depth = Surface.of(problem.views, problem.depth_rays, problem.surface, 0)
         if depth is not None and first.mode == 0:
             depth = depth.fitted_noise(first.states[first.best : first.best + 1])
             terms.append(depth)
-            states, normal = descend(states, terms, 5)
-            first = self._posterior(states, normal, landmarks, modes)
+            best, _ = descend(best, terms, 5)
+            free = best.under(*given.prior_of_all)
+            quadratic = Quadratic.of(landmarks(free) + depth(free), free)
+            first = self._posterior(free, quadratic, landmarks, modes, given)
         before = first  # rays about one camera's pose must not decide between cameras
         if self.is_sharp and first.mode == 0 and self._blur(first, landmarks) > RAYS_BELOW:
-            best = states[first.best : first.best + 1]
+            best = first.states[first.best : first.best + 1]
             rays = Rays.of(problem.views, problem.field, problem.bounds, RAYS, 0).fitted(best)
             best, _ = descend(best, [*terms, rays], 4)
-            quadratic = Quadratic.of(rays, best)  # rays are too expensive for all hypotheses
-            terms.append(quadratic)
-            there = replace(states, T=best.T[torch.zeros(len(states), dtype=torch.long)])
-            states, normal = descend(there.where(states.mode == first.mode, states), terms, 5)
-            first = self._posterior(
-                states, normal, landmarks, modes, (FIELD_ERRORS - 1) * quadratic(states).hessian
+            own = best.under(*given.prior_of_all)
+            free = own if len(free) == 1 else States.cat([own, free[1:]])
+            by_rays = rays(own)
+            found = total(free, terms) - prior(free)
+            found = replace(
+                found,
+                cost=_with_first(found.cost, by_rays.cost),
+                gradient=_with_first(found.gradient, by_rays.gradient),
+                hessian=_with_first(found.hessian, by_rays.hessian),
             )
+            quadratic = Quadratic.of(found, free)
+            systematic = torch.zeros_like(quadratic.hessian)
+            systematic[:1] = (FIELD_ERRORS - 1) * Quadratic.of(by_rays, own).hessian
+            first = self._posterior(free, quadratic, landmarks, modes, given, systematic)
         return self._judged(first, before, modes, landmarks, depth, given)
 
     def _blur(self, found: Posterior, term: Landmarks) -> float:
@@ -228,11 +269,16 @@ class Loop:
         return float(z[term.valid[g] > 0].median())
 
     def _posterior(
-        self, states: States, normal: Normal, landmarks: Landmarks, modes: list[Mode], systematic=0.0
+        self,
+        free: States,
+        quadratic: Quadratic,
+        landmarks: Landmarks,
+        modes: list[Mode],
+        given: Explanations,
+        systematic=0.0,
     ) -> Posterior:
-        parents = torch.tensor([mode.parent for mode in modes])
         scatter = self.landmarks.calibration_scatter.double()
-        return Posterior.of(states, normal, landmarks, parents, scatter, systematic)
+        return Posterior.of(given.about(free), quadratic, landmarks, scatter, systematic)
 
     def _judged(
         self,
@@ -284,6 +330,10 @@ class Loop:
 
 def modes_focal(term: Landmarks) -> float:
     return float(term.focal.max())
+
+
+def _with_first(values: Tensor, first: Tensor) -> Tensor:
+    return torch.cat([values[:1] + first, values[1:]])
 
 
 def _padded(values: Tensor, count: int, fill: float | tuple[float, ...] = 0.0) -> Tensor:

@@ -12,10 +12,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.camera import exposure_times
-from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.query import Query
-from bidnerf_core.localization.states import Sights, States, project
+from bidnerf_core.localization.states import States, imaged
 from bidnerf_core.mapping import LandmarkMap, paired_squared_distances
 
 STRONGEST, LOOKED_UP = 700, 4
@@ -90,50 +89,51 @@ class Nearest:
 class Projected:
     """The landmarks that one state should see, with their projections, view by view."""
 
-    def __init__(self, query: Query, landmarks: LandmarkMap, state: States, margin: float) -> None:
-        self.query, self.landmarks = query, landmarks
-        self.visible, self._parts = 0, []
-        for number, image in enumerate(query.images):
-            self._parts.append(self._part(number, image, state, margin))
-
-    def _part(self, number, image, state, margin):
-        landmarks, c = self.landmarks, image.intrinsics
+    def __init__(
+        self,
+        query: Query,
+        landmarks: LandmarkMap,
+        state: States,
+        margin: float,
+        among: Projected | None = None,
+    ) -> None:
+        """Project landmarks up to ``margin`` pixels beyond the images' edges, ``among`` those visible from a pose nearby."""
+        self.query, self.landmarks, self.visible, self._parts = query, landmarks, 0, []
         nuisances = state.nuisances[0]
-        focal = image.focal * float(nuisances[0].exp())  # host
-        half = torch.tensor([max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy])
-        half = half + nuisances[1:3].abs().float()
-        own = self.query.view == number
-        sizes = self.query.keypoints.sizes[own]
-        smallest = float(sizes.min()) / (2**OCTAVES * focal) if len(sizes) else 0.0
-        T = state.T[0] @ image.T_ref_camera
-        slopes = (1.2 * half + margin / image.focal) / float(nuisances[0].exp())
-        index, local = landmarks.in_view(T, slopes, OBLIQUE, smallest)
-        points = landmarks.positions[index].double()
-        there = image.T_ref_camera.inverse()
-        m = len(points)
-        sights = Sights(
-            points[:, :2], points.new_zeros(m), there.rotation.expand(m, 3, 3), there.translation.expand(m, 3)
-        )
-        flat = project(state, points, sights).image[0]
-        scale = torch.tensor([c.fx, c.fy], dtype=torch.float64)
-        centre = torch.tensor([c.cx, c.cy], dtype=torch.float64)
-        if bool((state.nuisances[0, 6:12] != 0).any()):
-            times = exposure_times(flat * scale + centre, c)
-            flat = project(
-                state, points, Sights(sights.image, times, sights.rotation, sights.translation)
-            ).image[0]
-        shown = flat * scale + centre
-        self.visible += int(((shown > 0) & (shown < torch.tensor([c.width, c.height]))).all(-1).sum())
-        pixels = flat * image.focal
-        expected = landmarks.sizes[index] * focal / local[:, 2]
-        tree = cKDTree(pixels.numpy()) if m else None  # host
-        return own.nonzero()[:, 0], image.focal, index, expected, tree
+        zoom = float(nuisances[0].exp())  # host
+        for number, image in enumerate(query.images):
+            c, own = image.intrinsics, (query.view == number).nonzero()[:, 0]
+            T = state.T[0] @ image.T_ref_camera
+            if among is None:
+                half = torch.tensor([max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy])
+                slopes = (1.2 * (half + nuisances[1:3].abs().float()) + margin / image.focal) / zoom
+                sizes = query.keypoints.sizes[own]
+                smallest = float(sizes.min()) / (2**OCTAVES * image.focal * zoom) if len(sizes) else 0.0
+                index, _ = landmarks.in_view(T, slopes, OBLIQUE, smallest)
+            else:
+                index = among._parts[number][1]
+            local = T.inverse().apply(landmarks.positions[index].double())
+            index, local = index[local[:, 2] > 0], local[local[:, 2] > 0]
+            scale = torch.tensor([c.fx, c.fy], dtype=torch.float64)
+            centre = torch.tensor([c.cx, c.cy], dtype=torch.float64)
+            flat = imaged(state, local[None], local.new_zeros(len(local))).image[0]
+            if bool((nuisances[6:12] != 0).any()):
+                flat = imaged(state, local[None], exposure_times(flat * scale + centre, c)).image[0]
+            shown = flat * scale + centre
+            inside = ((shown > 0) & (shown < torch.tensor([c.width, c.height]))).all(-1)
+            if image.hidden is not None:
+                column, row = shown[inside].long().unbind(-1)
+                inside[inside.clone()] = ~image.hidden[row, column]
+            self.visible += int(inside.sum())
+            expected = landmarks.sizes[index] * (image.focal * zoom) / local[:, 2]
+            tree = cKDTree((flat * image.focal).numpy(), balanced_tree=False) if len(index) else None  # host
+            self._parts.append((own, index, image.focal, expected, tree))
 
     def matches(self, radius: float, shift: float = 0.0) -> Matches:
         """Return the matches within ``radius`` pixels; with keypoints displaced by ``shift``, all are due to chance."""
         query, landmarks = self.query, self.landmarks
         pairs = []
-        for own, focal, index, expected, tree in self._parts:
+        for own, index, focal, expected, tree in self._parts:
             if tree is None or not len(own):
                 continue
             observed = query.sights.image[own] * focal + shift

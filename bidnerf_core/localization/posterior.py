@@ -5,21 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.descend import Normal, log_det
+from bidnerf_core.localization.descend import Normal, Quadratic, descend, log_evidence, unit_of
 from bidnerf_core.localization.states import P, States
 from bidnerf_core.localization.terms.landmarks import Landmarks
 
 BY_SHARE = 10.0
 """Log odds per factor e between the evidence for two places: it is not proportional to the number of matches, since the right
 place rarely has fewer than two thirds as many as another."""
+LEAST_EVIDENCE = 50.0
+"""Evidence below which places are not compared: a few chance matches are no evidence against even fewer."""
 LEAST_DOUBT = 0.005
 """Standard deviation of a camera's parameters that no photo rules out: lenses move with focus and image stabilisers."""
 LEAST_CURVATURE = 0.2
 """Smallest curvature, relative to the reweighted Hessian."""
+NEWTON = 2
+"""Steps on quadratic models, of which the first is exact up to the curvature of the rotations."""
 DRAWS = 256
 """Draws of the pose from each explanation's Gaussian, with which the probability mass within a tolerance is integrated."""
 
@@ -39,30 +43,24 @@ class Posterior:
     @staticmethod
     def of(
         states: States,
-        normal: Normal,
+        terms: Quadratic,
         landmarks: Landmarks,
-        parents: Int[Tensor, "g"],
         scatter: Float[Tensor, "4"],
-        systematic: Float[Tensor, "h P P"] | float = 0.0,
+        systematic: Float[Tensor, "g P P"] | float = 0.0,
     ) -> Posterior:
-        """Compare explanations within a mode by their cost, and modes by the evidence of landmarks; ``parents`` are the modes
-        whose matches each mode shares.
+        """Compare explanations within a mode by their cost, and modes by the evidence of landmarks. ``terms`` are the models of all terms, and ``systematic`` is the scatter of their gradient
+        (in its units) in addition to that of independent errors.
         """
-        log = states.log_prior - normal.cost - 0.5 * log_det(normal.hessian)
-        log = torch.where(log.isfinite(), log, -torch.inf)
-        member = states.mode[None] == torch.arange(len(parents), device=log.device)[:, None]
-        within = torch.where(member, log[None], -torch.inf)
-        norm = within.logsumexp(-1)
-        evidence = landmarks.evidence(states)
-        by_mode = (torch.where(member, (within - norm[:, None]).exp(), 0).nan_to_num(0.0) * evidence).sum(-1)
-        # Modes with the same matches are compared as any explanations are, others by their numbers of matches.
-        weight = BY_SHARE * by_mode[parents].clamp(min=1e-3).log() + norm - norm[parents]
-        log = log - norm[states.mode] + weight[states.mode]
+        states, normal = descend(states, [terms], NEWTON)
+        log = log_evidence(states, normal)
+        member = states.mode[None] == torch.arange(len(terms.here), device=log.device)[:, None]
+        norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
+        by_mode = landmarks.evidence(terms.here)
+        log = log + (BY_SHARE * by_mode.clamp(min=LEAST_EVIDENCE).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)
         best = int(probability.argmax())  # host
-        states, covariance = _true_cameras(
-            states, normal, robust_covariance(states, normal, landmarks, systematic), scatter
-        )
+        covariance = robust_covariance(states, normal, terms, landmarks, systematic)
+        states, covariance = _true_cameras(states, normal, covariance, scatter)
         anchor = states.T[best]
         return Posterior(
             states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), by_mode, best
@@ -120,13 +118,19 @@ class Posterior:
 
 
 def robust_covariance(
-    states: States, normal: Normal, landmarks: Landmarks, systematic: Float[Tensor, "h P P"] | float
+    states: States,
+    normal: Normal,
+    terms: Quadratic,
+    landmarks: Landmarks,
+    systematic: Float[Tensor, "g P P"] | float,
 ) -> Float[Tensor, "h P P"]:
     """Return the covariance of the unknowns: that of an M-estimator for landmarks, and of a Gaussian likelihood for all else."""
-    hessian, curvature, scatter = landmarks.sandwich(states)
-    rest = normal.hessian - hessian * (landmarks.share * landmarks.correlation)[states.mode][:, None, None]
+    unit, scale, g = unit_of(terms.here), 1 / unit_of(states), states.mode
+    parts = [unit[:, :, None] * part * unit[:, None] for part in landmarks.sandwich(terms.here)]
+    parts = [parts[0], parts[1], parts[2] + systematic]
+    hessian, curvature, scatter = (scale[:, :, None] * part[g] * scale[:, None] for part in parts)
+    rest = normal.hessian - hessian * (landmarks.share * landmarks.correlation)[g][:, None, None]
     unit = (hessian + rest).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    scatter = scatter + systematic
     hessian, curvature, scatter = (
         unit[..., None] * (x + rest) * unit[..., None, :] for x in (hessian, curvature, scatter)
     )

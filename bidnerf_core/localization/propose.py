@@ -15,7 +15,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.explanations import Seed, cameras_of_map
 from bidnerf_core.localization.matching import Matches, log10_nfa
 from bidnerf_core.localization.query import Query
-from bidnerf_core.localization.states import N, States, rays_through
+from bidnerf_core.localization.states import States, project, rays_through
 from bidnerf_core.mapping import LandmarkMap
 
 LADDER = (-0.35, 0.35, -0.7, 0.7)
@@ -109,14 +109,14 @@ def consensus(
     return Seed(name, T, camera, distance), nfa
 
 
-def inliers(query: Query, landmarks: LandmarkMap, matches: Matches, state: States) -> Bool[Tensor, "m"]:
-    """Return a mask of the matches that agree with a state."""
-    from bidnerf_core.localization.states import project
-
+def inliers(
+    query: Query, landmarks: LandmarkMap, matches: Matches, state: States, radius: float = 1.0
+) -> Bool[Tensor, "m"]:
+    """Return a mask of the matches that agree with a state; ``radius`` is in units of the inlier threshold."""
     keypoint = matches.keypoint
     seen = project(state, landmarks.positions[matches.landmark].double()[None], query.sights[keypoint])
     off = ((seen.image[0] - query.sights.image[keypoint]) * query.focal[keypoint, None]).norm(dim=-1)
-    return (off <= query.threshold) & seen.front[0]
+    return (off <= radius * query.threshold) & seen.front[0]
 
 
 def _camera(focal: float) -> dict[str, object]:

@@ -66,6 +66,12 @@ class States:
         t = torch.where(mask[:, None], self.T.translation, other.T.translation)
         return replace(self, T=SE3(R, t), z=torch.where(mask[:, None], self.z, other.z))
 
+    def under(self, mean: Float[Tensor, "N"], deviation: Float[Tensor, "N"]) -> States:
+        """Return the same poses and nuisances with another prior; a nuisance that it fixes takes its mean."""
+        free = deviation > 0
+        z = torch.where(free, (self.nuisances - mean) / torch.where(free, deviation, 1), 0)
+        return replace(self, z=z, mean=mean.expand_as(z), deviation=deviation.expand_as(z))
+
     @staticmethod
     def cat(parts: list[States]) -> States:
         joined = (torch.cat([getattr(part, name) for part in parts]) for name in PARTS)
@@ -110,15 +116,19 @@ def project(states: States, points: Float[Tensor, "*h m 3"], sights: Sights) -> 
     """Project world points."""
     local = (points - states.T.translation[:, None]) @ states.T.rotation
     local = (sights.rotation @ local[..., None])[..., 0] + sights.translation
-    nuisances, times = states.nuisances, sights.times[..., None]
+    return imaged(states, local, sights.times)
+
+
+def imaged(states: States, local: Float[Tensor, "h m 3"], times: Float[Tensor, "*h m"]) -> Projections:
+    """Project points in the frame of the camera at the middle row."""
+    nuisances, times = states.nuisances, times[..., None]
     v, w = nuisances[:, None, 6:9], nuisances[:, None, 9:12].expand_as(local)
     speed = v + torch.linalg.cross(w, local)  # the camera moves by exp(time * motion), to second order
     local = local - times * speed + 0.5 * times**2 * torch.linalg.cross(w, speed)
     front = local[..., 2] > 1e-9
     flat = local[..., :2] / torch.where(front, local[..., 2], 1.0)[..., None]
     bent = flat * (1 + nuisances[:, None, 3:4] * flat.square().sum(-1, keepdim=True))
-    image = (linear(states)[:, None] @ bent[..., None])[..., 0] + nuisances[:, None, 1:3]
-    return Projections(image, local, flat, front)
+    return Projections(bent @ linear(states).mT + nuisances[:, None, 1:3], local, flat, front)
 
 
 def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor, "h m 2 P"]:

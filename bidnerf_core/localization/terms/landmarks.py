@@ -40,6 +40,7 @@ class Landmarks:
         Tensor, "g"
     ]  # weight of a match's log likelihood, so that the curvature is that of the estimate's covariance
     area: float  # of the image, square pixels, over which outliers are spread
+    most_noise: float  # pixels: of keypoints that match
 
     def __call__(self, states: States) -> Normal:
         cost, rows, pull = self._weighted(states)
@@ -86,10 +87,13 @@ class Landmarks:
         return cost, rows.flatten(1, 2), (off * (weight / deviation)[..., None]).flatten(1, 2)
 
     def evidence(self, states: States) -> Float[Tensor, "h"]:
-        """Return the log likelihood relative to that of outliers alone."""
+        """Return the log likelihood relative to that of outliers alone, by the largest noise of any state and without weights, so
+        that it counts matches.
+        """
+        states = replace(states, noise=states.noise.amax().expand_as(states.noise))
         squared, _, _ = self.residuals(states)
         gain = torch.log1p(self._odds(states) / (1 + squared / SCALE**2).square())
-        return (self.share[states.mode][:, None] * self.valid[states.mode] * gain).sum(-1)
+        return (self.valid[states.mode] * gain).sum(-1)
 
     def with_noise(self, states: States) -> States:
         """Return the states with the noise that follows from their residuals."""
@@ -98,7 +102,7 @@ class Landmarks:
         sizes = torch.where(valid[..., None], off.abs(), torch.nan).flatten(1)
         by_points = torch.where(valid, self.variance[states.mode], torch.nan).nanmedian(-1).values
         spread = (MAD * sizes.nanmedian(-1).values).square()
-        noise = (spread - by_points).clamp(min=LEAST_NOISE**2).nan_to_num(1.0).sqrt()
+        noise = (spread - by_points).clamp(LEAST_NOISE**2, self.most_noise**2).nan_to_num(1.0).sqrt()
         return replace(states, noise=noise)
 
     def weighted_for(self, best: States) -> Landmarks:

@@ -14,7 +14,7 @@ from bidnerf_core.camera import exposure_times
 from bidnerf_core.fields import RadianceField, RaySamples, SceneBounds, render, render_samples
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.descend import Normal, Term
+from bidnerf_core.localization.descend import Normal
 from bidnerf_core.localization.states import MOTION, Sights, States, rays_by_camera, rays_through
 
 RAYS = 1024
@@ -161,28 +161,3 @@ class Rays:
             weight = 1 / (1 + ((gain[:, None] * seen + offset[:, None] - self.rgb) / (2 * self.scale)) ** 2)
         basis = seen - seen.mean(1, keepdim=True)
         return gain, offset, basis / basis.norm(dim=1, keepdim=True).clamp(min=1e-9)
-
-
-@dataclass(frozen=True, eq=False)
-class Quadratic:
-    """The quadratic model of an expensive term about one state, with which all other hypotheses are compared."""
-
-    T: SE3
-    nuisances: Float[Tensor, "N"]
-    cost: Float[Tensor, ""]
-    gradient: Float[Tensor, "P"]
-    hessian: Float[Tensor, "P P"]
-
-    @staticmethod
-    def of(term: Term, state: States) -> Quadratic:
-        found = term(state)
-        unit = torch.cat([torch.ones(6, dtype=torch.float64), 1 / state.deviation[0].clamp(min=1e-9)])
-        hessian = unit[:, None] * found.hessian[0] * unit
-        return Quadratic(state.T[0], state.nuisances[0], found.cost[0], found.gradient[0] * unit, hessian)
-
-    def __call__(self, states: States) -> Normal:
-        off = torch.cat([(self.T.inverse() @ states.T).log(), states.nuisances - self.nuisances], -1)
-        unit = torch.cat([torch.ones_like(off[:, :6]), states.deviation], -1)
-        pull = self.gradient + off @ self.hessian
-        cost = self.cost + 0.5 * ((pull + self.gradient) * off).sum(-1)
-        return Normal(cost, pull * unit, unit[:, :, None] * self.hessian * unit[:, None])
