@@ -100,6 +100,13 @@ class Quadratic:
         cost = self.cost[g] + 0.5 * ((pull + self.gradient[g]) * off).sum(-1)
         return Normal(cost, pull * scale, scale[:, :, None] * self.hessian[g] * scale[:, None])
 
+    def minimum(self, states: States) -> tuple[States, Normal]:
+        """Return the minimum of the sum with each state's prior; the second step accounts for the curvature of rotations."""
+        for _ in range(2):
+            normal = total(states, [self])
+            states = states.retract(-damped_solution(normal, torch.zeros_like(normal.cost)))
+        return states, total(states, [self])
+
 
 def unit_of(states: States) -> Float[Tensor, "h P"]:
     """Return the factors from derivatives by whitened unknowns to derivatives by the unknowns themselves."""

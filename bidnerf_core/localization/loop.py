@@ -32,9 +32,11 @@ DEPTH_WIDTH = 2.0
 """Ratio of the prior's deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
 LEAST_RIVAL = 0.3
 """Least number of inliers of another place, as a fraction of those of the first."""
+REFITS = 3
+"""Most fits of a mode until the explanation that it is linearized about is the most probable one."""
 MOST_FIRST = 100
 """Number of matches by descriptors to which the first fits are made."""
-RADII = (3.0, 1.5, 1.5)
+RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 TOLERANCE, ANGLE = 0.03, 0.05
 """Within which the pose must be: relative to the distance of the scene, and radians."""
@@ -163,10 +165,9 @@ class Loop:
                     again = Seed(mode.name, best[g].T[0], best[g].nuisances[0, :6], float(z.median()))
                     best[g] = self._compared(mode, again, given, float(best[g].noise))
                 term = self._term([mode], best[g])
-                best[g], _ = descend(term.with_noise(best[g]), [term], 4)
+                best[g], _ = descend(term.with_noise(best[g]), [term], 3)
         states = States.cat([replace(state, mode=state.mode + g) for g, state in enumerate(best)])
         term = self._term(modes, states)
-        states, _ = descend(states, [term], 4)
         states = term.with_noise(states)
         return modes, states, term.weighted_for(states)
 
@@ -177,8 +178,8 @@ class Loop:
         states = given.first(seed, 0, noise)
         term = self._term([replace(mode, matches=mode.matches[some])], states[:1])
         term = replace(term, share=term.share * (count / len(some)))
-        states, _ = descend(states, [term], 5)
-        states, normal = descend(term.with_noise(states), [term], 5)
+        states, _ = descend(states, [term], 4)
+        states, normal = descend(term.with_noise(states), [term], 3)
         return replace(
             states[log_evidence(states, normal).argmax()[None]], mode=torch.zeros(1, dtype=torch.long)
         )
@@ -217,12 +218,24 @@ class Loop:
             mirrored = query.mirrored
             yield "mirror image", mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best
 
+    def _settled(self, best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic]:
+        """Return the most probable state of each mode (g), and the model about it by which it is the most probable."""
+        for _ in range(REFITS):
+            best, _ = descend(term.with_noise(best), [term], 4)
+            free = best.under(*given.prior_of_all)
+            quadratic = Quadratic.of(term(free), free)
+            states, normal = quadratic.minimum(given.about(free))
+            member = states.mode[None] == torch.arange(len(best))[:, None]
+            found = states[torch.where(member, log_evidence(states, normal)[None], -torch.inf).argmax(-1)]
+            if bool((found.row == best.row).all()):
+                break
+            best = found
+        return best, quadratic
+
     def _fused(self, modes: list[Mode], best: States, landmarks: Landmarks, given: Explanations) -> tuple:
         """Fuse all measurements under all explanations, and judge the result."""
-        best, _ = descend(best, [landmarks], 4)
-        free = best.under(*given.prior_of_all)
-        quadratic = Quadratic.of(landmarks(free), free)
-        first = self._posterior(free, quadratic, landmarks, modes, given)
+        best, quadratic = self._settled(best, landmarks, given)
+        first = self._posterior(best, quadratic, landmarks, modes, given)
         problem, depth = self.problem, None
         terms: list[Term] = [landmarks]
         if problem.surface is not None and problem.has_depth:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.descend import Normal, Quadratic, descend, log_evidence, unit_of
+from bidnerf_core.localization.descend import Normal, Quadratic, log_evidence, unit_of
 from bidnerf_core.localization.states import P, States
 from bidnerf_core.localization.terms.landmarks import Landmarks
 
@@ -22,8 +22,6 @@ LEAST_DOUBT = 0.005
 """Standard deviation of a camera's parameters that no photo rules out: lenses move with focus and image stabilisers."""
 LEAST_CURVATURE = 0.2
 """Smallest curvature, relative to the reweighted Hessian."""
-NEWTON = 2
-"""Steps on quadratic models, of which the first is exact up to the curvature of the rotations."""
 DRAWS = 256
 """Draws of the pose from each explanation's Gaussian, with which the probability mass within a tolerance is integrated."""
 
@@ -51,7 +49,7 @@ class Posterior:
         """Compare explanations within a mode by their cost, and modes by the evidence of landmarks. ``terms`` are the models of all terms, and ``systematic`` is the scatter of their gradient
         (in its units) in addition to that of independent errors.
         """
-        states, normal = descend(states, [terms], NEWTON)
+        states, normal = terms.minimum(states)
         log = log_evidence(states, normal)
         member = states.mode[None] == torch.arange(len(terms.here), device=log.device)[:, None]
         norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
