@@ -5,7 +5,6 @@ An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a p
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch

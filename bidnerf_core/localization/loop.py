@@ -6,16 +6,14 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, accept
 from bidnerf_core.localization.descend import Normal, Term, descend
-from bidnerf_core.localization.explanations import Explanations, Seed, explanations, rows, tilted
+from bidnerf_core.localization.explanations import Explanations, Seed, explanations, rows
 from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, log10_nfa
 from bidnerf_core.localization.posterior import Posterior
 from bidnerf_core.localization.problem import Problem

@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.camera import exposure_times
-from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.states import Sights, States, project

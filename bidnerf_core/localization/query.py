@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics, exposure_times
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.states import Sights
