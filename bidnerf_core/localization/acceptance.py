@@ -6,14 +6,9 @@ The poses of all methods are checked here. The code that finds a pose computes i
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import torch
-
-from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.landmarks.map_camera import OTHER_CAMERA, MapCamera, map_cameras
@@ -22,75 +17,7 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import RenderedThresholds
-from bidnerf_core.mapping import trace
-
-WELL_BEFORE = 0.04
-"""Fraction of the extent by which a line of sight must hit the surface too early to count as a violation."""
-SIGHT_LINES = 300
-"""Maximum number of lines of sight that are traced."""
-FLAT = 0.02
-"""Standard deviation of an image's colours, in [0, 1], below which a gain and a bias can fit any view to it."""
-
-
-@dataclass(frozen=True)
-class SurfaceThresholds:
-    """Thresholds for accepting a pose on the baked surface."""
-
-    on_surface: float = 0.85  # minimum fraction of the measured points on the surface
-    colour_inliers: float = 0.42  # minimum fraction of the measured points on the surface and with its colour
-    free_space_violations: float = 0.15  # maximum fraction of lines of sight that pass through the surface
-    runner_up_margin: float = 0.15  # margin by which the second-best pose must be worse
-    # minimum inlier fraction of the rendered rays, of those with depth if at least 5 % have it
-    rendered_inliers: float = 0.8
-
-
-@dataclass(frozen=True)
-class SurfaceDiagnostics:
-    """Measures of how well a pose explains the measured points; all but the margin are fractions between 0 and 1."""
-
-    on_surface: float
-    colour_inliers: float
-    free_space_violations: float
-    runner_up_margin: float
-    rendered_inliers: float = 1.0  # 1 if nothing was rendered
-    support: Support | None = None  # None: not compared with other poses
-
-    def rejection(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict | None:
-        """Return the most serious reason to reject the pose, or None."""
-        if self.on_surface < thresholds.on_surface:
-            return Verdict(
-                Outcome.OFF_SURFACE, f"only {self.on_surface:.0%} of the measured points lie on the surface"
-            )
-        if self.colour_inliers < thresholds.colour_inliers:
-            share = f"{self.colour_inliers:.0%} of the measured points have the surface's colour"
-            return Verdict(Outcome.COLOUR_MISMATCH, f"only {share}")
-        if self.free_space_violations > thresholds.free_space_violations:
-            share = f"{self.free_space_violations:.0%} of the lines of sight"
-            return Verdict(Outcome.FREE_SPACE_VIOLATED, f"{share} pass through the surface")
-        if self.runner_up_margin < thresholds.runner_up_margin:
-            return Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
-        if not self.rendered_inliers >= thresholds.rendered_inliers:
-            share = f"{self.rendered_inliers:.0%} of the rendered rays agree with the measurements"
-            return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}")
-        return None if self.support is None else self.support.rejection()
-
-    def verdict(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict:
-        share = f"{self.colour_inliers:.0%} of the measured points match the surface in position and colour"
-        confidence = None if self.support is None else self.support.confidence
-        return self.rejection(thresholds) or Verdict(Outcome.CONVERGED, share, confidence)
-
-
-def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDiagnostics:
-    """Measure how well the points of ``judge``, transformed by one pose, fit the surface.
-
-    Each point counts by its inlier weight, so there is no hard threshold on single points. Points without a colour do not count
-    for the colour inliers, unless no point has a colour.
-    """
-    near, alike = judge.inliers(judge.correspondences(T[None]))
-    coloured = judge.cloud.coloured
-    both = (near * alike)[:, coloured] if bool(coloured.any()) else near
-    violations = free_space_violations(judge, T)
-    return SurfaceDiagnostics(float(near.mean()), float(both.mean()), violations, margin)
+from bidnerf_core.localization.support import SurfaceDiagnostics
 
 
 @dataclass(frozen=True)
@@ -198,24 +125,6 @@ def _doubted(found: LandmarkPose) -> str:
     return f", but they do not show whether {choice} are right: {other.compared(found.given_or_assumed)}"
 
 
-def is_blank(frame: Frame) -> bool:
-    """Return whether the image has a single colour, as if the lens were covered, or the frame has no colours at all."""
-    shown = frame.rgb.flatten(0, 1) if frame.hidden is None else frame.rgb[~frame.hidden]
-    return not frame.has_colour or float(shown.std(0, correction=0).max()) < FLAT
-
-
-def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
-    """Return the fraction of lines of sight that hit the surface well before the measured point."""
-    some, surface = cost.cloud.first(SIGHT_LINES), cost.surface
-    T = T.to(surface.device)
-    origins, ends = (T.apply(x.double()).to(some.points) for x in (some.origins, some.points))
-    length = torch.linalg.vector_norm(ends - origins, dim=-1)
-    met = trace(surface, origins, (ends - origins) / length.clamp(min=1e-9)[:, None])
-    # Grazing rays hit coarse cells early.
-    slack = max(WELL_BEFORE * surface.extent, 4 * surface.cell)
-    return float((met < length - slack).float().mean())
-
-
 def rendered_verdict(found: RefinementResult, thresholds: RenderedThresholds) -> Verdict:
     """Accept or reject a pose by newly drawn rays: their inliers, and their support against rival poses and a plain image."""
     if not bool(found.covariance.isfinite().all()):
@@ -229,35 +138,6 @@ def rendered_verdict(found: RefinementResult, thresholds: RenderedThresholds) ->
             Outcome.NOT_SETTLED, f"newly drawn rays give a further step of {found.step:.3g}, {most}"
         )
     return found.support.rejection() or Verdict(Outcome.CONVERGED, share, found.support.confidence)
-
-
-@dataclass(frozen=True)
-class DescentDiagnostics:
-    """The measures by which the answer of a first-order descent is judged."""
-
-    mean_loss: float  # of its last steps
-    converged_loss: float  # below which it is accepted
-    support: Support
-
-
-def descent_verdict(
-    mean_loss: float, threshold: float, finite: bool, reason: str, found: Support, least_explained: float
-) -> Verdict:
-    """Accept or reject the result of a first-order descent by the mean loss of its last steps and its support by other rays.
-
-    ``reason`` explains why it ended. Low-contrast images have a small loss even at a wrong pose.
-    """
-    if not finite or not math.isfinite(mean_loss):
-        return Verdict(Outcome.DIVERGED, reason)
-    reason = f"{reason}; mean loss {mean_loss:.3g}, must be below {threshold:.3g}"
-    if mean_loss >= threshold:
-        return Verdict(Outcome.HIGH_LOSS, reason)
-    rejection = found.rejection(least_explained)
-    return (
-        Verdict(Outcome.CONVERGED, reason, found.confidence)
-        if rejection is None
-        else replace(rejection, reason=f"{reason}, but {rejection.reason}")
-    )
 
 
 def may_be_miscalibrated(problem: Problem) -> bool:

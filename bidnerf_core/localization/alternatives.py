@@ -21,7 +21,6 @@ from bidnerf_core.camera import Orientation
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds
-from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.depth_scale import at_pose
 from bidnerf_core.localization.landmarks.chance import CONVINCING, DECISIVE, log_odds_of_share, probability_of
@@ -38,6 +37,7 @@ from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import ColourSettings, RefinementSettings, RefinementStage
 from bidnerf_core.localization.solvers.pivots import pivot
+from bidnerf_core.localization.support import log_odds
 from bidnerf_core.mapping import FIXED
 
 UNMISTAKABLE = -150.0

@@ -22,26 +22,25 @@ from bidnerf_core.localization.acceptance import (
 from bidnerf_core.localization.alternatives import decide
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
 from bidnerf_core.localization.by_colour import without_the_imprecise
-from bidnerf_core.localization.by_depth import localized_by_depth
-from bidnerf_core.localization.by_image_search import localized_by_images
 from bidnerf_core.localization.by_landmarks import (
     MOSTLY_ON_SURFACE,
     LandmarkAnswer,
     answer_by_landmarks,
     fused_answer,
+    is_sharp,
     localization_by_landmarks,
 )
+from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
 from bidnerf_core.localization.confidence import TRUSTED
-from bidnerf_core.localization.first_order import BidConfig, bid
 from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm
-from bidnerf_core.localization.methods import Method, SharedSettings
+from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
+from bidnerf_core.localization.occluders import nearest_piece
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.risk import within_risk
-from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
@@ -50,6 +49,8 @@ fails too.
 """
 IN_FRONT = 0.9
 """Minimum fraction of an occluder's points that must lie in front of the surface."""
+MANY_LANDMARKS = 500
+"""Minimum number of landmarks of a textured scene."""
 LEAST_SUPPORT = 0.5
 """Minimum confidence for landmarks to support a pose accepted on the surface."""
 
@@ -123,9 +124,10 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
             return _Proposal(found)
         return _Proposal(found, confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True).pose)
     if has_points:
-        found = localized_by_depth(problem, problem.surface, config, seed)
+        found = localize_by_depth(problem, problem.surface, config, seed)
     else:
-        found = localized_by_images(problem.without_depth(), problem.surface, config, seed)
+        hopeless = _unrecognised(problem) if matcher is not None and _is_hopeless(problem) else None
+        found = localize_by_images(problem, problem.surface, config, seed, hopeless)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
         found = without_the_imprecise(found, typical)
     if matcher is None:
@@ -135,6 +137,19 @@ def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> 
     if by_landmarks is not None and is_unsure and proposal.found.outcome is Outcome.TOO_FEW_MATCHES:
         return by_landmarks
     return proposal
+
+
+def _is_hopeless(problem: Problem) -> bool:
+    """Return whether an image without recognised landmarks cannot be localized, as the scene is textured but the field blurred."""
+    textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
+    return textured and not is_sharp(problem)
+
+
+def _unrecognised(problem: Problem) -> Verdict:
+    causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
+    focal = ", or its focal length may be too far off" if problem.focal_is_approximate else ""
+    why = f"too few landmarks were recognised, and the field is not sharp enough to compare images with it: {causes}{focal}"
+    return Verdict(Outcome.TOO_FEW_MATCHES, why)
 
 
 def _with_hint_at_landmarks(found: Localization) -> Localization:

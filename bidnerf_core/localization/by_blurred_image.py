@@ -17,7 +17,6 @@ from torch import Tensor
 from bidnerf_core.devices import moved
 from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.acceptance import may_be_miscalibrated
-from bidnerf_core.localization.beyond_chance import Support, support
 from bidnerf_core.localization.by_landmarks import is_sharp
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.costs.images import (
@@ -33,6 +32,7 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.solvers.levenberg_marquardt import Descent, descend
 from bidnerf_core.localization.solvers.pivots import Pivot, pivot
+from bidnerf_core.localization.support import Support, support
 
 WIDTH = 100
 """Longer side of the compared images, pixels."""

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Generator
+from jaxtyping import Float
+from torch import Generator, Tensor
 
 from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.acceptance import rendered_verdict
@@ -16,11 +17,21 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult, refine
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import ByColourConfig, RefinementStage
 
 TYPICAL_ERRORS = 4.5
 """Maximum standard deviation of an accepted position, in median errors of the map's own images."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """The remaining poses of a search, and the margin of the best over any different one; on the CPU."""
+
+    T: SE3  # (h), best first
+    scores: Float[Tensor, "h"]
+    margin: float  # score of the best different pose minus that of the best; infinite if there was none
+    path: SE3  # (s + 1): from the winning hypothesis to the best pose
+    losses: Float[Tensor, "s"]  # of the path before each step; costs of different stages are not comparable
 
 
 @dataclass(frozen=True, eq=False)

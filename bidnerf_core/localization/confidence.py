@@ -13,9 +13,9 @@ from functools import lru_cache
 from importlib.resources import files
 
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
-from bidnerf_core.localization.beyond_chance import ACCEPTED
 from bidnerf_core.localization.landmarks.chance import probability_of
 from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization.support import ACCEPTED
 
 TRUSTED = 0.95
 """Minimum confidence at which a pose by landmarks is trusted without further measurements."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.geometry import SE3, skew
 from bidnerf_core.localization.states import P, States
 
 SETTLED = 0.01
@@ -55,12 +56,25 @@ def total(states: States, terms: Sequence[Term]) -> Normal:
     return sum((term(states) for term in terms), start=prior(states))
 
 
-def descend(states: States, terms: Sequence[Term], steps: int) -> tuple[States, Normal]:
-    """Minimize the sum of ``terms`` and the prior from each state; a step that does not lower the sum is not taken."""
+def descend(
+    states: States,
+    terms: Sequence[Term],
+    steps: int,
+    pivot: Float[Tensor, "3"] | None = None,
+    path: list[tuple[SE3, Float[Tensor, "h"]]] | None = None,
+) -> tuple[States, Normal]:
+    """Minimize the sum of ``terms`` and the prior from each state; a step that does not lower the sum is not taken.
+
+    Steps are damped as updates that rotate about ``pivot`` (metres, the rig's frame), by default the rig's origin: about the middle
+    of the visible scene, rotation and translation decouple. Poses and costs before each step are added to ``path``.
+    """
     here = total(states, terms)
     damping = torch.full_like(here.cost, FIRST_DAMPING)
+    about = None if pivot is None else _about(pivot.to(here.hessian))
     for _ in range(steps):
-        step = damped_solution(here, damping)
+        if path is not None:
+            path.append((states.T, here.cost))
+        step = damped_solution(here, damping, about)
         if step.device.type == "cpu" and bool(((step * here.gradient).sum(-1) < SETTLED).all()):
             break  # where the host need not wait for this
         moved = states.retract(-step)
@@ -113,12 +127,28 @@ def unit_of(states: States) -> Float[Tensor, "h P"]:
     return torch.cat([torch.ones_like(states.z[:, :6]), 1 / states.deviation.clamp(min=1e-9)], -1)
 
 
-def damped_solution(normal: Normal, damping: Float[Tensor, "h"]) -> Float[Tensor, "h P"]:
-    diagonal = normal.hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
-    factor, _ = torch.linalg.cholesky_ex(
-        normal.hessian + torch.diag_embed((damping[:, None] + 1e-12) * diagonal)
-    )
-    return torch.cholesky_solve(normal.gradient[..., None], factor)[..., 0]
+def _about(pivot: Float[Tensor, "3"]) -> Float[Tensor, "P P"]:
+    """Return the matrix that takes an update whose rotation is about ``pivot`` to the same one about the rig's origin."""
+    found = torch.eye(P, dtype=pivot.dtype, device=pivot.device)
+    found[:3, 3:6] = skew(pivot)
+    return found
+
+
+def damped_solution(
+    normal: Normal, damping: Float[Tensor, "h"], about: Float[Tensor, "P P"] | None = None
+) -> Float[Tensor, "h P"]:
+    gradient, hessian = normal.gradient, normal.hessian
+    if about is not None:
+        gradient, hessian = gradient @ about, about.mT @ hessian @ about
+    diagonal = hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
+    # Scaled to a unit diagonal, whatever the units; along directions of no information the step is 0.
+    unit = diagonal.rsqrt()
+    scaled = unit[..., None] * hessian * unit[..., None, :]
+    eye = torch.eye(P, dtype=scaled.dtype, device=scaled.device)
+    factor, info = torch.linalg.cholesky_ex(scaled + (damping[:, None, None] + 1e-9) * eye)
+    step = unit * torch.cholesky_solve((unit * gradient)[..., None], factor)[..., 0]
+    step = torch.where(((info == 0) & step.isfinite().all(-1))[:, None], step, 0)
+    return step if about is None else step @ about.mT
 
 
 def log_det(hessian: Float[Tensor, "h p p"]) -> Float[Tensor, "h"]:

@@ -17,7 +17,7 @@ from torch import Generator, Tensor
 from bidnerf_core.devices import may_wait, without_waiting
 from bidnerf_core.fields import Observations, RadianceField, SceneBounds, render
 from bidnerf_core.geometry import SE3, USUAL
-from bidnerf_core.localization.beyond_chance import Support, support
+from bidnerf_core.localization.adam import History
 from bidnerf_core.localization.costs.linearization import flattened
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import SurfaceCost
@@ -25,9 +25,9 @@ from bidnerf_core.localization.covariance import sandwich_covariance, weight
 from bidnerf_core.localization.normal_equations import NormalEquations, Scaled
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import RefinementStage
-from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.solvers.pivots import pivot
+from bidnerf_core.localization.support import Support, support
 
 RIVALS = 3
 """Maximum number of other poses found with which the best one is compared."""
@@ -152,7 +152,10 @@ def _descended(cost: RenderedCost, T: SE3, history: History) -> SE3:
     stage = cost.stage
     with without_waiting():
         found = descend(cost, T, stage.steps, cost.pivot.moved, stage.damping, cost.settings.stop_step)
-    history.add_batch(found.poses.to("cpu"), found.costs.cpu())
+    poses, costs = found.poses.to("cpu"), found.costs.cpu()
+    best = costs.argmin(-1).tolist()
+    history.poses += [poses[i, best[i]] for i in range(1, len(best))]
+    history.losses += (costs.amin(-1)[:-1] / 2).tolist()
     return found.T[found.equations.cost.argsort()].normalized()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from bidnerf_core.depth import DEPTH_SENSORS
 from bidnerf_core.fields import (
@@ -18,15 +18,17 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.frames import DrawerName
 from bidnerf_core.geometry import Robust, RobustName
+from bidnerf_core.localization.pivot import PivotName
 from bidnerf_core.localization.risk import least_confidence
-from bidnerf_core.localization.solvers.history import AnswerName
-from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 RENDERED_DEPTH_SHARE = 0.038
 """Depth difference at which outliers begin in rendered rays, as a fraction of the scene's mean side."""
 LEAST_POINTS = 50
 """Minimum number of measured depths from which the shape of the scene can be recognised."""
+
+
+AnswerName = Literal["last", "best"]
 
 
 @dataclass(frozen=True)
@@ -41,12 +43,26 @@ class ColourSettings(Settings):
 
 
 @dataclass(frozen=True)
-class DepthSettings(Settings):
-    """Settings of the depth term, which applies where depth was measured."""
+class DepthLossSettings(Settings):
+    """Settings of the depth term of second-order steps, which applies where depth was measured."""
 
-    depth_weight: NotNegative = 1.0  # weight of the depth term; the photometric term has weight 1
+    # weight of the depth term; the photometric term has weight 1, and differences are in units of their scales
+    depth_weight: NotNegative = 3.0
     depth_loss: RobustName = "huber"  # robust loss of depth differences
-    depth_scale: Positive = 0.1  # depth difference, metres, at which outliers begin
+    # depth difference, metres, at which outliers begin; None: 3.8 % of the scene's mean side
+    depth_scale: Positive | None = None
+
+
+@dataclass(frozen=True)
+class DepthSettings(Settings):
+    """Settings of the depth term of first-order steps, which applies where depth was measured."""
+
+    depth_weight: NotNegative = (
+        1.0  # weight of the depth term, per square metre; the photometric term has weight 1
+    )
+    depth_loss: RobustName = "huber"  # robust loss of depth differences
+    # depth difference, metres, at which outliers begin; None: 3.8 % of the scene's mean side
+    depth_scale: Positive | None = None
     depth_residual: Annotated[str, OneOf(DEPTH_RESIDUALS), EXPERT] = "distance"  # how depths are compared
     # number of rays drawn from a sensor with rays of its own
     depth_rays: Annotated[int, Range(0, 10**7), EXPERT] = 512
@@ -73,7 +89,8 @@ def objective_of(
     """
     terms = [colour_term(colour.robust(colour_scale))]
     if depth is not None and depth.used:
-        scale = depth.depth_scale if depth_scale is None else depth_scale
+        scale = depth_scale or depth.depth_scale
+        assert scale is not None
         robust = Robust(depth.depth_loss, scale)
         miss = None if miss_scales is None else miss_scales * scale
         terms.append(depth_term(robust, depth.depth_weight, DEPTH_RESIDUALS[depth.depth_residual], miss))
@@ -103,11 +120,6 @@ class ReachSettings(Settings):
 
     # number of pixels drawn for each ray, for images with background; pixels on matter are preferred, then those that may hit it
     candidates: Annotated[int, Range(1, 64), EXPERT] = 1
-    # number of equal intervals of each ray, whether or not they may contain matter; 0: the field's own
-    samples: Annotated[int, Range(0, 4096), EXPERT] = 0
-    # standard deviation of the noise added to the query points of the field, metres, at the first step; 0: not blurred
-    blur: Annotated[float, Range(0.0), EXPERT] = 0.0
-    blur_steps: Annotated[int, Range(1, 10**7), EXPERT] = 200  # number of steps in which the blur halves
     # weight of the distance between measured points and the box of the scene, unless there is matter beyond the box
     box_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
 
@@ -117,7 +129,8 @@ class AdamSettings(Settings):
     """Settings of Adam's steps and of the criteria that end them."""
 
     max_steps: Count = 200  # maximum number of steps
-    learning_rate: Annotated[float, Above(0.0, 1e3)] = 0.01  # initial length of a step, metres and radians
+    # initial length of a step, metres and radians; None: 1 % of the distance to the pivot
+    learning_rate: Annotated[float, Above(0.0, 1e3)] | None = None
     decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor by which the learning rate falls in decay_steps
     decay_steps: Count = 100  # number of steps in which the learning rate falls by decay
     # stop once the mean loss of 20 steps is below this (epsilon of Alg. 1); 0: never
@@ -137,8 +150,9 @@ class SpreadSettings(Settings):
 
     # number of poses tried, including the start; 1: the start alone
     poses: Annotated[int, Range(1, 10**5)] = 32
-    # standard deviation of the poses along each axis of the camera, metres
-    spread_translation: NotNegative = 0.3
+    # standard deviation of the poses along each axis of the camera, metres; None: a fraction of the distance to the scene, 0.1 for
+    # ``bid-lm`` and 0.04 for ``inerf-lm``
+    spread_translation: NotNegative | None = None
     spread_rotation: NotNegative = 0.12  # standard deviation of the poses about each axis, radians
 
 
@@ -165,7 +179,8 @@ class RenderedThresholds(Settings):
 
     # minimum inlier fraction of the rays for an accepted pose
     converged_inliers: NotNegative = 0.93
-    converged_step: NotNegative = 0.02  # maximum length of a further step on those rays (metres, radians)
+    # maximum length of a further step on those rays: of the scene relative to its distance, and in radians
+    converged_step: NotNegative = 0.02
 
 
 @dataclass(frozen=True)
@@ -188,13 +203,18 @@ class RefinementStage:
     centring: int = 0
 
 
+def mean_side(bounds: SceneBounds) -> float:
+    """Return the geometric mean of the sides of the scene's box, metres."""
+    return math.prod(bounds.size) ** (1 / 3)
+
+
 def rendered_depth_scale(bounds: SceneBounds) -> float:
     """Return the depth difference (metres) at which outliers begin in rendered rays.
 
     A field's resolution, and hence the error of its depth, is a fraction of its box. The resolution of a baked surface does not
     matter: it may come from measured depth, which is more accurate than the field's renderings.
     """
-    return RENDERED_DEPTH_SHARE * math.prod(bounds.size) ** (1 / 3)
+    return RENDERED_DEPTH_SHARE * mean_side(bounds)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.landmarks.chance import DECISIVE, log_odds_of_share
 from bidnerf_core.localization.landmarks.consensus import sample_consensus
 from bidnerf_core.localization.landmarks.correspondences import MAX_AMBIGUITY, MIN_MATCHES, LandmarkMatches
@@ -24,6 +23,7 @@ from bidnerf_core.localization.landmarks.guided_pose import RADII, confirmed
 from bidnerf_core.localization.landmarks.matching import LOOKED_UP, LandmarkMatcher
 from bidnerf_core.localization.landmarks.pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.query import LandmarkQuery
+from bidnerf_core.localization.support import log_odds
 from bidnerf_core.mapping import (
     FIXED,
     GIVEN,

@@ -1,4 +1,4 @@
-"""Colours of rendered rays as a log likelihood."""
+"""Colours and distances of rendered rays as a log likelihood."""
 
 from __future__ import annotations
 
@@ -7,39 +7,75 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, normalize
 
 from bidnerf_core.camera import exposure_times
-from bidnerf_core.fields import RadianceField, RaySamples, SceneBounds, render, render_samples
-from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.devices import moved
+from bidnerf_core.fields import Observations, RadianceField, Rendering, SceneBounds, device_of, render
+from bidnerf_core.frames import Frame, View, colours_at, continued
+from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.descend import Normal
 from bidnerf_core.localization.states import MOTION, Sights, States, rays_by_camera, rays_through
+from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
+from bidnerf_core.localization.terms.landmarks import MAD
+from bidnerf_core.localization.terms.rendering import Derivatives, differentiate
 
 RAYS = 1024
 INDEPENDENT = 300.0
 """Largest number of independent measurements among rendered rays, as far as their own noise is concerned."""
+ALONE = 10.0
+"""The same without other measurements, at a pose that may be far off."""
 FIELD_ERRORS = 10.0
 """Variance of the rays' gradients relative to that by their noise: neighbouring rays share the errors of the field."""
-LEAST_WEIGHT = 0.01
-"""Rendering weight of a sample below which its derivatives are neglected."""
+GAIN_PRIOR = 0.001
+"""Precision of the gain's prior, relative to the number of rays. It matters only if everything in view has one colour."""
+MISS = 3.0
+"""Depth residual, in scales of the loss, of a ray that hits nothing: that of an outlier, but less than the whole distance."""
+OUTLIER = 3.0
+"""Residual, in scales of the loss, beyond which a ray disagrees with the rendering."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Colours of rendered rays; a gain and an offset of the exposure are eliminated per channel (variable projection)."""
+    """Colours of rendered rays and, with a ``depth_loss``, their distances.
+
+    A gain and an offset of the exposure are eliminated per channel (variable projection). All tensors are on the field's device.
+    """
 
     field: RadianceField
     bounds: SceneBounds
     sights: Sights  # (n) rotation and translation are T_rig_camera
     rgb: Float[Tensor, "n 3"]
+    coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
+    distance: Float[Tensor, "n"]  # metres along the ray, 0 where none was measured
     noise: float = 0.1  # of a channel, in the information of a ray
-    scale: float = 0.1  # of the robust loss: large enough for a wide basin, small enough to reject occluders
+    independent: float = INDEPENDENT
+    # of the norm of a colour difference: wide enough for a wide basin, and narrow enough to reject occluders
+    loss: Robust = Robust("geman-mcclure", 0.1)
+    depth_loss: Robust | None = None  # of depth differences, metres; None: colours alone
+    depth_weight: float = (
+        1.0  # of a squared depth difference relative to that of a colour, each in units of its scale
+    )
+    exposure: bool = True
+    sigma: float = 0.0  # metres: uncertainty of the map's surfaces; steep residuals have less weight in steps
 
     @staticmethod
-    def of(views: Sequence[View], field: RadianceField, bounds: SceneBounds, count: int, seed: int) -> Rays:
-        """Draw ``count`` visible pixels of ``views``, whose poses are relative to the last."""
+    def of(
+        views: Sequence[View],
+        field: RadianceField,
+        bounds: SceneBounds,
+        count: int,
+        seed: int,
+        blur: int = 1,
+        depth_rays: Observations | None = None,
+    ) -> Rays:
+        """Draw ``count`` visible pixels of ``views``, whose poses are relative to the last, and at most as many of
+        ``depth_rays``, which another sensor measured in the last camera's frame.
+
+        Colours are averaged over squares of ``blur`` pixels.
+        """
         generator, parts = torch.Generator().manual_seed(seed), []
         for view in views:
             frame, camera = view.frame, view.frame.intrinsics
@@ -50,38 +86,82 @@ class Rays:
             column, row = number % camera.width, number // camera.width
             pixels = torch.stack([column, row], -1).double() + 0.5
             times = exposure_times(pixels, camera) if len(views) == 1 else torch.zeros(len(pixels)).double()
-            flat, T = camera.unproject(pixels)[:, :2], view.T_ref_camera.to("cpu", torch.float64)
-            n = len(pixels)
-            parts.append(
-                (
-                    flat,
-                    times,
-                    T.rotation.expand(n, 3, 3),
-                    T.translation.expand(n, 3),
-                    frame.rgb[row, column].double(),
-                )
+            flat, T, n = camera.unproject(pixels), view.T_ref_camera.to("cpu", torch.float64), len(pixels)
+            depth = torch.zeros(n) if frame.depth is None else frame.depth.cpu()[row, column]
+            depth = torch.where(depth.isfinite(), depth.clamp(min=0), 0).double() * flat.norm(dim=-1)
+            rgb = (
+                colours_at(frame.held_rgb.cpu(), row, column)
+                if blur == 1
+                else averaged(frame, blur)[row, column]
             )
-        image, times, R, t, rgb = (torch.cat(part) for part in zip(*parts, strict=True))
-        return Rays(field, bounds, Sights(image, times, R, t), rgb)
+            R, t = T.rotation.expand(n, 3, 3), T.translation.expand(n, 3)
+            coloured = torch.full((n,), float(frame.has_colour)).double()
+            parts.append((flat[:, :2], times, R, t, rgb.double(), coloured, depth))
+        if depth_rays is not None:
+            # Such a ray is the central pixel of a camera of its own.
+            some = depth_rays.drawn(count, generator, torch.float64, "cpu")
+            zero = torch.zeros_like(some.origins)
+            parts.append((
+                zero[:, :2], zero[:, 0], _looking_along(some.directions), some.origins, zero, zero[:, 0], some.distance,
+            ))  # fmt: skip
+        image, times, R, t, *measured = (torch.cat(part) for part in zip(*parts, strict=True))
+        return moved(Rays(field, bounds, Sights(image, times, R, t), *measured), device_of(field))
+
+    def __len__(self) -> int:
+        return len(self.rgb)
 
     def __call__(self, states: States) -> Normal:
-        value, rows = self._residuals(states)
+        here = moved(states, self.rgb.device)
+        value, rows, steepness = self._residuals(here)
         cost, weight = self._robust(value)
-        flat, pull = rows.flatten(1, 2), (weight[..., None] * value).flatten(1, 2)
-        share = INDEPENDENT / (value.shape[1] + INDEPENDENT) / self.noise**2
-        hessian = (flat * weight.repeat_interleave(3, 1)[..., None]).mT @ flat
-        return Normal(share * cost.sum(-1), share * (flat * pull[..., None]).sum(1), share * hessian)
+        if self.sigma > 0:
+            weight = weight / (1 + (self.sigma / self.loss.scale * steepness).square())
+        flat, pull = rows.flatten(1, 2), (weight * value).flatten(1, 2)
+        hessian = (flat * weight.flatten(1)[..., None]).mT @ flat
+        share = self._share
+        found = Normal(share * cost.sum(-1), share * (flat * pull[..., None]).sum(1), share * hessian)
+        return moved(found, states.z.device)
+
+    @property
+    def _share(self) -> float:
+        return self.independent / (len(self) + self.independent) / self.noise**2
 
     def costs(self, states: States) -> Float[Tensor, "h n"]:
         """Return each ray's robust loss, without derivatives, in units of the noise."""
-        rgb, _ = self._seen(states)
-        gain, offset, _ = self._exposure(rgb)
-        return self._robust(gain[:, None] * rgb + offset[:, None] - self.rgb)[0] / self.noise**2
+        return (
+            self._robust(self._compared(moved(states, self.rgb.device)))[0].to(states.z.device)
+            / self.noise**2
+        )
+
+    def cost(self, states: States) -> Float[Tensor, "h"]:
+        """Return the cost alone."""
+        return self._share * self.noise**2 * self.costs(states).sum(-1)
+
+    def agreement(self, states: States) -> Float[Tensor, "h"]:
+        """Return the fraction of the rays whose colours and distances agree with the rendering."""
+        value = self._compared(moved(states, self.rgb.device)).abs()
+        good = (value[..., :3] <= OUTLIER * self.loss.scale).all(-1)
+        if self.depth_loss is not None:
+            good = good & (value[..., 3] <= OUTLIER * self._depth_unit * self.depth_loss.scale)
+        return good.double().mean(-1).to(states.z.device)
+
+    def colour_noise(self, states: States) -> Float[Tensor, "h"]:
+        """Return the robust standard deviation of the colour differences."""
+        value = self._compared(moved(states, self.rgb.device))[:, self.coloured > 0, :3]  # host
+        return (MAD * value.abs().flatten(1).nanmedian(-1).values).to(states.z.device)
+
+    def plain_costs(self) -> Float[Tensor, "n"] | None:
+        """Return each ray's robust loss, in units of the noise, if all had the colour that fits best; None with depth, or without colours."""
+        if (self.depth_loss is not None and bool((self.distance > 0).any())) or not bool(self.coloured.any()):
+            return None
+        _, offset = self._exposure(torch.zeros_like(self.rgb)[None])
+        value = (offset - self.rgb) * self.coloured[:, None]
+        return (self._robust(value)[0] / self.noise**2)[0].cpu()
 
     def fitted(self, states: States) -> Rays:
         """Return the term with the noise that follows from the scatter of the rays' gradients at the first state."""
-        value, rows = self._residuals(states[:1])
-        weight = self._robust(value)[1][0, :, None, None]
+        value, rows, _ = self._residuals(moved(states[:1], self.rgb.device))
+        weight = self._robust(value)[1][0, :, :, None]
         rows = rows[0, :, :, :6]
         hessian = (weight * rows).flatten(0, 1).mT @ rows.flatten(0, 1)
         scores = (weight[..., 0] * value[0])[..., None] * rows
@@ -91,42 +171,86 @@ class Rays:
         ratio = whitened @ (unit[:, None] * (scores.mT @ scores) * unit)
         return replace(self, noise=min(max(math.sqrt(max(float(ratio.trace()), 0) / 6), 0.005), 0.3))  # host
 
-    def _robust(self, value: Float[Tensor, "h n 3"]) -> tuple[Float[Tensor, "h n"], Float[Tensor, "h n"]]:
-        """Return Geman and McClure's loss of each ray, in squared colours, and its weight."""
-        squared, half = value.square().sum(-1), (2 * self.scale) ** 2
-        return 0.5 * half * squared / (squared + half), (half / (squared + half)).square()
+    @property
+    def _depth_unit(self) -> float:
+        """Colour difference that counts as much as a depth difference of one metre."""
+        assert self.depth_loss is not None
+        return math.sqrt(self.depth_weight) * self.loss.scale / self.depth_loss.scale
 
-    def _seen(self, states: States):
-        """Return the rendered colours (h n 3), and what their derivatives need."""
+    def _robust(self, value: Float[Tensor, "h n c"]) -> tuple[Float[Tensor, "h n"], Float[Tensor, "h n c"]]:
+        """Return each ray's loss, in squared colours, and the weight of each channel."""
+        norm = value[..., :3].norm(dim=-1)
+        cost, weight = self.loss(norm), self.loss.weight(norm)[..., None].expand_as(value[..., :3])
+        if value.shape[-1] > 3 and self.depth_loss is not None:
+            unit = self._depth_unit
+            cost = cost + unit**2 * self.depth_loss(value[..., 3] / unit)
+            weight = torch.cat([weight, self.depth_loss.weight(value[..., 3:] / unit)], -1)
+        return cost, weight
+
+    def _sent(self, states: States) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return the sights on the plane z = 1, their lengths and directions in the rig's frame; and the rays (h n), world."""
         rays, sights = rays_through(states, self.sights.image), self.sights
         length = rays.norm(dim=-1, keepdim=True)
-        unit = (sights.rotation @ (rays / length)[..., None])[..., 0]  # in the rig's frame
-        directions = (unit @ states.T.rotation.mT).float()
-        origins = (states.T.translation[:, None] + sights.translation @ states.T.rotation.mT).float()
-        leaves = [x.expand_as(directions).flatten(0, 1).contiguous() for x in (origins, directions)]
-        rendering = render(self.field, self.bounds.rays(*leaves), self.bounds.background)
-        seen = rendering.rgb.detach().double().unflatten(0, directions.shape[:2])
-        return seen, (rays, length, unit, leaves, rendering)
+        unit = (sights.rotation @ (rays / length)[..., None])[..., 0]
+        directions = unit @ states.T.rotation.mT
+        origins = states.T.translation[:, None] + sights.translation @ states.T.rotation.mT
+        return rays, length, unit, origins.float().flatten(0, 1), directions.float().flatten(0, 1)
 
-    def _residuals(self, states: States):
-        seen, (rays, length, unit, leaves, rendering) = self._seen(states)
-        # Of the samples that matter: most lie in empty space.
-        kept = rendering.samples.valid & (rendering.weights > LEAST_WEIGHT)
-        order = (~kept).sort(dim=-1, stable=True).indices[:, : max(1, int(kept.sum(-1).amax()))]  # host
-        samples = RaySamples(
-            *(x.gather(-1, order) for x in (rendering.samples.starts, rendering.samples.ends, kept))
+    def _channels(self, rendering: Rendering, index: Int[Tensor, "k"]) -> Float[Tensor, "k c"]:
+        """Return rendered colours and depth differences; ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``.
+
+        The fraction of a ray that passes through the scene counts as if it hit something ``miss`` too far away: a rendered
+        distance of 0 would jump at silhouettes, where its derivative is of no use.
+        """
+        if self.depth_loss is None:
+            return rendering.rgb
+        measured = self.distance[index % len(self)].to(rendering.rgb)
+        miss = MISS * self.depth_loss.scale
+        off = rendering.distance - rendering.opacity * measured + (1 - rendering.opacity) * miss
+        return torch.cat([rendering.rgb, torch.where(measured > 0, off, 0)[:, None]], -1)
+
+    def _compared(self, states: States) -> Float[Tensor, "h n c"]:
+        """Return the residuals without derivatives."""
+        *_, origins, directions = self._sent(states)
+        rendering = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)
+        seen = self._channels(rendering, torch.arange(len(origins), device=origins.device))
+        return self._differences(seen.double().unflatten(0, (len(states), -1)))[0]
+
+    def _differences(
+        self, seen: Float[Tensor, "h n c"]
+    ) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h 1 3"]]:
+        """Return rendered minus measured, and the gain of the exposure."""
+        gain, offset = self._exposure(seen[..., :3])
+        value = (gain * seen[..., :3] + offset - self.rgb) * self.coloured[:, None]
+        if self.depth_loss is None:
+            return value, gain
+        return torch.cat([value, self._depth_unit * seen[..., 3:]], -1), gain
+
+    def _exposure(
+        self, seen: Float[Tensor, "h n 3"]
+    ) -> tuple[Float[Tensor, "h 1 3"], Float[Tensor, "h 1 3"]]:
+        if not self.exposure:
+            return torch.ones_like(seen[:, :1]), torch.zeros_like(seen[:, :1])
+        half = 2 * self.loss.scale
+        known, precision = self.coloured[None, :, None], GAIN_PRIOR * len(self)
+        gain, offset = fit_exposure(
+            seen, self.rgb, lambda off: 1 / (1 + (off / half).square()), known, (precision, 0.0)
         )
-        leaves = [x.requires_grad_() for x in leaves]
-        with torch.enable_grad():
-            moving = render_samples(
-                self.field, self.bounds.rays(*leaves), samples, self.bounds.background
-            ).rgb
-            parts = [torch.autograd.grad(moving[:, c].sum(), leaves, retain_graph=c < 2) for c in range(3)]
-        gain, offset, basis = self._exposure(seen)
-        value = gain[:, None] * seen + offset[:, None] - self.rgb
-        by_origin, by_direction = (
-            torch.stack([p[k] for p in parts], 1).double().unflatten(0, seen.shape[:2]) for k in (0, 1)
+        return gain.clamp(0.1, 10), offset
+
+    def _residuals(
+        self, states: States
+    ) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h n c P"], Float[Tensor, "h n c"]]:
+        """Return the residuals, their derivatives, and the norms of their gradients by the rays' origins."""
+        rays, length, unit, origins, directions = self._sent(states)
+        found: Derivatives = differentiate(
+            self.field, self.bounds.rays(origins, directions), self.bounds.background, self._channels
         )
+        seen, by_origin, by_direction = (
+            part.double().unflatten(0, (len(states), -1))
+            for part in (found.value, found.by_origin, found.by_direction)
+        )
+        value, gain = self._differences(seen)
         R, sights = states.T.rotation[:, None], self.sights
         by_origin, by_direction = by_origin @ R, by_direction @ R  # in the rig's axes
 
@@ -141,23 +265,38 @@ class Rays:
         by_row = by_frame(own, turned, torch.zeros_like(sight), sight)
         across = (turned - (turned @ sight[..., None]) * sight[..., None, :]) / length[..., None]
         by_motion = by_row * sights.times[:, None, None] * states.deviation[:, None, None, MOTION]
-        rows = [by_pose, across @ rays_by_camera(rays, states), by_motion, torch.zeros_like(by_pose[..., :1])]
-        rows = gain[:, None, :, None] * torch.cat(rows, -1)
-        rows = rows - rows.mean(1, keepdim=True)
-        return value, rows - basis[..., None] * (basis[..., None] * rows).sum(1, keepdim=True)
+        parts = [
+            by_pose,
+            across @ rays_by_camera(rays, states),
+            by_motion,
+            torch.zeros_like(by_pose[..., :1]),
+        ]
+        rows, steepness = torch.cat(parts, -1), by_origin.norm(dim=-1)
+        scale = torch.cat([gain * self.coloured[:, None], torch.ones_like(value[..., 3:])], -1)
+        if self.depth_loss is not None:
+            scale = torch.cat([scale[..., :3], self._depth_unit * scale[..., 3:]], -1)
+        rows, steepness = scale[..., None] * rows, scale * steepness
+        if self.exposure:
+            weight = self._robust(value)[1][..., :3] * self.coloured[:, None]
+            colours = eliminate(rows[..., :3, :], seen[..., :3], weight)
+            rows = torch.cat([colours, rows[..., 3:, :]], -2)
+        return value, rows, steepness
 
-    def _exposure(self, seen: Float[Tensor, "h n 3"]):
-        """Return gain and offset (h 3) by reweighted least squares, and the unit vector (h n 3) of the gain."""
-        weight = torch.ones_like(seen)
-        for _ in range(3):
-            total = weight.sum(1)
-            mean, target = (weight * seen).sum(1) / total, (weight * self.rgb).sum(1) / total
-            centred = seen - mean[:, None]
-            square = (weight * centred.square()).sum(1)
-            gain = ((weight * centred * (self.rgb - target[:, None])).sum(1) / square.clamp(min=1e-9)).clamp(
-                0.1, 10
-            )
-            offset = target - gain * mean
-            weight = 1 / (1 + ((gain[:, None] * seen + offset[:, None] - self.rgb) / (2 * self.scale)) ** 2)
-        basis = seen - seen.mean(1, keepdim=True)
-        return gain, offset, basis / basis.norm(dim=1, keepdim=True).clamp(min=1e-9)
+
+def averaged(frame: Frame, size: int) -> Float[Tensor, "h w 3"]:
+    """Return the colours averaged over squares of ``size`` pixels and interpolated between them; hidden pixels are filled in."""
+    height, width = frame.held_rgb.shape[:2]
+    size = min(size, height, width)
+    rgb = continued(frame).cpu().float().permute(2, 0, 1)[None]
+    small = avg_pool2d(rgb, size, ceil_mode=True, count_include_pad=False)
+    # Enlarged to whole squares, then cropped to the image, so that squares stay in place.
+    covered = (small.shape[2] * size, small.shape[3] * size)
+    smooth = interpolate(small, covered, mode="bilinear", align_corners=False)[..., :height, :width]
+    return smooth[0].permute(1, 2, 0)
+
+
+def _looking_along(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+    """Return rotations that take the z axis to unit ``directions``."""
+    least = torch.nn.functional.one_hot(directions.abs().argmin(-1), 3).to(directions)
+    x = normalize(torch.linalg.cross(least, directions), dim=-1)
+    return torch.stack([x, torch.linalg.cross(directions, x), directions], -1)

@@ -1,4 +1,4 @@
-"""Distances of measured points from the baked surface as a log likelihood."""
+"""Distances of measured points from the baked surface, and differences of their colours, as a log likelihood."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import exposure_times
+from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations
-from bidnerf_core.frames import View
+from bidnerf_core.frames import View, colours_at
+from bidnerf_core.geometry import inlier_weight
 from bidnerf_core.localization.descend import Normal
 from bidnerf_core.localization.states import DEPTH, MOTION, Sights, States, rays_by_camera, rays_through
+from bidnerf_core.localization.terms.exposure import fit_exposure
 from bidnerf_core.localization.terms.landmarks import MAD
 from bidnerf_core.mapping import SurfaceMap
 
@@ -21,74 +24,193 @@ POINTS = 500
 """Number of points that are compared."""
 INDEPENDENT = 10.0
 """Largest number of independent measurements among depths against the surface."""
+LEAST = 50
+"""Least number of measured points from which a shape can be recognized."""
 DISC = 1.5
 """Radius of a surfel in cells: beyond it, a point does not lie on the surface."""
+COLOUR = 0.15
+"""Norm of the colour difference (three channels, each in [0, 1]) at which a point's inlier weight is one half."""
+MOST_CHANGE = 0.2
+"""Maximum change of a surfel's colour to which its gradient is extrapolated within the plane."""
+GAINED = 0.05
+"""Minimum increase of the colour inliers by an exposure, as a fraction of all points, for it to be applied.
+
+Blur also lowers contrast, but restoring that contrast only enlarges the differences.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Distances of measured points from the planes of the nearest surfels, metres."""
+    """Distances of measured points from the planes of the nearest surfels, metres, and differences from their colours.
+
+    All tensors are on the surface's device.
+    """
 
     surface: SurfaceMap
     sights: Sights  # (n) pixels of measured depth; rotation and translation are T_rig_camera
     z: Float[Tensor, "n"]  # metres, measured along the optical axis
-    fixed: Float[Tensor, "n 3"]  # metres: points of another sensor in the camera's frame, for which z is 0
+    fixed: Float[Tensor, "n 3"]  # metres: points of another sensor, relative to it, for which z is 0
+    rgb: Float[Tensor, "n 3"]
+    coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     noise: float  # metres
+    colour_weight: float = 0.0  # of colours, relative to distances
 
     @staticmethod
     def of(
-        views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int
+        views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int, count: int = POINTS
     ) -> Surface | None:
-        """Draw measured points of ``views``, whose poses are relative to the last; None if there are too few."""
+        """Draw measured points of ``views``, whose poses are relative to the last, in random order; None if there are too few."""
         generator, parts = torch.Generator().manual_seed(seed), []
         for view in views:
-            depth = torch.zeros((0, 0)) if view.frame.depth is None else view.frame.depth.cpu()
+            frame = view.frame
+            depth = torch.zeros((0, 0)) if frame.depth is None else frame.depth.cpu()
             row, column = ((depth > 0) & depth.isfinite()).nonzero().unbind(-1)
-            if view.frame.hidden is not None and len(row):
-                shown = ~view.frame.hidden.cpu()[row, column]
+            if frame.hidden is not None and len(row):
+                shown = ~frame.hidden.cpu()[row, column]
                 row, column = row[shown], column[shown]
-            drawn = torch.randperm(len(row), generator=generator)[: -(-POINTS // len(views))]
-            pixels = torch.stack([column[drawn], row[drawn]], -1).double() + 0.5
-            camera, z = view.frame.intrinsics, depth[row[drawn], column[drawn]].double()
+            drawn = torch.randperm(len(row), generator=generator)[: -(-count // len(views))]
+            row, column = row[drawn], column[drawn]
+            pixels = torch.stack([column, row], -1).double() + 0.5
+            camera, z, n = frame.intrinsics, depth[row, column].double(), len(row)
             times = exposure_times(pixels, camera) if len(views) == 1 else torch.zeros_like(z)
+            T = view.T_ref_camera.to("cpu", torch.float64)
+            R, t = T.rotation.expand(n, 3, 3), T.translation.expand(n, 3)
+            rgb = colours_at(frame.held_rgb.cpu(), row, column).float()
+            coloured = torch.full((n,), float(frame.has_colour))
+            flat = camera.unproject(pixels)[:, :2]
+            parts.append((flat, times, R, t, z, torch.zeros((n, 3)).double(), rgb, coloured))
+        if rays is not None and len(rays):
+            some = rays.drawn(count, generator, torch.float64, "cpu")
+            zero, n = torch.zeros_like(some.origins), len(some)
+            eye = torch.eye(3, dtype=torch.float64).expand(n, 3, 3)
+            points = some.points - some.origins
             parts.append(
                 (
-                    camera.unproject(pixels)[:, :2],
-                    times,
-                    z,
-                    torch.zeros((len(z), 3)).double(),
-                    view.T_ref_camera,
+                    zero[:, :2],
+                    zero[:, 0],
+                    eye,
+                    some.origins,
+                    zero[:, 0],
+                    points,
+                    zero.float(),
+                    zero[:, 0].float(),
                 )
             )
-        if rays is not None and len(rays):
-            points = rays.drawn(POINTS, generator, device="cpu").points.double()
-            zero = torch.zeros(len(points), dtype=torch.float64)
-            parts.append((points[:, :2] * 0, zero, zero, points, views[-1].T_ref_camera))
-        image, times, z, fixed = (torch.cat([part[i] for part in parts]) for i in range(4))
-        if len(z) < 50:
+        total = sum(len(part[0]) for part in parts)
+        if total < LEAST:
             return None
-        R = torch.cat([part[4].rotation.double().cpu().expand(len(part[2]), 3, 3) for part in parts])
-        t = torch.cat([part[4].translation.double().cpu().expand(len(part[2]), 3) for part in parts])
-        return Surface(surface, Sights(image, times, R, t), z, fixed, 2 * surface.cell)
+        order = torch.randperm(total, generator=generator)
+        image, times, R, t, *measured = (torch.cat(part)[order] for part in zip(*parts, strict=True))
+        term = Surface(surface, Sights(image, times, R, t), *measured, noise=2 * surface.cell)
+        return moved(term, surface.device)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def first(self, count: int) -> Surface:
+        """Return the term of the first ``count`` points, which are a random sample."""
+        some = slice(0, count)
+        names = ("sights", "z", "fixed", "rgb", "coloured")
+        return replace(self, **{name: getattr(self, name)[some] for name in names})
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """The measured points in the rig's frame, with the stated camera at rest."""
+        image, sights = self.sights.image, self.sights
+        local = torch.cat([image, torch.ones_like(image[:, :1])], -1) * self.z[:, None] + self.fixed
+        return (sights.rotation @ local[..., None])[..., 0] + sights.translation
+
+    @property
+    def origins(self) -> Float[Tensor, "n 3"]:
+        """The positions of the sensors in the rig's frame."""
+        return self.sights.translation
 
     def __call__(self, states: States) -> Normal:
-        r, squared, normal, local, rays = self._offsets(states)
+        here = moved(states, self.surface.device)
+        r, squared, normal, index, along, local, rays = self._offsets(here)
         # Geman-McClure: points of an occluder have almost no influence
-        inlier = 1 / (1 + squared / (2 * self.noise) ** 2)
-        share = INDEPENDENT / len(self.z)
+        inlier = inlier_weight(squared, 2 * self.noise)
+        share = INDEPENDENT / len(self)
         cost = share * 2 * (1 - inlier).sum(-1)
         weight = share * inlier.square() / self.noise**2
-        rows = self._rows(states, normal, local, rays)
-        return Normal(cost, ((weight * r)[..., None] * rows).sum(1), (rows * weight[..., None]).mT @ rows)
+        R = here.T.rotation
+        gradient = hessian = 0
+        if self.colour_weight:
+            difference, slope = self._colours(index, along)
+            alike = self._alike(difference)
+            weight = weight * (1 + self.colour_weight * alike)
+            cost = cost + share * 2 * self.colour_weight * (1 - inlier * alike).sum(-1)
+            by_colour = 4 * share * self.colour_weight * inlier * alike.square() / COLOUR**2
+            for channel in range(3):
+                rows = self._rows(here, slope[..., channel, :].double() @ R, local, rays)
+                pull = (by_colour * difference[..., channel])[..., None]
+                gradient = gradient + (pull * rows).sum(1)
+                hessian = hessian + (rows * by_colour[..., None]).mT @ rows
+        rows = self._rows(here, normal @ R, local, rays)
+        gradient = gradient + ((weight * r)[..., None] * rows).sum(1)
+        found = Normal(cost, gradient, hessian + (rows * weight[..., None]).mT @ rows)
+        return moved(found, states.z.device)
 
     def near(self, states: States) -> Float[Tensor, "h n"]:
         """Return how far each point is on the surface: its inlier weight."""
-        return 1 / (1 + self._offsets(states)[1] / (3 * self.noise) ** 2)
+        return inlier_weight(self._offsets(states)[1], 3 * self.noise)
+
+    def inliers(self, states: States) -> tuple[Float[Tensor, "h n"], Float[Tensor, "h n"]]:
+        """Return each point's inlier weights by distance and by colour."""
+        here = moved(states, self.surface.device)
+        _, squared, _, index, along, *_ = self._offsets(here)
+        found = inlier_weight(squared, 2 * self.noise), self._alike(self._colours(index, along)[0])
+        return moved(found, states.z.device)
+
+    def costs(self, states: States) -> Float[Tensor, "h n"]:
+        """Return each point's cost, 0 to 1 plus the weight of colours."""
+        near, alike = self.inliers(states)
+        return 1 - near + self.colour_weight * (1 - near * alike)
 
     def fitted_noise(self, states: States) -> Surface:
         """Return the term with the noise of the points at the first state."""
-        r, least = self._offsets(states[:1])[0].abs(), 0.25 * self.surface.cell
-        return replace(self, noise=min(max(MAD * float(r.median()), least), 3 * self.noise))  # host
+        r = self._offsets(moved(states[:1], self.surface.device))[0].abs()
+        return replace(
+            self, noise=min(max(MAD * float(r.median()), 0.25 * self.surface.cell), 3 * self.noise)
+        )  # host
+
+    def exposed(self, states: States) -> Surface:
+        """Return the term with colours converted to the map's exposure, by the points on the surface at the first state.
+
+        The colours stay as they are if hardly any more points have the surface's colour then.
+        """
+        here = moved(states[:1], self.surface.device)
+        _, squared, _, index, along, *_ = self._offsets(here)
+        difference, near = self._colours(index, along)[0], inlier_weight(squared, 2 * self.noise)
+        known = (near * self.coloured)[..., None].float()
+        surface = difference + self.rgb
+        gain, offset = fit_exposure(
+            surface,
+            self.rgb,
+            lambda off: inlier_weight(off.square(), COLOUR),
+            known,
+            (0.02 * len(self), 0.0),
+            6,
+        )
+        rgb = ((self.rgb - offset[0]) / gain[0].clamp(min=0.1)).clamp(0, 1)
+        changed = replace(self, rgb=rgb)
+        gained = near * (changed._alike(surface - rgb) - self._alike(difference)) * self.coloured
+        return changed if float(gained.mean()) > GAINED else self  # host
+
+    def _alike(self, difference: Float[Tensor, "h n 3"]) -> Float[Tensor, "h n"]:
+        return inlier_weight(difference.double().square().sum(-1), COLOUR)
+
+    def _colours(
+        self, index: Tensor, along: Tensor
+    ) -> tuple[Float[Tensor, "h n 3"], Float[Tensor, "h n 3 3"]]:
+        """Return the surface's colour at each point minus the measured one, and its derivative by the point's position (world)."""
+        surfels = self.surface.surfels
+        slope = surfels.rgb_gradient[index]
+        change = (slope @ along.to(slope)[..., None])[..., 0]
+        slope = slope * (change.abs() < MOST_CHANGE)[..., None]
+        difference = surfels.rgb[index] + change.clamp(-MOST_CHANGE, MOST_CHANGE) - self.rgb
+        seen = self.coloured[:, None]
+        return difference * seen, slope * seen[..., None]
 
     def _offsets(self, states: States):
         rays, sights = rays_through(states, self.sights.image), self.sights
@@ -101,9 +223,9 @@ class Surface:
         offset = world - self.surface.surfels.positions[index]
         normal = self.surface.surfels.normals[index].double()
         across = (offset * normal).sum(-1)
-        along = (offset.square().sum(-1) - across.square()).clamp(min=0).sqrt()
-        beyond = (along - DISC * self.surface.cell).clamp(min=0)
-        return across, across.square() + beyond.square(), normal @ states.T.rotation, local, rays
+        along = offset - across[..., None] * normal
+        beyond = (along.norm(dim=-1) - DISC * self.surface.cell).clamp(min=0)
+        return across, across.square() + beyond.square(), normal, index, along, local, rays
 
     def _rows(self, states, normal, local, rays) -> Float[Tensor, "h n P"]:
         sights = self.sights

@@ -14,14 +14,13 @@ from bidnerf_core.depth import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames import Frame, View, visible_at
 from bidnerf_core.geometry import SE3, USUAL
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
-from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, refine_by_colour
+from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, SearchResult, refine_by_colour
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.landmarks.pose import CameraDoubt, LandmarkPose, MatchEvidence
 from bidnerf_core.localization.landmarks.query import pixel_threshold
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import ByColourConfig, TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius

@@ -10,9 +10,9 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.acceptance import is_blank
-from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
+from bidnerf_core.localization.auto import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
+from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.problem import Problem, SceneMap
 from bidnerf_core.localization.result import Localization

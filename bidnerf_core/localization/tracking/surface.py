@@ -29,7 +29,7 @@ from bidnerf_core.localization.covariance import (
 )
 from bidnerf_core.localization.normal_equations import GaussianPrior, Scaled, Sum
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.by_points import JUDGED
+from bidnerf_core.localization.search import JUDGED
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.tracking.motion import PoseEstimate
 from bidnerf_core.mapping import SurfaceMap

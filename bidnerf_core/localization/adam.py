@@ -11,25 +11,28 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from threading import Lock
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.devices import constant, noted, without_waiting
+from bidnerf_core.devices import constant, moved, noted, without_waiting
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.settings import AdamSettings
-from bidnerf_core.localization.solvers.history import WINDOW, History
-from bidnerf_core.localization.solvers.pivots import Pivot
+from bidnerf_core.localization.pivot import Pivot
+from bidnerf_core.localization.settings import AdamSettings, AnswerName
 from bidnerf_core.progress import check_stopped
 
+WINDOW = 20
+"""Steps over which the noisy loss of a few rays is averaged."""
 WARM_UP = 3
 """Steps before the capture, which fill caches and load kernels, as a capture does not allow this."""
 _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 Loss = Callable[[SE3], Tensor]
+RATE = 0.01
+"""Usual learning rate: of translations as a fraction of the distance to the pivot, of rotations in radians."""
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 """Decay rates of the moments, and the constant added to the root of the second (Kingma and Ba 2015, Alg. 1)."""
 
@@ -85,9 +88,10 @@ class AdamSteps:
 
     def __init__(self, loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3) -> None:
         device = start.translation.device
-        self._loss, self._pivot, self._config = loss, pivot.to(device), config
-        turning = config.learning_rate / pivot.lever_arm
-        self._rate = torch.tensor([config.learning_rate] * 3 + [turning] * 3, dtype=torch.float64).to(device)
+        self._loss, self._pivot, self._config = loss, moved(pivot, device), config
+        lever = pivot.lever_arm
+        length = RATE * lever if config.learning_rate is None else config.learning_rate
+        self._rate = torch.tensor([length] * 3 + [length / lever] * 3, dtype=torch.float64).to(device)
         self._T = SE3(start.rotation.clone(), start.translation.clone())
         self._steps, self._updates = (torch.zeros((), dtype=torch.float64, device=device) for _ in range(2))
         self._mean, self._square = (torch.zeros(6, dtype=torch.float64, device=device) for _ in range(2))
@@ -108,9 +112,9 @@ class AdamSteps:
             (gradient,) = torch.autograd.grad(value, delta)
             update = self._update(gradient)
         with torch.no_grad():
-            moved = self._pivot.moved(self._T, update).polished()
-            finite = moved.rotation.isfinite().all() & moved.translation.isfinite().all()
-            for now, then in ((self._T.rotation, moved.rotation), (self._T.translation, moved.translation)):
+            there = self._pivot.moved(self._T, update).polished()
+            finite = there.rotation.isfinite().all() & there.translation.isfinite().all()
+            for now, then in ((self._T.rotation, there.rotation), (self._T.translation, there.translation)):
                 now.copy_(torch.where(finite, then, now))
             pose = torch.cat([self._T.rotation.flatten(), self._T.translation])
             row = torch.cat([pose, torch.stack([value.detach().to(pose), finite.to(pose)])])
@@ -137,6 +141,53 @@ class AdamSteps:
         fade = constant((self._config.decay,), self._steps)[0] ** (self._steps / self._config.decay_steps)
         root = self._square.sqrt() / bias_of_square.sqrt() + EPSILON
         return -self._rate * fade / bias * (self._mean / root)
+
+
+@dataclass(eq=False)
+class History:
+    """Poses from the start on, and the loss at each but the last."""
+
+    poses: list[SE3]
+    losses: list[float] = field(default_factory=list)
+
+    @property
+    def T(self) -> SE3:
+        """The current pose."""
+        return self.poses[-1]
+
+    def recent_loss(self) -> float:
+        """Return the mean of the last ``WINDOW`` losses; NaN if there are none."""
+        last = self.losses[-WINDOW:]
+        return sum(last) / len(last) if last else math.nan
+
+    def recent_step(self) -> float:
+        """Return the mean length of the last ``WINDOW`` steps' tangent vectors, metres and radians alike."""
+        if len(self.poses) < 2:
+            return math.inf
+        way = SE3.stack(self.poses[-WINDOW - 1 :])
+        return float((way[:-1].inverse() @ way[1:]).log().norm(dim=-1).mean())
+
+    def stop(self, loss_below: float, step_below: float) -> str | None:
+        """Return the reason to stop, or None; a threshold of 0 is never met."""
+        if len(self.losses) < WINDOW:
+            return None
+        if self.recent_loss() < loss_below:
+            return f"mean loss of {WINDOW} steps fell below {loss_below:g}"
+        if step_below > 0 and self.recent_step() < step_below:
+            return f"mean length of {WINDOW} steps fell below {step_below:g}"
+        return None
+
+    def answer(self, name: AnswerName) -> tuple[SE3, float]:
+        """Return a pose and the mean loss of the steps up to it.
+
+        ``last`` is the last pose. ``best`` is the pose at the end of the ``WINDOW`` steps with the smallest mean loss, since the
+        loss of a single step is noisy; in a shorter history, it is the last pose.
+        """
+        if name == "last" or len(self.losses) < WINDOW:
+            return self.T, self.recent_loss()
+        means = torch.tensor(self.losses, dtype=torch.float64).unfold(0, WINDOW, 1).mean(-1)
+        least = int(means.argmin())
+        return self.poses[least + WINDOW - 1], float(means[least])
 
 
 def follow_gradient(

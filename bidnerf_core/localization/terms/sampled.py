@@ -9,54 +9,16 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields import (
-    FieldValues,
-    Objective,
-    Observations,
-    RadianceField,
-    Rays,
-    RaySampler,
-    Resampled,
-    SceneBounds,
-    Stratified,
-    masked_mean,
-    render,
-    widened,
-)
+from bidnerf_core.fields import Objective, Observations, Rays, masked_mean, render, widened
 from bidnerf_core.frames import Frame, PixelDrawer, draw, drawer
 from bidnerf_core.geometry import SE3, Robust
-from bidnerf_core.localization.costs.rendered import RayCounts
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.settings import DescentSettings, ReachSettings
-
-
-@dataclass(frozen=True, eq=False)
-class Blurred:
-    """A field queried at points with random displacements, of standard deviation ``sigma`` metres along each axis.
-
-    In expectation, it is the field convolved with a Gaussian (randomized smoothing, Duchi et al. 2012), at the cost of one
-    query. The sampler is the field's own: if it skips empty cells, matter is not blurred into them.
-    """
-
-    field: RadianceField
-    sigma: float
-    generator: Generator
-
-    @property
-    def sampler(self) -> RaySampler:
-        return self.field.sampler
-
-    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        noise = torch.randn(positions.shape, generator=self.generator, device=self.generator.device)
-        return self.field.query(positions + self.sigma * noise.to(positions), directions)
-
+from bidnerf_core.localization.settings import DescentSettings, ReachSettings, rendered_depth_scale
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""
 LITTLE_BACKGROUND = 0.02
 """Fraction of an image's pixels without matter below which preferring the other pixels is not worth its cost."""
-BOX_SCALE = 0.1
-"""Distance (metres) between a measured point and the box of the scene at which outliers begin."""
 
 
 @dataclass(eq=False)
@@ -65,13 +27,12 @@ class SampledLoss:
 
     problem: Problem
     objective: Objective
-    counts: RayCounts
+    depth_rays: int  # number of rays drawn from a sensor with rays of its own
     rays: DescentSettings
     reach: ReachSettings
     generator: Generator
     _drawer: PixelDrawer = field(init=False)
     _batches: list[Observations] | None = field(default=None, init=False)
-    _calls: int = field(default=0, init=False)
     _candidates: int = field(default=1, init=False)
 
     def __post_init__(self) -> None:
@@ -83,28 +44,11 @@ class SampledLoss:
         """Return the loss; differentiable in the pose of the last view's camera."""
         if self._batches is None or self.rays.renew:
             self._batches = self._drawn(T_world_last.detach())
-        scene = self._field()
-        self._calls += 1
-        first, *others = (self._loss(scene, batch, T_world_last) for batch in self._batches)
+        first, *others = (self._loss(batch, T_world_last) for batch in self._batches)
         return sum(others, start=first)
 
-    @property
-    def is_capturable(self) -> bool:
-        """Whether all calls do the same computation apart from random numbers; false with a blur, which decays."""
-        return self.reach.blur == 0
-
-    def _field(self) -> RadianceField:
-        """Return the level to render, with the sampling and the blur of this step."""
-        scene, reach = self.problem.level(self.rays.level), self.reach
-        if reach.samples > 0:
-            scene = Resampled(scene, Stratified(reach.samples, self.problem.bounds))
-        if reach.blur > 0:
-            sigma = reach.blur * 0.5 ** (self._calls / reach.blur_steps)
-            scene = Blurred(scene, sigma, self.generator)
-        return scene
-
-    def _loss(self, scene: RadianceField, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
-        rays = self._rays(observed, T_world_last)
+    def _loss(self, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
+        scene, rays = self.problem.level(self.rays.level), self._rays(observed, T_world_last)
         bounds, weight = self.problem.bounds, self.reach.box_weight
         loss = self.objective.loss(render(scene, rays, bounds.background), observed)
         boxed = weight > 0 and self.objective.uses_depth and not bounds.contracted
@@ -120,23 +64,21 @@ class SampledLoss:
         points = rays.origins + observed.distance[..., None] * rays.directions
         half = constant(bounds.size, points) / 2
         off = ((points - constant(bounds.centre, points)).abs() - half).clamp(min=0)
-        robust = Robust("huber", BOX_SCALE)
+        robust = Robust("huber", rendered_depth_scale(bounds))
         return masked_mean(robust(torch.linalg.vector_norm(off, dim=-1)), observed.measured).mean()
 
     def _drawn(self, T_world_last: SE3) -> list[Observations]:
         """Draw pixels (views, pixels per view) and any depth rays (1, rays)."""
         problem, device = self.problem, self.problem.device
-        many = self.counts.pixels * self._candidates
+        many = self.rays.rays * self._candidates
         pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
         if self._candidates > 1:
-            count = max(1, self.counts.pixels // len(problem.views))
+            count = max(1, self.rays.rays // len(problem.views))
             order = self._rank(pixels, T_world_last).sort(dim=-1, descending=True, stable=True).indices
             pixels = pixels.gathered(order[:, :count])
         batches = [pixels]
-        if problem.depth_rays is not None and self.objective.uses_depth and self.counts.depth_rays > 0:
-            batches.append(
-                problem.depth_rays.drawn(self.counts.depth_rays, self.generator, device=device)[None]
-            )
+        if problem.depth_rays is not None and self.objective.uses_depth and self.depth_rays > 0:
+            batches.append(problem.depth_rays.drawn(self.depth_rays, self.generator, device=device)[None])
         return batches
 
     def _rank(self, pixels: Observations, T_world_last: SE3) -> Int[Tensor, "k p"]:

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.acceptance import SIGHT_LINES
+from bidnerf_core.localization.by_surface import SIGHT_LINES
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.mapping import SurfaceMap, cast

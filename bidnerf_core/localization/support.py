@@ -8,6 +8,7 @@ measurement's cost between the rival and the pose.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,8 +18,8 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.landmarks.chance import odds
+from bidnerf_core.localization.pivot import Pivot
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.solvers.pivots import Pivot
 
 ACCEPTED = 0.8
 """Minimum confidence of an accepted pose."""
@@ -72,6 +73,62 @@ class Support:
         return None
 
 
+@dataclass(frozen=True)
+class DescentDiagnostics:
+    """The measures by which the answer of a first-order descent is judged."""
+
+    mean_loss: float  # of its last steps
+    converged_loss: float  # below which it is accepted
+    support: Support
+
+
+@dataclass(frozen=True)
+class SurfaceThresholds:
+    """Thresholds for accepting a pose on the baked surface."""
+
+    on_surface: float = 0.85  # minimum fraction of the measured points on the surface
+    colour_inliers: float = 0.42  # minimum fraction of the measured points on the surface and with its colour
+    free_space_violations: float = 0.15  # maximum fraction of lines of sight that pass through the surface
+    runner_up_margin: float = 0.15  # margin by which the second-best pose must be worse
+    rendered_inliers: float = 0.8  # minimum inlier fraction of the rendered rays
+
+
+@dataclass(frozen=True)
+class SurfaceDiagnostics:
+    """Measures of how well a pose explains the measured points; all but the margin are fractions between 0 and 1."""
+
+    on_surface: float
+    colour_inliers: float
+    free_space_violations: float
+    runner_up_margin: float
+    rendered_inliers: float = 1.0  # 1 if nothing was rendered
+    support: Support | None = None  # None: not compared with other poses
+
+    def rejection(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict | None:
+        """Return the most serious reason to reject the pose, or None."""
+        if not self.on_surface >= thresholds.on_surface:
+            return Verdict(
+                Outcome.OFF_SURFACE, f"only {self.on_surface:.0%} of the measured points lie on the surface"
+            )
+        if not self.colour_inliers >= thresholds.colour_inliers:
+            share = f"{self.colour_inliers:.0%} of the measured points have the surface's colour"
+            return Verdict(Outcome.COLOUR_MISMATCH, f"only {share}")
+        if not self.free_space_violations <= thresholds.free_space_violations:
+            share = f"{self.free_space_violations:.0%} of the lines of sight"
+            return Verdict(Outcome.FREE_SPACE_VIOLATED, f"{share} pass through the surface")
+        if not self.runner_up_margin >= thresholds.runner_up_margin:
+            return Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
+        if not self.rendered_inliers >= thresholds.rendered_inliers:
+            share = f"{self.rendered_inliers:.0%} of the rendered rays agree with the measurements"
+            return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}")
+        return None if self.support is None else self.support.rejection()
+
+    def verdict(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict:
+        share = f"{self.colour_inliers:.0%} of the measured points match the surface in position and colour"
+        confidence = None if self.support is None else self.support.confidence
+        return self.rejection(thresholds) or Verdict(Outcome.CONVERGED, share, confidence)
+
+
 def support(
     costs: Costs,
     T: SE3,
@@ -85,15 +142,16 @@ def support(
     each measurement's cost in images rendered in their mean colour; None if more than colours is compared. ``others`` are
     poses (h) found by a search; those within the displacement do not count as rivals.
     """
-    here, about = costs(T[None])[0], Pivot.at_point(middle)
+    here, about = costs(T[None])[0], Pivot.at_point(middle.to(T.translation))
     reach = float(torch.linalg.vector_norm(middle))
-    near = log_odds(costs(_displaced(T, about, reach)), here)
+    # Twelve poses, displaced in both directions along and about each axis.
+    size = torch.tensor([DISPLACEMENT * reach] * 3 + [DISPLACEMENT] * 3, dtype=torch.float64)
+    steps = torch.cat([torch.diag(size), -torch.diag(size)]).to(T.translation)
+    many = SE3(T.rotation.expand(12, 3, 3), T.translation.expand(12, 3))
+    near = log_odds(costs(about.moved(many, steps)), here)
     far = near[:0]
     if others is not None:
-        others = others.to(
-            T.translation.device, T.translation.dtype
-        )  # a search leaves them on the map's device
-        others = others[_apart(T, others, about, reach)]
+        others = others[~same_pose(T, others, middle)]
         far = log_odds(costs(others), here) if len(others.translation) else far
     explained, by_plain = 1.0, NO_RIVAL
     if plain is not None:
@@ -111,21 +169,15 @@ def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Te
     return torch.where(odds.isfinite(), odds, 0)
 
 
-def _displaced(T: SE3, about: Pivot, reach: float) -> SE3:
-    """Return twelve poses, displaced in both directions along and about each axis."""
-    size = torch.tensor([DISPLACEMENT * reach] * 3 + [DISPLACEMENT] * 3, dtype=torch.float64)
-    steps = torch.cat([torch.diag(size), -torch.diag(size)]).to(T.translation)
-    return about.to(T.translation.device).moved(_repeated(T, len(steps)), steps)
+def same_pose(
+    T: SE3, others: SE3, middle: Float[Tensor, "3"], within: float = DISPLACEMENT
+) -> Bool[Tensor, "h"]:
+    """Return a mask of the ``others`` (h) that differ from ``T`` by at most ``within``.
 
-
-def _apart(T: SE3, others: SE3, about: Pivot, reach: float) -> Bool[Tensor, "h"]:
-    """Return a mask of the poses that are farther from ``T`` than the displaced ones."""
-    here = about.to(T.translation.device).at(T)
-    there = about.to(T.translation.device).at(others)
-    motion = (_repeated(here.inverse(), len(there.translation)) @ there).log()
-    shift, turn = (torch.linalg.vector_norm(part, dim=-1) for part in motion.split(3, -1))
-    return (shift > DISPLACEMENT * reach) | (turn > DISPLACEMENT)
-
-
-def _repeated(T: SE3, count: int) -> SE3:
-    return SE3(T.rotation.expand(count, 3, 3), T.translation.expand(count, 3))
+    This is a fraction of the distance to the ``middle`` of the visible scene (metres, last camera's frame), by which the middle is
+    displaced, and an angle in radians.
+    """
+    middle = middle.to(T.translation)
+    shift = torch.linalg.vector_norm(others.apply(middle) - T.apply(middle), dim=-1)
+    trace = (T.rotation.mT @ others.rotation).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return (shift <= within * torch.linalg.vector_norm(middle)) & (trace >= 1 + 2 * math.cos(within))

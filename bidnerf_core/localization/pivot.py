@@ -1,0 +1,98 @@
+"""Pivots: the points about which updates of poses rotate, and the middle of the visible scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.fields import RadianceField, SceneBounds, device_of, render
+from bidnerf_core.frames import View, draw, measured_middle, uniform
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.problem import Problem
+
+PivotName = Literal["scene", "camera", "world"]
+MIDDLE_RAYS = 256
+"""Number of rays whose renderings give the middle of the visible scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pivot:
+    """The centre of rotation of updates: a point fixed to the camera, or the world's origin."""
+
+    T_camera_pivot: SE3 | None  # a translation; None: the world's own frame
+
+    @staticmethod
+    def at_point(point: Float[Tensor, "3"]) -> Pivot:
+        """Return the pivot at a point given in the camera's frame, metres; on the device of the point."""
+        return Pivot(SE3(torch.eye(3, dtype=torch.float64, device=point.device), point.to(torch.float64)))
+
+    @property
+    def lever_arm(self) -> float:
+        """Distance (metres) by which a rotation of one radian moves the camera. In the world's frame it is 1, since iNeRF does not
+        balance steps of translation and rotation; so it is at the camera, which no rotation moves.
+        """
+        reach = 0.0 if self.T_camera_pivot is None else float(self.T_camera_pivot.translation.norm())
+        return reach if reach > 0 else 1.0
+
+    def moved(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
+        """Return ``T``, one pose or a batch, after the update ``delta``; differentiable in ``delta``."""
+        if self.T_camera_pivot is None:
+            return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
+        return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
+
+    def moved_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
+        """Return ``moved`` to first order in ``delta``, which is cheaper and has the same value and derivative at 0."""
+        if self.T_camera_pivot is None:
+            return SE3.identity(device=delta.device).retract_linearly(delta) @ T
+        return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()
+
+
+def pivot(name: PivotName, problem: Problem) -> Pivot:
+    """Return a pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of the visible scene.
+
+    For a scene metres away, rotation and sideways translation of the camera change the image in almost the same way. In the
+    camera's frame, the objective is therefore a long narrow valley, in which first-order steps are slow. About the middle of the
+    visible scene, the two motions decouple.
+    """
+    if name == "world":
+        return Pivot(None)
+    return (
+        Pivot(SE3.identity()) if name == "camera" else Pivot.at_point(middle_of_view(problem, problem.start))
+    )
+
+
+@torch.no_grad()
+def middle_of_view(problem: Problem, T: SE3 | None) -> Float[Tensor, "3"]:
+    """Return the median of the measured points or, without any, of those rendered from the pose ``T``; on the CPU.
+
+    It is in the last camera's frame, metres: the middle of the scene's box if nothing is rendered, and 0 without a pose.
+    """
+    point = measured_middle(problem.views)
+    if point is not None:
+        return point.to("cpu", torch.float64)
+    if problem.depth_rays is not None:
+        return problem.depth_rays.points.to(torch.float64).cpu().median(0).values
+    if T is None:
+        return torch.zeros(3, dtype=torch.float64)
+    found = rendered_middle(problem.level(0), problem.bounds, problem.views, T[None])[0].cpu().double()
+    if bool(found.isfinite().all()):
+        return found
+    return (
+        T.to("cpu", torch.float64).inverse().apply(torch.tensor(problem.bounds.centre, dtype=torch.float64))
+    )
+
+
+def rendered_middle(
+    field: RadianceField, bounds: SceneBounds, views: tuple[View, ...], T: SE3
+) -> Float[Tensor, "h 3"]:
+    """Return the median of the rendered points along each axis, in the last camera's frame; NaN if no ray hits anything."""
+    device, generator = device_of(field), torch.Generator().manual_seed(0)
+    some = draw(views, MIDDLE_RAYS, uniform, generator, device=device).flattened()
+    rays = some.rays(T.to(device), bounds)
+    seen = render(field, rays, bounds.background)
+    distance = torch.where(seen.opacity > 0.5, seen.distance / seen.opacity.clamp(min=0.5), torch.nan)
+    return (some.origins + distance[..., None] * some.directions).nanmedian(1).values

@@ -1,1 +1,0 @@
-"""Search: propose poses, and discard all but the best."""

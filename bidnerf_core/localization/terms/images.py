@@ -1,0 +1,222 @@
+"""Whole small images: photos compared with renderings of a map from many poses.
+
+Thumbnails are small, smoothed photos. Renderers quickly render the same views, without derivatives, from the baked surface or a
+field. The derivative of a rendered image with respect to the pose follows from the image's gradient and its depth, for any renderer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import conv2d, grid_sample, interpolate, normalize, pad
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.devices import constant
+from bidnerf_core.fields import RadianceField, SceneBounds, render
+from bidnerf_core.frames import View, continued
+from bidnerf_core.geometry import SE3, inlier_weight
+from bidnerf_core.localization.descend import Normal
+from bidnerf_core.localization.states import P, States
+from bidnerf_core.localization.terms.exposure import fit_exposure
+from bidnerf_core.mapping import SurfaceMap, cast
+
+CHUNK = 16384
+"""Number of rays rendered at a time."""
+UNKNOWN_COST = 0.7
+"""Cost of a pixel for which the map renders nothing, relative to that of a pixel that disagrees."""
+INDEPENDENT = 60.0
+"""Number of independent measurements in a small image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A view resampled to a small camera without distortion. Derived tensors are on the device of ``rgb``."""
+
+    camera: Intrinsics
+    T_last_camera: SE3
+    rgb: Float[Tensor, "3 h w"]  # smoothed
+
+    @staticmethod
+    def of(view: View, width: int) -> Thumbnail:
+        """Return ``view`` undistorted, smoothed and reduced to at most ``width`` pixels on its longer side; on the CPU."""
+        camera = view.frame.intrinsics
+        small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
+        # Averaged first, so that every pixel of the image contributes.
+        rgb = continued(view.frame).cpu().float().permute(2, 0, 1)[None]
+        rgb = interpolate(rgb, (small.height, small.width), mode="area")
+        if camera.distortion:
+            seen = camera.project(small.unproject(small.pixel_centres()))
+            seen = 2 * seen / torch.tensor([camera.width, camera.height]) - 1
+            rgb = grid_sample(rgb, seen[None], padding_mode="border", align_corners=False)
+        return Thumbnail(small, view.T_ref_camera.to("cpu", torch.float64), smooth(rgb[0]))
+
+    @cached_property
+    def flat(self) -> Float[Tensor, "n 3"]:
+        """The pixels' points on the plane z = 1 of the camera frame, row by row."""
+        return self.camera.unproject(self.camera.pixel_centres()).reshape(-1, 3).to(self.rgb.device)
+
+    @cached_property
+    def directions(self) -> Float[Tensor, "n 3"]:
+        """The pixels' unit directions, in the last camera's frame."""
+        return self.T_last_camera.to(self.flat).rotate(normalize(self.flat, dim=-1))
+
+    @cached_property
+    def colours(self) -> Float[Tensor, "n 3"]:
+        return self.rgb.flatten(1).mT
+
+    @cached_property
+    def slopes(self) -> Float[Tensor, "3 n 2"]:
+        return slopes(self.rgb, self.camera)
+
+
+def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """Convolve with a 5x5 binomial kernel, approximately a Gaussian of one pixel; the border is replicated."""
+    kernel = constant((1.0, 4.0, 6.0, 4.0, 1.0), image) / 16
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
+    flat = conv2d(pad(flat, (0, 0, 2, 2), mode="replicate"), kernel.view(1, 1, 5, 1))
+    return flat.view(image.shape)
+
+
+def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:
+    """Return central differences to the right and down, per unit on the plane z = 1."""
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    wide = pad(flat, (1, 1, 1, 1), mode="replicate")
+    across = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) * (camera.fx / 2)
+    down = (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) * (camera.fy / 2)
+    return torch.stack([across, down], -1).reshape(*image.shape[:-2], -1, 2)
+
+
+Renderer = Callable[[Float[Tensor, "r 3"], Float[Tensor, "r 3"]], tuple[Tensor, Tensor, Tensor]]
+"""Renders rays, given their origins and unit directions (world). Returns their colours (r 3), premultiplied by the second part,
+which is 0 where the map has nothing along the ray, else 1 (r); and the distances (r), metres, of the visible points or, for the
+background, of where rays pass closest to the scene."""
+
+
+def surface_renderer(surface: SurfaceMap, background: tuple[float, float, float] | None) -> Renderer:
+    """Return a renderer of the colours of surfels.
+
+    Without a ``background``, a ray that hits nothing passes through a hole in the map.
+    """
+
+    def rendered(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        found = cast(surface, origins, directions)
+        met = found.met[:, None].to(origins)
+        behind = constant(background or (0.0, 0.0, 0.0), origins)
+        rgb = met * surface.surfels.rgb[found.index] + (1 - met) * behind
+        known = met[:, 0] if background is None else torch.ones_like(found.along)
+        return rgb, known, found.along.clamp(min=surface.cell)
+
+    return rendered
+
+
+def field_renderer(field: RadianceField, bounds: SceneBounds) -> Renderer:
+    """Return a renderer of a field with its background."""
+
+    @torch.no_grad()
+    def rendered(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        parts = []
+        for o, d in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True):
+            seen = render(field, bounds.rays(o, d), bounds.background)
+            passing = ((constant(bounds.centre, o) - o) * d).sum(-1)
+            met = seen.distance / seen.opacity.clamp(min=0.5)
+            parts.append((seen.rgb, torch.where(seen.opacity > 0.5, met, passing).clamp(min=bounds.near)))
+        rgb, along = (torch.cat(part) for part in zip(*parts, strict=True))
+        return rgb, torch.ones_like(along), along
+
+    return rendered
+
+
+@dataclass(frozen=True)
+class ColourScales:
+    """Scales for comparing colours and for fitting an image's exposure relative to the map."""
+
+    colour: float = (
+        0.2  # norm of a pixel's colour difference (three channels) at which its inlier weight is 1/2
+    )
+    gain: float = 0.2  # standard deviation of the prior about 1
+    offset: float = 0.1  # standard deviation of the prior about 0
+    rounds: int = 2  # of reweighting for the exposure
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, with the difference c between rendered and measured colour, times ``INDEPENDENT``.
+
+    By the mean of both images' gradients, colours are linearized with second-order accuracy (Benhimane and Malis 2004, "Real-time
+    image-based tracking of planes using efficient second-order minimization"). Only the pose has derivatives. The cost is infinite for
+    poses that are not finite. Everything is computed on the device of the thumbnails, which is also that of the renderer.
+    """
+
+    renderer: Renderer
+    thumbnails: Sequence[Thumbnail]
+    scales: ColourScales = ColourScales()
+
+    @torch.no_grad()
+    def __call__(self, states: States) -> Normal:
+        parts = [self._of_thumbnail(small, states.T) for small in self.thumbnails]
+        cost, gradient, hessian = (
+            INDEPENDENT * torch.stack(values).mean(0).to(states.z) for values in zip(*parts, strict=True)
+        )
+        sound = states.T.translation.isfinite().all(-1) & states.T.rotation.isfinite().all(-1).all(-1)
+        extra = P - 6
+        return Normal(
+            torch.where(sound, cost, torch.inf), pad(gradient, (0, extra)), pad(hessian, (0, extra, 0, extra))
+        )
+
+    def _of_thumbnail(self, small: Thumbnail, T: SE3) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the cost, its gradient and its Hessian of one image."""
+        rgb, known, points, depth = render_view(self.renderer, small, T)
+        scales = self.scales
+        seen, measured, sure = rgb.mT, small.colours, known[..., None]
+
+        def inlier(off: Tensor) -> Tensor:
+            return inlier_weight(off.square().sum(-1, keepdim=True), scales.colour)
+
+        gain, offset = fit_exposure(
+            seen, measured, lambda off: inlier(off).square().expand_as(off), sure,
+            ((scales.colour / scales.gain) ** 2, (scales.colour / scales.offset) ** 2), scales.rounds,
+        )  # fmt: skip
+        corrected = gain * seen + offset
+        error = corrected.clamp(0, 1) - measured
+        near = inlier(error)
+        cost = (sure * (1 - near) + (1 - sure) * UNKNOWN_COST)[..., 0].mean(-1)
+        # Where the camera clips, the colour does not depend on the pose.
+        inside = (corrected - 0.5).abs() < 0.5
+        weight = inside * (sure * near.square() * (2 / scales.colour**2 / error.shape[1]))
+        slope = (slopes(rgb.unflatten(-1, small.rgb.shape[1:]), small.camera) + small.slopes) / 2
+        # A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
+        by_z = -(slope * small.flat[:, :2]).sum(-1, keepdim=True)
+        rotation = small.T_last_camera.rotation.to(slope)
+        by_point = torch.cat([slope, by_z], -1) @ rotation.mT / depth[:, None, :, None]
+        arm = points[:, None].expand_as(by_point)
+        rows = torch.cat([by_point, torch.linalg.cross(arm, by_point)], -1)
+        weighted = (weight.mT[..., None] * rows).flatten(1, 2)
+        gradient = (weighted.mT @ error.mT.flatten(1)[..., None])[..., 0]
+        return cost, gradient, weighted.mT @ rows.flatten(1, 2)
+
+
+def render_view(renderer: Renderer, small: Thumbnail, T: SE3) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Render a thumbnail's n pixels from the poses T_world_last (h).
+
+    Returns smoothed colours (h 3 n), the fraction of each pixel that the map renders (h n), the visible points in the last
+    camera's frame (h n 3) and their depths in the thumbnail's camera (h n), metres.
+    """
+    camera, count, local = small.camera, len(T.translation), small.directions
+    origin = small.T_last_camera.translation.to(local)
+    rotation, translation = T.rotation.to(local), T.translation.to(local)
+    directions = local @ rotation.mT
+    origins = (rotation @ origin + translation)[:, None].expand_as(directions)
+    rgb, known, along = renderer(origins.reshape(-1, 3), directions.reshape(-1, 3))
+    rgb, known = (
+        smooth(part.reshape(count, camera.height, camera.width, -1).permute(0, 3, 1, 2))
+        for part in (rgb, known)
+    )
+    rgb, along = rgb / known.clamp(min=1e-3), along.view(count, -1)
+    points = origin + along[..., None] * local
+    return rgb.flatten(2), known.flatten(1), points, along / torch.linalg.vector_norm(small.flat, dim=-1)
