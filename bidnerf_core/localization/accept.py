@@ -1,59 +1,144 @@
-"""Acceptance: one record of evidence, one table of thresholds."""
+"""Acceptance: one record of evidence, one table of bounds, one logistic model."""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import NamedTuple
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.settings import Range
+
+ACCEPTED = 0.8
+"""Minimum confidence of an accepted pose."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that the decision depends on; no number depends on the unit of length or the size of the image."""
+    """All that the decision about a pose by landmarks depends on; no number depends on the unit of length or the image's size."""
 
-    log10_nfa: float  # expected number of equally good poses by chance (a contrario), by descriptors alone
-    inliers: int  # matches by projection within three standard deviations
-    above_chance: float  # ratio to the number at displaced keypoints
-    recall: float  # fraction of the landmarks in view, or of the keypoints, that match
-    spread: float  # fraction of the image's 10 x 10 cells with a match
-    noise_ratio: float  # keypoints' noise relative to that of the map's images
-    mass: float  # posterior probability that the pose is within the tolerance, and the camera credible
-    precision: float  # standard deviation of the position relative to the scene's distance
-    other_mode: float  # probability of another place, a mirrored image, or the second pose of a plane
-    credible: float  # probability of the explanations under which a pose counts as right
-    surprise: (
-        float  # squared deviations of the camera and its motion from their means, of the best explanation
+    log10_nfa: (
+        float  # false alarms of the matches by descriptors alone; 0 if the pose was found by other means
     )
-    on_surface: float = 1.0  # fraction of the measured points on the surface
+    inliers: int  # matches by projection within three standard deviations
+    by_chance: float  # such matches expected at a wrong pose
+    recall: float  # fraction of the landmarks in view, or of the keypoints, that match
+    spread: float  # fraction of the image's cells that contain a match
+    noise_ratio: float  # keypoints' noise relative to that of the map's images
+    other_place: float  # probability of another place or of a mirrored image
+    credible: float  # probability of the explanations of the camera under which a pose counts as right
+    precision: float  # standard deviation of the position relative to the scene's distance
+    mass: float  # probability that the pose is within the tolerance, and its camera credible
+    searched: bool  # whether landmarks found the pose, or only confirm one found by other means
+    on_surface: float | None = None  # fraction of the measured points on the surface
+    colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
 
-    def plain(self) -> dict[str, float]:
-        return asdict(self)
+    @property
+    def above_chance(self) -> float:
+        """Ratio of the matches to those expected at a wrong pose."""
+        return (1 + self.inliers) / (1 + self.by_chance)
 
 
-TABLE = (
-    # measure, limit, whether the measure must be above it, outcome
-    ("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES),
-    ("inliers", 15, True, Outcome.TOO_FEW_MATCHES),
-    ("above_chance", 3.0, True, Outcome.AMBIGUOUS),
-    ("spread", 0.06, True, Outcome.UNDETERMINED),
-    ("other_mode", 0.02, False, Outcome.AMBIGUOUS),
-    ("credible", 0.5, True, Outcome.MISCALIBRATED),
-    ("precision", 0.03, False, Outcome.IMPRECISE),
-    ("mass", 0.8, True, Outcome.UNCERTAIN),
-    ("recall", 0.02, True, Outcome.UNCERTAIN),
-    ("noise_ratio", 6.0, False, Outcome.UNCERTAIN),
-)
+class Bound(NamedTuple):
+    """A bound of a measure, and what it means if it is not kept."""
+
+    measure: str
+    limit: float
+    is_least: bool
+    outcome: Outcome
+    reason: str  # with the value as ``{0}``
+
+
+BOUNDS = (
+    Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "{0:.0e} poses as good are expected by chance"),
+    Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers"),
+    Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
+    Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
+    Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}"),
+    Bound("credible", 0.5, True, Outcome.MISCALIBRATED, "the image contradicts the intrinsics: they are right with {0:.0%}"),
+    Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
+    Bound("mass", 0.8, True, Outcome.UNCERTAIN, "the pose is within the tolerance with a probability of {0:.0%}"),
+)  # fmt: skip
+"""The bounds of a pose by landmarks, the most serious reason first."""
 
 
 def accept(evidence: Evidence) -> Verdict:
-    """Return the first row of the table that fails, or acceptance."""
-    for name, limit, above, outcome in TABLE:
-        value = getattr(evidence, name)
-        if not (value >= limit if above else value <= limit) or not math.isfinite(value):
-            return Verdict(
-                outcome,
-                f"{name} is {value:.3g}, expected {'at least' if above else 'at most'} {limit:g}",
-                evidence.mass,
-            )
-    return Verdict(Outcome.CONVERGED, f"{evidence.inliers} landmarks", evidence.mass)
+    """Return the first bound that is not kept, or else whether the pose is likely to be right."""
+    confidence = model().probability(features(evidence))
+    for bound in BOUNDS:
+        value = getattr(evidence, bound.measure)
+        if bound.measure == "log10_nfa":
+            if not evidence.searched:
+                continue
+            shown = 10.0 ** min(max(value, -300), 300)
+        else:
+            shown = value
+        if not (value >= bound.limit if bound.is_least else value <= bound.limit):
+            return Verdict(bound.outcome, bound.reason.format(shown), confidence)
+    share = f"{evidence.inliers} landmark inliers"
+    if confidence < ACCEPTED:
+        why = f"{share}, but only {math.floor(100 * confidence)}% likely to be right"
+        return Verdict(Outcome.UNCERTAIN, why, confidence)
+    return Verdict(Outcome.CONVERGED, share, confidence)
+
+
+def features(found: Evidence) -> dict[str, float]:
+    """Return the features of the logistic model."""
+    return {
+        "inliers": math.log10(1 + found.inliers),
+        "above_chance": math.log10(found.above_chance),
+        "recall": math.log10(max(found.recall, 1e-3)),
+        "noise_ratio": math.log10(max(found.noise_ratio, 0.1)),
+        "spread": found.spread,
+        "precision": math.log10(min(max(found.precision, 1e-4), 1.0)),
+        "mass": -math.log10(max(1 - found.mass, 1e-4)),
+        "incredible": math.log10(max(1 - found.credible, 1e-6)),
+        "confirmed_only": 0.0 if found.searched else 1.0,
+        # Without measured points, the surface neither supports nor contradicts a pose.
+        "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
+        "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
+    }
+
+
+@dataclass(frozen=True)
+class LogisticModel:
+    """A logistic regression (Cox 1958): the logarithm of the odds is linear in the features."""
+
+    weights: dict[str, float]
+    bias: float
+
+    def probability(self, values: dict[str, float]) -> float:
+        """Return the probability for features by name."""
+        log_odds = self.bias + sum(weight * values[name] for name, weight in self.weights.items())
+        return 1 / (1 + math.exp(-min(max(log_odds, -500), 500)))
+
+
+@lru_cache(maxsize=1)
+def stored() -> dict[str, dict[str, object]]:
+    """Return the model and the calibrated risks, which ``benchmarks/confidence.py`` and ``benchmarks/risk.py`` have fitted."""
+    found: dict[str, dict[str, object]] = json.loads((files(__package__) / "acceptance.json").read_text())
+    return found
+
+
+@lru_cache(maxsize=1)
+def model() -> LogisticModel:
+    """Return the logistic model of poses by landmarks."""
+    return LogisticModel(**stored()["landmarks"])  # type: ignore[arg-type]
+
+
+def least_confidence(risk: float) -> float:
+    """Return the confidence required by the largest calibrated risk that does not exceed ``risk``.
+
+    Raises ``InputError`` for a risk outside the calibrated range.
+    """
+    levels: list[tuple[float, float]] = stored()["risk"]["least_confidence"]  # type: ignore[assignment]
+    calibrated = Range(levels[0][0], levels[-1][0])
+    if risk not in calibrated:
+        raise InputError(
+            f"risk is {risk!r}", expected=f"{calibrated}, for which the confidence was calibrated"
+        )
+    return min(confidence for level, confidence in levels if level <= risk)

@@ -1,226 +1,161 @@
 """Method ``auto``: find the pose with or without a start, from all available measurements, and decide whether to trust it.
 
 If the map has landmarks, they are matched first, and their pose is fused with measured depth and rendered rays. If that pose is
-not accepted, the surface is searched: measured points are aligned with it if there is enough depth; otherwise, the images are
-compared with its renderings. In a map without a surface, ``auto`` needs a start, from which it descends as ``bid`` does.
+not accepted in a map with few landmarks, or there are none, the surface is searched: measured points are aligned with it if there is
+enough depth; otherwise, the images are compared with its renderings. In a map without a surface and landmarks, ``auto`` needs a start,
+from which it descends as ``bid`` does.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+import torch
 
 from bidnerf_core.depth import find_depth_sensor
-from bidnerf_core.errors import InputError
-from bidnerf_core.localization.acceptance import (
-    LandmarkDiagnostics,
-    LandmarkThresholds,
-    landmark_verdict,
-    without_ambiguous_intrinsics,
-)
-from bidnerf_core.localization.alternatives import decide
-from bidnerf_core.localization.by_blurred_image import refined_if_blurred
-from bidnerf_core.localization.by_colour import without_the_imprecise
-from bidnerf_core.localization.by_landmarks import (
-    MOSTLY_ON_SURFACE,
-    LandmarkAnswer,
-    answer_by_landmarks,
-    fused_answer,
-    is_sharp,
-    localization_by_landmarks,
-)
+from bidnerf_core.errors import InputError, enumeration
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.accept import least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
-from bidnerf_core.localization.confidence import TRUSTED
-from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
-from bidnerf_core.localization.landmarks.pose import LandmarkPose
-from bidnerf_core.localization.landmarks.propose import confirm
+from bidnerf_core.localization.loop import Answer, Loop
 from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
 from bidnerf_core.localization.occluders import nearest_piece
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.risk import within_risk
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
+from bidnerf_core.mapping import Calibration
 
-FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
-"""Outcomes of a pose by landmarks that no other measurement can correct: with wrong intrinsics, aligning points with the surface
-fails too.
-"""
+TEXTURED = 150
+"""Matches of a usual image of the map from which an image without recognised landmarks shows something else."""
 IN_FRONT = 0.9
 """Minimum fraction of an occluder's points that must lie in front of the surface."""
-MANY_LANDMARKS = 500
-"""Minimum number of landmarks of a textured scene."""
-LEAST_SUPPORT = 0.5
-"""Minimum confidence for landmarks to support a pose accepted on the surface."""
+FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS)
+"""Outcomes of a pose by landmarks that no other measurement can correct."""
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
-    """Find the pose by landmarks, or else by depth or colour on the surface, or else by descent from a start.
+    """Find the pose by landmarks, or else on the surface, or else by descent from a start.
 
-    If the pose is rejected, or doubtful because of an occluder, the image is tried again without the nearest measured object,
-    which may hide the scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose, and there is no
-    start.
+    Raises ``InputError`` if the map has neither landmarks nor a baked surface, and there is no start.
     """
+    began = time.perf_counter()
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
-    found = _found_behind_occluders(problem, config, seed)
+    loop = None
+    if problem.matcher is not None and config.landmarks:
+        loop = Loop(problem, problem.matcher, config.fused_rays, seed)
+    answer = None if loop is None else loop()
+    found = None if answer is None else localization(problem, answer, began)
+    if found is None or not (found.converged or found.outcome in FINAL):
+        found = _on_surface(problem, config, seed, loop, found, began)
+    found = replace(found, seconds=time.perf_counter() - began)
     return found if config.risk is None else within_risk(found, config.risk)
 
 
-def _found_behind_occluders(problem: Problem, config: AutoConfig, seed: int) -> Localization:
-    found = _localized(problem, config, seed)
-    if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
-        return found
-    occluder = nearest_piece(problem)
-    if occluder is None:
-        return found
-    if found.converged and occluder.share_in_front(problem.surface, found.T_world_camera) < IN_FRONT:
-        return found
-    rest = _localized(occluder.rest, config, seed)
-    seconds = found.seconds + rest.seconds
-    if not rest.converged or occluder.share_in_front(problem.surface, rest.T_world_camera) < IN_FRONT:
-        return replace(found, seconds=seconds)
-    hidden = f"without the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
-    return replace(rest, reason=f"{rest.reason}, {hidden}", seconds=seconds)
-
-
-@dataclass(frozen=True, eq=False)
-class _Proposal:
-    """A pose that may be the answer."""
-
-    found: Localization
-    near: LandmarkPose | None = None  # pose by the landmarks that match near a pose found by other means
-    decided: bool = False  # whether it was compared with alternative explanations
-
-
-def _localized(problem: Problem, config: AutoConfig, seed: int) -> Localization:
-    """Return the best pose, rejected if an alternative explanation of the images may be right."""
-    began, rays = time.perf_counter(), config.fused_rays
-    proposal = _proposed(problem, config, seed, began)
-    before = without_ambiguous_intrinsics(proposal.found, problem)
-    found = refined_if_blurred(problem, before) if rays else before
-    decided = proposal.decided and before.converged
-    if found.converged and config.landmarks and not decided:
-        why = decide(problem, found.T_world_camera, proposal.near, rays, seed).rejection
-        found = found if why is None else found.rejected(why)
-    return replace(found, seconds=time.perf_counter() - began)
-
-
-def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> _Proposal:
-    answer, matcher = None, problem.matcher if config.landmarks else None
-    if matcher is not None:
-        answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
-    has_points = _measured_points(problem) >= LEAST_POINTS
-    by_landmarks = None
-    if answer is not None:
-        by_landmarks = _Proposal(localization_by_landmarks(problem, answer, began), decided=True)
-        if _is_final(answer, has_points):
-            return by_landmarks
-        if problem.start is None:
-            problem = replace(problem, start=answer.T)  # one more place to look
-    if problem.surface is None:
-        found = _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
-        if matcher is None or not found.converged:
-            return _Proposal(found)
-        return _Proposal(found, confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True).pose)
-    if has_points:
-        found = localize_by_depth(problem, problem.surface, config, seed)
-    else:
-        hopeless = _unrecognised(problem) if matcher is not None and _is_hopeless(problem) else None
-        found = localize_by_images(problem, problem.surface, config, seed, hopeless)
-        typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
-        found = without_the_imprecise(found, typical)
-    if matcher is None:
-        return _Proposal(found if problem.matcher is not None else _with_hint_at_landmarks(found))
-    proposal = _compared_with_landmarks(found, problem, matcher, config, seed, began)
-    is_unsure = answer is not None and answer.verdict.outcome in (Outcome.IMPRECISE, Outcome.UNCERTAIN)
-    if by_landmarks is not None and is_unsure and proposal.found.outcome is Outcome.TOO_FEW_MATCHES:
-        return by_landmarks
-    return proposal
-
-
-def _is_hopeless(problem: Problem) -> bool:
-    """Return whether an image without recognised landmarks cannot be localized, as the scene is textured but the field blurred."""
-    textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
-    return textured and not is_sharp(problem)
-
-
-def _unrecognised(problem: Problem) -> Verdict:
-    causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
-    focal = ", or its focal length may be too far off" if problem.focal_is_approximate else ""
-    why = f"too few landmarks were recognised, and the field is not sharp enough to compare images with it: {causes}{focal}"
-    return Verdict(Outcome.TOO_FEW_MATCHES, why)
-
-
-def _with_hint_at_landmarks(found: Localization) -> Localization:
-    """Add a hint to a rejected answer that the map has no landmarks, if they might have given a pose."""
-    if found.converged or found.outcome is Outcome.UNDETERMINED:
-        return found
-    return replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
-
-
-def _is_settled(found: Localization) -> bool:
-    """Return whether a pose is accepted and shows no sign of an occluder."""
-    said = found.diagnostics
-    if not found.converged or not isinstance(said, LandmarkDiagnostics) or said.on_surface is None:
-        return found.converged
-    return (found.confidence or 0.0) >= TRUSTED and said.on_surface >= MOSTLY_ON_SURFACE
-
-
-def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
-    """Return whether the surface cannot improve the pose by landmarks.
-
-    Colours do not determine a position that landmarks leave imprecise because the intrinsics are unknown.
-    """
-    if answer.has_rival:
-        return True  # the surface is assumed to look the same there, too
-    outcome = answer.verdict.outcome
-    unknown_camera = outcome is Outcome.IMPRECISE and answer.found.estimates_calibration
-    if outcome is Outcome.UNCERTAIN or unknown_camera:
-        return not has_points
-    return outcome is Outcome.CONVERGED or outcome in FINAL
-
-
-def _compared_with_landmarks(
-    found: Localization,
+def _on_surface(
     problem: Problem,
-    matcher: LandmarkMatcher,
     config: AutoConfig,
     seed: int,
+    loop: Loop | None,
+    by_landmarks: Localization | None,
     began: float,
-) -> _Proposal:
-    """Refine a pose found on the surface by the landmarks that match there, or reject it if too few of the visible ones match.
+) -> Localization:
+    """Return the answer by measured depth or images on the surface, or else that by landmarks."""
+    textured = loop is not None and loop.landmarks.usual_matches >= TEXTURED
+    surface = problem.surface
+    if loop is None and surface is None:
+        return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
+    if surface is None or textured:
+        return by_landmarks or unrecognized(problem)
+    has_points = measured_points(problem) >= LEAST_POINTS
+    if not has_points:
+        if loop is not None:
+            return by_landmarks or unrecognized(problem)
+        return _uncertain_camera(localize_by_images(problem, surface, config, seed), problem)
+    best = by_landmarks
+    occluder = nearest_piece(problem)
+    for given in (problem, *(() if occluder is None else (occluder.rest,))):
+        found = localize_by_depth(given, surface, config if loop is None else replace(config, rounds=1), seed)
+        if occluder is not None and given is not problem:
+            if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < IN_FRONT:
+                continue
+            hidden = (
+                f"without the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
+            )
+            found = replace(found, reason=f"{found.reason}, {hidden}")
+        there = None if loop is None else loop.at(found.T_world_camera)
+        if there is not None and there.verdict.accepted:
+            refined = localization(problem, there, began)
+            return replace(refined, reason=f"found on the surface; {refined.reason}")
+        if there is not None and found.converged and there.contradicted:
+            why = f"{there.evidence.inliers} landmarks match, {there.evidence.by_chance:.0f} by chance"
+            found = found.rejected(Verdict(Outcome.TOO_FEW_MATCHES, why))
+        found = _uncertain_camera(found, problem)
+        if found.converged:
+            return found
+        best = best or found
+    assert best is not None
+    return best
 
-    Landmarks whose own pose is not accepted only confirm an accepted pose, and do not move it.
-    """
-    near = confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True)
-    if near.pose is not None and (record := current_record()) is not None:
-        record.landmarks.append(near.pose)
-    # Matches are no accident near a pose found by other means.
-    verdict = (
-        None if near.pose is None else landmark_verdict(near.pose, LandmarkThresholds(log10_nfa=math.inf))
+
+def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
+    """Reject a pose on the surface by a camera whose focal length is approximate, as only landmarks separate that from distance."""
+    if not (
+        found.converged and problem.focal_is_approximate and any(v.frame.has_depth for v in problem.views)
+    ):
+        if not (found.converged and problem.focal_is_approximate and problem.depth_rays is None):
+            return found
+    why = "the focal length is approximate, and only landmarks can separate it from the distance"
+    return found.rejected(Verdict(Outcome.IMPRECISE, why))
+
+
+def localization(problem: Problem, answer: Answer, began: float) -> Localization:
+    """Convert an answer of the loop."""
+    T, noise = answer.T_world_rig, float(answer.posterior.states.noise[answer.posterior.best])
+    poses = [T] if problem.start is None else [problem.start, T]
+    stated, camera = problem.views[-1].frame.intrinsics, answer.camera
+    corrected = None if camera is None else Calibration(*camera[:5].tolist()).applied(stated)
+    reason = answer.verdict.reason
+    if answer.fused:
+        reason += f", fused with {enumeration(answer.fused)}"
+    if corrected is not None:
+        reason += f", with another camera than the stated one ({answer.explanation})"
+    elif answer.explanation.endswith(" moving"):
+        reason += ", with the motion of a rolling shutter"
+    record = current_record()
+    if record is not None:
+        record.answers.append(answer)
+    return Localization(
+        T_world_camera=T,
+        outcome=answer.verdict.outcome,
+        reason=reason,
+        steps=len(poses),
+        seconds=time.perf_counter() - began,
+        loss=noise,
+        method="auto",
+        poses=SE3.stack([*poses, T]),
+        losses=torch.full((len(poses),), noise, dtype=torch.float64),
+        covariance=answer.covariance,
+        focal_factor=1.0 if camera is None else float(camera[0].exp()),
+        intrinsics=corrected,
+        confidence=answer.verdict.confidence,
+        diagnostics=answer.evidence,
     )
-    if near.pose is not None and verdict is not None and verdict.accepted:
-        answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
-        supported = found.converged and (answer.verdict.confidence or 0.0) >= LEAST_SUPPORT
-        if supported and not answer.verdict.accepted:
-            return _Proposal(found, near.pose)  # they confirm the pose, but are too few to move it
-        refined = localization_by_landmarks(problem, answer, began)
-        return _Proposal(replace(refined, reason=f"found on the surface; {refined.reason}"), near.pose)
-    if found.converged and near.contradicts:
-        why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
-        found = found.rejected(Verdict(Outcome.TOO_FEW_MATCHES, why))
-    elif found.converged and verdict is not None and _is_misled(verdict, problem):
-        found = found.rejected(verdict)
-    return _Proposal(found, near.pose)
 
 
-def _is_misled(near: Verdict, problem: Problem) -> bool:
-    """Return whether landmarks contradict the intrinsics of a pose by colour, as wrong intrinsics fit at a wrong pose."""
-    return near.outcome is Outcome.MISCALIBRATED and _measured_points(problem) < LEAST_POINTS
+def unrecognized(problem: Problem) -> Localization:
+    """Return the answer to images in which no landmarks were recognised."""
+    T = problem.start or SE3.identity()
+    causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
+    return Localization(
+        T, Outcome.TOO_FEW_MATCHES, f"too few landmarks were recognised: {causes}", 0, 0.0, float("nan"), "auto",
+        SE3.stack([T]), torch.zeros(0, dtype=torch.float64),
+    )  # fmt: skip
 
 
-def _measured_points(problem: Problem) -> int:
+def measured_points(problem: Problem) -> int:
+    """Return the number of measured depths."""
     images = [view.frame.depth for view in problem.views if view.frame.depth is not None]
     pixels = sum(int(((depth > 0) & depth.isfinite()).sum()) for depth in images)
     return pixels + (0 if problem.depth_rays is None else len(problem.depth_rays))
@@ -231,6 +166,16 @@ def _descended(problem: Problem, seed: int, why: str) -> Localization:
         raise InputError("method 'auto' then needs a start; give one", where=why)
     found = bid(problem, BidConfig(), seed)
     return replace(found, reason=f"{why}; {found.reason}")
+
+
+def within_risk(found: Localization, risk: float) -> Localization:
+    """Return the answer, rejected as ``uncertain`` if its confidence is unknown or lower than the risk requires."""
+    least = least_confidence(risk)
+    if not found.converged or (found.confidence is not None and found.confidence >= least):
+        return found
+    known = "unknown" if found.confidence is None else f"{found.confidence:.3f}"
+    why = f"the confidence is {known}, a risk of {risk:g} requires {least:.3f}"
+    return found.rejected(Verdict(Outcome.UNCERTAIN, why, found.confidence))
 
 
 AUTO = Method(

@@ -114,6 +114,12 @@ class Quadratic:
         cost = self.cost[g] + 0.5 * ((pull + self.gradient[g]) * off).sum(-1)
         return Normal(cost, pull * scale, scale[:, :, None] * self.hessian[g] * scale[:, None])
 
+    def with_first(self, other: Quadratic) -> Quadratic:
+        """Return the sum with the model of further terms about the state of the first mode."""
+        names = ("cost", "gradient", "hessian")
+        joined = ((getattr(self, name), getattr(other, name)) for name in names)
+        return Quadratic(self.here, *(torch.cat([own[:1] + more, own[1:]]) for own, more in joined))
+
     def minimum(self, states: States) -> tuple[States, Normal]:
         """Return the minimum of the sum with each state's prior; the second step accounts for the curvature of rotations."""
         for _ in range(2):

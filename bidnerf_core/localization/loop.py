@@ -1,30 +1,39 @@
-"""The loop: propose a pose, fuse all measurements under all hypotheses, weigh the explanations, accept or go on."""
+"""The loop: propose a pose, refine it under all explanations, fuse all measurements, accept it or go on."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, accept
-from bidnerf_core.localization.descend import Quadratic, Term, descend, log_evidence, prior, total
+from bidnerf_core.localization.descend import (
+    Quadratic,
+    Term,
+    descend,
+    log_evidence,
+    prior,
+    total,
+)
 from bidnerf_core.localization.explanations import Explanations, Seed, explanations
+from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
 from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, log10_nfa
 from bidnerf_core.localization.posterior import Posterior
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.propose import LEAST_AGREEING, best_consensus, consensus, inliers
+from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
 from bidnerf_core.localization.query import Query
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.settings import AutoConfig
+from bidnerf_core.localization.recording import current_record
+from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.states import Sights, States, project
 from bidnerf_core.localization.terms.landmarks import Landmarks, point_variance
-from bidnerf_core.localization.terms.rays import FIELD_ERRORS, RAYS, Rays
+from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
 from bidnerf_core.localization.terms.surface import Surface
+from bidnerf_core.mapping import LandmarkMap
 
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which no mirror image is tried."""
@@ -35,22 +44,28 @@ LEAST_RIVAL = 0.3
 REFITS = 3
 """Most fits of a mode until the explanation that it is linearized about is the most probable one."""
 MOST_FIRST = 100
-"""Number of matches by descriptors to which the first fits are made."""
+"""Number of matches on which kinds of cameras are compared."""
 RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 TOLERANCE, ANGLE = 0.03, 0.05
 """Within which the pose must be: relative to the distance of the scene, and radians."""
 SHARPEST = 0.04
 """Colour noise of a field on its training images above which its rays add nothing to the landmarks."""
-import os
-
-RAYS_BELOW = float(os.environ.get("RB", "0.6"))
-"""Pixels: standard deviation of the scene's projection by landmarks below which rays add nothing."""
+RAYS_BEYOND = 0.6
+"""Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them."""
+HEAVY_TAILS = 1.7
+"""Factor of the covariance by which the ellipsoid of a Gaussian's 95 % holds 95 % of the poses: errors have heavier tails."""
+FROM_START = 6.0
+"""Log odds of a place per factor e of its distance from the start: in six dimensions, the density of a normal distribution of unknown
+width falls with the sixth power of the distance.
+"""
+CELLS = 10
+"""Number of rows and columns of the grid whose occupied cells measure how far matches spread over an image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """A place (or a mirror image) that may explain the photo, with the matches that agree with it."""
+    """A place, or a mirror image, that may explain the images, with the matches that agree with it."""
 
     name: str
     query: Query
@@ -58,118 +73,179 @@ class Mode:
     by_descriptors: Matches  # alone
 
 
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """A pose by landmarks and all that was fused with them, under the explanations of the images, and whether to accept it."""
+
+    modes: Sequence[Mode]
+    posterior: Posterior
+    explanations: Explanations
+    landmarks: Landmarks
+    covariance: Float[
+        Tensor, "6 6"
+    ]  # of the right update, translation first; that of the map's own poses included
+    distance: float  # median distance of the matched landmarks
+    evidence: Evidence
+    verdict: Verdict
+    fused: tuple[str, ...]  # the measurements other than landmarks
+    contradicted: bool  # whether hardly more landmarks match than by chance, although many should
+
+    @property
+    def T_world_rig(self) -> SE3:
+        return self.posterior.pose()
+
+    @property
+    def mode(self) -> Mode:
+        return self.modes[self.posterior.mode]
+
+    @property
+    def explanation(self) -> str:
+        """The name of the most probable explanation."""
+        return self.explanations.names[int(self.posterior.states.row[self.posterior.best])]
+
+    @property
+    def camera(self) -> Float[Tensor, "6"] | None:
+        """The correction of the stated camera, or None if that is at least approximately right."""
+        if self.explanation.removesuffix(" moving") in ("exact", "right", "inexact"):
+            return None
+        return self.posterior.states.nuisances[self.posterior.best, :6]
+
+
 class Loop:
     """Localizes the images of one problem in a map by landmarks, measured depth and rendered colours."""
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        self.matcher = problem.matcher
-        self.landmarks = problem.matcher.landmarks
-        self.is_sharp = problem.colour_noise is not None and problem.colour_noise <= SHARPEST
+    def __init__(self, problem: Problem, matcher: LandmarkMatcher, rays: int = 0, seed: int = 0) -> None:
+        """Detect keypoints; ``rays`` is the number that may be rendered, 0 for none."""
+        self.problem, self.matcher, self.seed = problem, matcher, seed
+        self.landmarks: LandmarkMap = matcher.landmarks
+        self.query = Query.of(problem.views, matcher.features)
+        is_sharp = problem.colour_noise is None or problem.colour_noise <= SHARPEST
+        self.rays = rays if is_sharp else 0
+        self._nearest: dict[int, Nearest] = {}
 
     @torch.no_grad()
-    def __call__(self) -> tuple:
-        query = Query.of(self.problem.views, self.matcher.features)
-        answer = None
-        for seed, nearest, nfa in self._proposals(query):
-            given = explanations(
-                query, self.landmarks, seed.distance, DEPTH_WIDTH * self.problem.sensor.scale
-            )
-            modes, states, term = self._modes(query, nearest, seed, given, nfa)
-            if not modes:
-                continue
-            found = self._fused(modes, states, term, given)
-            if answer is None or found[1].accepted or found[3].log10_nfa < answer[3].log10_nfa:
+    def __call__(self) -> Answer | None:
+        """Return the best answer; None if no pose agrees with any landmarks."""
+        answer: Answer | None = None
+        for seed, nearest, nfa in self._proposals():
+            found = self.answer(seed, nearest, nfa)
+            if found is not None and (answer is None or _is_better(found, answer)):
                 answer = found
-            if answer[1].accepted:
+            if answer is not None and answer.verdict.accepted:
                 break
         return answer
 
-    def _proposals(self, query: Query) -> Iterator[tuple[Seed, Nearest, float]]:
-        """Yield poses, cheapest first: by sample consensus on the strongest keypoints, and then on all."""
-        most = max(len(image.keypoints) for image in query.images)
-        if most < 4:
-            return
-        for count in dict.fromkeys((min(STRONGEST, most), most)):
-            nearest = Nearest.of(query, self.matcher, count)
-            found = best_consensus(query, self.landmarks, nearest.best)
-            if found is not None:
-                yield found[0], nearest, found[1]
-                if found[1] < -20:
-                    break
+    @torch.no_grad()
+    def at(self, T_world_rig: SE3) -> Answer | None:
+        """Return the answer at a pose found by other means; None if no landmarks match there."""
+        distance = self._distance(T_world_rig)
+        seed = Seed("elsewhere", T_world_rig, torch.zeros(6, dtype=torch.float64), distance)
+        return self.answer(seed, self.nearest(STRONGEST), 0.0, searched=False)
 
-    def _term(self, modes: list[Mode], best: States) -> Landmarks:
+    def answer(self, seed: Seed, nearest: Nearest, nfa: float, searched: bool = True) -> Answer | None:
+        """Refine a seed under all explanations of the images, fuse all measurements, and judge the result."""
+        width = DEPTH_WIDTH * self.problem.sensor.scale
+        given = explanations(self.query, self.landmarks, seed.distance, width)
+        modes, states = self._modes(nearest, seed, given, nfa, searched)
+        if not modes:
+            return None
+        term = self._term(modes, states)
+        states = term.with_noise(states)
+        return self._fused(modes, states, term.weighted_for(states), given, searched)
+
+    def nearest(self, strongest: int) -> Nearest:
+        """Return the landmarks most similar to the strongest keypoints of each image."""
+        count = min(strongest, max(len(image.keypoints) for image in self.query.images))
+        if count not in self._nearest:
+            self._nearest[count] = Nearest.of(self.query, self.matcher, count)
+        return self._nearest[count]
+
+    def _proposals(self) -> Iterator[tuple[Seed, Nearest, float]]:
+        """Yield poses, the cheapest first: by sample consensus on the strongest keypoints, and on all; and the start."""
+        most = max(len(image.keypoints) for image in self.query.images)
+        nearest, record = self.nearest(STRONGEST), current_record()
+        for count in dict.fromkeys((min(STRONGEST, most), most)):
+            nearest = self.nearest(count)
+            found = best_consensus(self.query, self.landmarks, nearest.best)
+            if found is None:
+                continue
+            if record is not None:
+                record.add(f"sample consensus on {len(nearest.best)} matches", found[0].T)
+            yield found[0], nearest, found[1]
+            if found[1] < CONVINCING:
+                break
+        if self.problem.start is not None:
+            T = self.problem.start
+            yield Seed("start", T, torch.zeros(6, dtype=torch.float64), self._distance(T)), nearest, 0.0
+
+    def _distance(self, T_world_rig: SE3) -> float:
+        """Return the median distance of the landmarks in front of the camera, or of all."""
+        local = T_world_rig.inverse().apply(self.landmarks.positions.double())
+        front = local[local[:, 2] > 0]
+        return float((front if len(front) else local).norm(dim=-1).median())
+
+    def _term(self, modes: Sequence[Mode], best: States) -> Landmarks:
         """Return the reprojection errors of the modes' matches, padded; ``best`` (g) are the modes' states."""
         m = max(1, *(len(mode.matches) for mode in modes))
         parts = []
         for number, (query, found) in enumerate((mode.query, mode.matches) for mode in modes):
-            k = found.keypoint
-            variance = point_variance(
-                self.landmarks, found.landmark, best[number : number + 1], query.focal[k]
-            )
-            sights = query.sights[k]
+            k, sights = found.keypoint, query.sights[found.keypoint]
+            here = best[number : number + 1]
+            variance = point_variance(self.landmarks, found.landmark, here, query.focal[k])
             points = self.landmarks.positions[found.landmark].double()
-            parts.append([
-                _padded(points, m, (0.0, 0.0, 1.0)), _padded(sights.image, m), _padded(sights.times, m), _padded(sights.rotation, m),
-                _padded(sights.translation, m), _padded(torch.ones(len(found), dtype=torch.float64), m), _padded(variance, m, 1.0),
-                _padded(query.focal[k], m, 1.0),
-            ])  # fmt: skip
+            valid = torch.ones(len(found), dtype=torch.float64)
+            values = (
+                points,
+                sights.image,
+                sights.times,
+                sights.rotation,
+                sights.translation,
+                valid,
+                variance,
+                query.focal[k],
+            )
+            fillers = ((0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+            parts.append([_padded(value, m, fill) for value, fill in zip(values, fillers, strict=True)])
         points, *seen, valid, variance, focal = (torch.stack(part) for part in zip(*parts, strict=True))
-        correlation = torch.tensor(
-            [self.landmarks.correlation_of(len(mode.matches)) for mode in modes], dtype=torch.float64
-        )
+        counts = [self.landmarks.correlation_of(len(mode.matches)) for mode in modes]
+        correlation, query = torch.tensor(counts, dtype=torch.float64), modes[0].query
         return Landmarks(
-            points,
-            Sights(*seen),
-            valid,
-            variance,
-            focal,
-            correlation,
-            1 / correlation,
-            modes[0].query.area,
-            modes[0].query.threshold / 2,
-        )
+            points, Sights(*seen), valid, variance, focal, correlation, 1 / correlation, query.area, query.threshold / 2
+        )  # fmt: skip
 
     def _modes(
-        self, query: Query, nearest: Nearest, seed: Seed, given: Explanations, nfa: float
-    ) -> tuple[list[Mode], States | None, Landmarks | None]:
+        self, nearest: Nearest, seed: Seed, given: Explanations, nfa: float, searched: bool
+    ) -> tuple[list[Mode], States]:
         """Return the modes, and the most probable state of each, refined on matches by projection."""
         modes: list[Mode] = []
         best: list[States] = []
-        for name, there, found, start in self._places(query, nearest, seed, given, nfa, best):
+        for name, query, found, start in self._places(nearest, seed, nfa, best):
             known = States.known(start.T, start.camera)
-            near = found[inliers(there, self.landmarks, found, known, 3)]
+            near = found[inliers(query, self.landmarks, found, known, RADII[0])]
+            if not searched and not modes:
+                within = RADII[0] * query.threshold
+                near = Projected(query, self.landmarks, known, within).matches(within)
             if len(near) < LEAST_AGREEING:
                 continue
-            mode = Mode(name, there, near, found)
-            modes.append(mode)
-            best.append(self._compared(mode, start, given, query.threshold / 2))
-        if not modes:
-            return [], None, None
+            modes.append(Mode(name, query, near, found))
+            best.append(self._compared(modes[-1], start, given, query.threshold / 2))
         seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
             for g, mode in enumerate(modes):
                 within = radius * mode.query.threshold
-                seen[g] = Projected(mode.query, self.landmarks, best[g], within, seen[g])
-                found = seen[g].matches(within)
-                modes[g] = mode = replace(
-                    mode, matches=found if len(found) >= LEAST_AGREEING else mode.matches
-                )
+                seen[g] = projected = Projected(mode.query, self.landmarks, best[g], within, seen[g])
+                matches = projected.matches(within)
+                if len(matches) >= LEAST_AGREEING:
+                    modes[g] = mode = replace(mode, matches=matches)
                 if radius == RADII[0]:
-                    z = (
-                        best[g]
-                        .T.inverse()
-                        .apply(self.landmarks.positions[mode.matches.landmark].double())
-                        .norm(dim=-1)
-                    )
-                    again = Seed(mode.name, best[g].T[0], best[g].nuisances[0, :6], float(z.median()))
+                    points = self.landmarks.positions[mode.matches.landmark].double()
+                    distance = float(best[g].T.inverse().apply(points).norm(dim=-1).median())
+                    again = Seed(mode.name, best[g].T[0], best[g].nuisances[0, :6], distance)
                     best[g] = self._compared(mode, again, given, float(best[g].noise))
                 term = self._term([mode], best[g])
                 best[g], _ = descend(term.with_noise(best[g]), [term], 3)
-        states = States.cat([replace(state, mode=state.mode + g) for g, state in enumerate(best)])
-        term = self._term(modes, states)
-        states = term.with_noise(states)
-        return modes, states, term.weighted_for(states)
+        numbered = [replace(state, mode=state.mode + g) for g, state in enumerate(best)]
+        return modes, States.cat(numbered) if numbered else States.known(seed.T, seed.camera)
 
     def _compared(self, mode: Mode, seed: Seed, given: Explanations, noise: float) -> States:
         """Return the most probable state of a mode, comparing kinds of cameras, each with its own noise, on some of the matches."""
@@ -180,51 +256,79 @@ class Loop:
         term = replace(term, share=term.share * (count / len(some)))
         states, _ = descend(states, [term], 4)
         states, normal = descend(term.with_noise(states), [term], 3)
-        return replace(
-            states[log_evidence(states, normal).argmax()[None]], mode=torch.zeros(1, dtype=torch.long)
-        )
+        return states[log_evidence(states, normal).argmax()[None]]
 
     def _places(
-        self, query: Query, nearest: Nearest, seed: Seed, given: Explanations, nfa: float, best: list[States]
+        self, nearest: Nearest, seed: Seed, nfa: float, best: list[States]
     ) -> Iterator[tuple[str, Query, Matches, Seed]]:
-        """Yield the seed, and others that compete with it; ``best`` has the state refined from each before the next is asked for."""
-        matches = nearest.best
-        yield "landmarks", query, matches, seed
+        """Yield the seed and the places that compete with it; ``best`` has the state refined from it before those are asked for.
+
+        A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the seed may agree as well
+        with similar landmarks elsewhere. And the image may be mirrored.
+        """
+        query, matches = self.query, nearest.best
+        yield seed.name, query, matches, seed
         if not best:
             return
-        for name, there, found in self._rivals(query, nearest, best[0], nfa):
-            other = consensus(there, self.landmarks, found, best[0].nuisances[0, :6], name)
-            if other is not None:
-                yield name, there, found, other[0]
-
-    def _rivals(
-        self, query: Query, nearest: Nearest, best: States, nfa: float
-    ) -> Iterator[tuple[str, Query, Matches]]:
-        """Yield matches with similar landmarks at other places, and those of the mirror image."""
+        rivals: list[tuple[str, Query, Matches]] = []
         q, k = nearest.landmark.shape
         own = nearest.keypoint.repeat_interleave(k)
         points = self.landmarks.positions[nearest.landmark.flatten()].double()[None]
-        seen = project(best, points, query.sights[own])
+        seen = project(best[0], points, query.sights[own])
         off = ((seen.image[0] - query.sights.image[own]) * query.focal[own, None]).norm(dim=-1)
-        near = ((off <= 3 * query.threshold) & seen.front[0]).view(q, k)
+        near = ((off <= RADII[0] * query.threshold) & seen.front[0]).view(q, k)
         agreeing = torch.zeros(len(query.view), dtype=torch.bool)
         agreeing[nearest.keypoint] = near[:, 0]
         others = nearest.others(near)
         others = others[agreeing[others.keypoint]]
-        least = max(6, LEAST_RIVAL * int(agreeing.sum()))
-        if len(others.keypoint.unique()) >= least:
-            yield "other place", query, others
+        if len(others.keypoint.unique()) >= max(LEAST_AGREEING, LEAST_RIVAL * int(agreeing.sum())):
+            rivals.append(("another place", query, others))
         if nfa > UNMISTAKABLE and self.landmarks.features == "sift" and len(query.images) == 1:
             mirrored = query.mirrored
-            yield "mirror image", mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best
+            rivals.append(("mirror image", mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
+        for name, there, found in rivals:
+            other = consensus(there, self.landmarks, found, best[0].nuisances[0, :6], name)
+            if other is not None:
+                yield name, there, found, other[0]
+
+    def _fused(
+        self, modes: list[Mode], best: States, landmarks: Landmarks, given: Explanations, searched: bool
+    ) -> Answer:
+        """Fuse all measurements under all explanations, and judge the result."""
+        problem, terms = self.problem, list[Term]([landmarks])
+        best, quadratic = self._settled(best, landmarks, given)
+        found = self._posterior(quadratic, landmarks, given)
+        points, fused = None, list[str]()
+        if problem.surface is not None and problem.has_depth:
+            points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
+        if points is not None and found.mode == 0:
+            points = points.fitted_noise(found.states[found.best : found.best + 1])
+            terms.append(points)
+            fused.append("depth")
+            best, _ = descend(best, terms, 5)
+            quadratic = self._linearized(best, terms, given)
+            found = self._posterior(quadratic, landmarks, given)
+        before = found  # rays about one camera's pose must not decide between cameras
+        if self.rays and found.mode == 0 and self._blur(found, landmarks) > RAYS_BEYOND:
+            here = found.states[found.best : found.best + 1]
+            rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed).fitted(here)
+            fused.append("rendering")
+            here, _ = descend(here, [*terms, rays], 4)
+            quadratic = self._linearized(States.cat([here, best[1:]]), terms, given)
+            # Rays are too expensive to be rendered for all hypotheses.
+            by_rays = Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
+            quadratic = quadratic.with_first(by_rays)
+            systematic = torch.zeros_like(quadratic.hessian)
+            systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
+            found = self._posterior(quadratic, landmarks, given, systematic)
+        return self._judged(found, before, modes, landmarks, points, given, searched, tuple(fused))
 
     def _settled(self, best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic]:
         """Return the most probable state of each mode (g), and the model about it by which it is the most probable."""
         for _ in range(REFITS):
             best, _ = descend(term.with_noise(best), [term], 4)
-            free = best.under(*given.prior_of_all)
-            quadratic = Quadratic.of(term(free), free)
-            states, normal = quadratic.minimum(given.about(free))
+            quadratic = self._linearized(best, [term], given)
+            states, normal = quadratic.minimum(given.about(quadratic.here))
             member = states.mode[None] == torch.arange(len(best))[:, None]
             found = states[torch.where(member, log_evidence(states, normal)[None], -torch.inf).argmax(-1)]
             if bool((found.row == best.row).all()):
@@ -232,144 +336,89 @@ class Loop:
             best = found
         return best, quadratic
 
-    def _fused(self, modes: list[Mode], best: States, landmarks: Landmarks, given: Explanations) -> tuple:
-        """Fuse all measurements under all explanations, and judge the result."""
-        best, quadratic = self._settled(best, landmarks, given)
-        first = self._posterior(best, quadratic, landmarks, modes, given)
-        problem, depth = self.problem, None
-        terms: list[Term] = [landmarks]
-        if problem.surface is not None and problem.has_depth:
-            depth = Surface.of(problem.views, problem.depth_rays, problem.surface, 0)
-        if depth is not None and first.mode == 0:
-            depth = depth.fitted_noise(first.states[first.best : first.best + 1])
-            terms.append(depth)
-            best, _ = descend(best, terms, 5)
-            free = best.under(*given.prior_of_all)
-            quadratic = Quadratic.of(landmarks(free) + depth(free), free)
-            first = self._posterior(free, quadratic, landmarks, modes, given)
-        before = first  # rays about one camera's pose must not decide between cameras
-        if self.is_sharp and first.mode == 0 and self._blur(first, landmarks) > RAYS_BELOW:
-            best = first.states[first.best : first.best + 1]
-            rays = Rays.of(problem.views, problem.field, problem.bounds, RAYS, 0).fitted(best)
-            best, _ = descend(best, [*terms, rays], 4)
-            own = best.under(*given.prior_of_all)
-            free = own if len(free) == 1 else States.cat([own, free[1:]])
-            by_rays = rays(own)
-            found = total(free, terms) - prior(free)
-            found = replace(
-                found,
-                cost=_with_first(found.cost, by_rays.cost),
-                gradient=_with_first(found.gradient, by_rays.gradient),
-                hessian=_with_first(found.hessian, by_rays.hessian),
-            )
-            quadratic = Quadratic.of(found, free)
-            systematic = torch.zeros_like(quadratic.hessian)
-            systematic[:1] = (FIELD_ERRORS - 1) * Quadratic.of(by_rays, own).hessian
-            first = self._posterior(free, quadratic, landmarks, modes, given, systematic)
-        return self._judged(first, before, modes, landmarks, depth, given)
-
-    def _blur(self, found: Posterior, term: Landmarks) -> float:
-        """Return the standard deviation of the scene's projection at the best pose, pixels."""
-        covariance = found.mixture()
-        if not bool(covariance.isfinite().all()):
-            return math.inf
-        distance = self._distance(found, term)
-        return float(modes_focal(term) * covariance[:3, :3].trace().sqrt()) / distance
-
-    def _distance(self, found: Posterior, term: Landmarks) -> float:
-        g = found.mode
-        z = found.states.T[found.best].inverse().apply(term.points[g]).norm(dim=-1)
-        return float(z[term.valid[g] > 0].median())
+    def _linearized(self, best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
+        """Return the model of the sum of terms about each mode's state."""
+        free = best.under(*given.prior_of_all)
+        return Quadratic.of(total(free, terms) - prior(free), free)
 
     def _posterior(
         self,
-        free: States,
         quadratic: Quadratic,
         landmarks: Landmarks,
-        modes: list[Mode],
         given: Explanations,
-        systematic=0.0,
+        systematic: Tensor | float = 0.0,
     ) -> Posterior:
+        states = given.about(quadratic.here)
+        if (start := self.problem.start) is not None:
+            # Of two places that look the same, the one nearer to the start is the likelier.
+            update = (start.inverse() @ quadratic.here.T).log()
+            away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
+            log_prior = states.log_prior - FROM_START * away.clamp(min=1e-9).log()[states.mode]
+            states = replace(states, log_prior=log_prior)
         scatter = self.landmarks.calibration_scatter.double()
-        return Posterior.of(given.about(free), quadratic, landmarks, scatter, systematic)
+        return Posterior.of(states, quadratic, landmarks, scatter, systematic)
+
+    def _blur(self, found: Posterior, term: Landmarks) -> float:
+        """Return the standard deviation of the scene's projection at the best pose, pixels."""
+        position = found.mixture()[:3, :3].trace().sqrt()
+        return float(term.focal.max() * position.nan_to_num(math.inf)) / term.distance(
+            found.states[found.best]
+        )
 
     def _judged(
-        self,
-        found: Posterior,
-        before: Posterior,
-        modes: list[Mode],
-        term: Landmarks,
-        depth: Surface | None,
-        given: Explanations,
-    ) -> tuple:
+        self, found: Posterior, before: Posterior, modes: list[Mode], term: Landmarks, points: Surface | None,
+        given: Explanations, searched: bool, fused: tuple[str, ...],
+    ) -> Answer:  # fmt: skip
         mode, state = modes[found.mode], found.states[found.best : found.best + 1]
-        squared = term.residuals(state)[0][0]
-        inlier = (squared <= 9) & (term.valid[found.mode] > 0)
-        count = int(inlier.sum())
         query = mode.query
-        distance = self._distance(found, term)
-        radius = RADII[-1] * query.threshold
-        seen = Projected(query, self.landmarks, state, radius)
-        chance = len(seen.matches(radius, 4 * radius))
+        inlier = (term.residuals(state)[0][0] <= 9) & (term.valid[found.mode] > 0)
+        count, distance = int(inlier.sum()), term.distance(state)
+        within = RADII[-1] * query.threshold
+        seen = Projected(query, self.landmarks, state, within)
+        chance = sum(len(seen.matches(within, shift * within)) for shift in (4, -4)) / 2
         pixels = query.keypoints.pixels[mode.matches.keypoint]
         size = torch.tensor([query.camera.width, query.camera.height])
-        cells = ((pixels / size * 10).long().clamp(0, 9) * torch.tensor([1, 10])).sum(-1)
-        cells = cells + 100 * query.view[mode.matches.keypoint]
+        cells = ((pixels / size * CELLS).long().clamp(0, CELLS - 1) * torch.tensor([1, CELLS])).sum(-1)
+        cells = cells + CELLS**2 * query.view[mode.matches.keypoint]
         shared = self.landmarks.pose_covariance
-        covariance = found.mixture() + shared
-        position = covariance[:3, :3].trace().sqrt() if bool(covariance.isfinite().all()) else math.inf
+        covariance = HEAVY_TAILS * (found.mixture() + shared)
+        position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf))
         credible = given.credible[found.states.row]
         agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
+        near = alike = None
+        if points is not None:
+            near, alike = points.inliers(state)
         evidence = Evidence(
-            log10_nfa=log10_nfa(len(mode.by_descriptors), agreeing, query.by_chance), inliers=count,
-            above_chance=(1 + count) / (1 + chance), recall=count / max(1, min(seen.visible, len(query.view))),
-            spread=len(cells.unique()) / 100 / len(query.images), noise_ratio=float(state.noise) / self.landmarks.noise,
-            mass=min(x.mass(distance, shared, TOLERANCE, ANGLE, credible) for x in (found, before)),
-            precision=float(position) / distance, other_mode=float(found.probability[found.states.mode != found.mode].sum()),
-            credible=float(found.probability[credible].sum()), surprise=float(state.z.square().sum()),
-            on_surface=1.0 if depth is None else float(depth.near(state).mean()),
+            log10_nfa=log10_nfa(len(mode.by_descriptors), agreeing, query.by_chance) if searched else 0.0,
+            inliers=count, by_chance=chance, recall=count / max(1, min(seen.visible, len(query.view))),
+            spread=len(cells.unique()) / CELLS**2 / len(query.images),
+            noise_ratio=float(state.noise) / self.landmarks.noise,
+            other_place=float(found.probability[found.states.mode != found.mode].sum()),
+            credible=float(found.probability[credible].sum()), precision=position / distance,
+            mass=min(x.mass(distance, shared, TOLERANCE, ANGLE, credible) for x in (found, before)), searched=searched,
+            on_surface=None if near is None else float(near.mean()),
+            colour_inliers=None if near is None or alike is None else float((near * alike).mean()),
         )  # fmt: skip
         verdict = accept(evidence)
         if mode.name == "mirror image":
-            verdict = Verdict(Outcome.MIRRORED, "the mirror image fits better")
-        extra = {"row": given.names[int(state.row)], "rows": {}}
-        for p, r, m in zip(found.probability.tolist(), found.states.row.tolist(), found.states.mode.tolist()):
-            if p > 0.01:
-                extra["rows"][f"{m}:{given.names[r]}"] = round(p, 3)
-        extra["nuis"] = [round(x, 4) for x in state.nuisances[0].tolist()]
-        extra["blur"] = self._blur(before, term)
-        return found.pose(), verdict, covariance, evidence, extra
+            verdict = Verdict(
+                Outcome.MIRRORED, f"the mirror image has {count} landmark inliers", verdict.confidence
+            )
+        contradicted = seen.visible >= MANY_VISIBLE and count < CONTRADICTED * chance + LEAST_AGREEING
+        if (record := current_record()) is not None:
+            record.add(f"refined on {count} landmarks", found.pose())
+        return Answer(modes, found, given, term, covariance, distance, evidence, verdict, fused, contradicted)
 
 
-def modes_focal(term: Landmarks) -> float:
-    return float(term.focal.max())
+MANY_VISIBLE, CONTRADICTED = 200, 1.5
+"""Number of visible landmarks from which a pose can be contradicted, and multiple of the chance matches below which it is."""
 
 
-def _with_first(values: Tensor, first: Tensor) -> Tensor:
-    return torch.cat([values[:1] + first, values[1:]])
+def _is_better(one: Answer, other: Answer) -> bool:
+    """Return whether an answer should replace another one."""
+    return one.verdict.accepted or (one.evidence.log10_nfa < other.evidence.log10_nfa)
 
 
 def _padded(values: Tensor, count: int, fill: float | tuple[float, ...] = 0.0) -> Tensor:
     filler = torch.as_tensor(fill, dtype=values.dtype).expand(count - len(values), *values.shape[1:])
     return torch.cat([values, filler])
-
-
-def localized(problem: Problem, config: AutoConfig, seed: int) -> Localization:
-    began = time.perf_counter()
-    answer = Loop(problem)() if problem.matcher is not None else None
-    if answer is None:
-        T, verdict, covariance, evidence, extra = (
-            SE3.identity(),
-            Verdict(Outcome.TOO_FEW_MATCHES, "no pose agrees with enough landmarks"),
-            None,
-            None,
-            {},
-        )
-    else:
-        T, verdict, covariance, evidence, extra = answer
-    found = Localization(
-        T, verdict.outcome, verdict.reason, 1, time.perf_counter() - began, 0.0, "auto", SE3.stack([T]),
-        torch.zeros(1), covariance, confidence=verdict.confidence, diagnostics=evidence,
-    )  # fmt: skip
-    object.__setattr__(found, "extra", extra)
-    return found

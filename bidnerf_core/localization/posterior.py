@@ -160,7 +160,8 @@ def _true_cameras(
     prior = (apparent - scatter.square()).clamp(min=0)
     share, doubt = torch.ones_like(states.z), torch.zeros_like(states.z)
     share[:, :4] = prior / apparent.clamp(min=1e-24)
-    least = prior.clamp(min=LEAST_DOUBT**2)
+    # Part of what seems spurious may be real, as image stabilisers shift each image.
+    least = prior.clamp(min=LEAST_DOUBT**2) + scatter.square() / 2
     doubt[:, :4] = least * scatter.square() / (least + scatter.square()) / apparent.clamp(min=1e-24)
     follows = -torch.linalg.solve_ex(H[:, :6, :6], H[:, :6, 6:])[0]  # (h 6 N) by the whitened nuisances
     step = (share - 1) * states.z

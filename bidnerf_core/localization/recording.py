@@ -16,6 +16,7 @@ from bidnerf_core.devices import moved
 from bidnerf_core.geometry import SE3
 
 if TYPE_CHECKING:
+    from bidnerf_core.localization.loop import Answer
     from bidnerf_core.localization.landmarks.pose import LandmarkPose
 
 MOST_POSES = 400
@@ -49,6 +50,7 @@ class SearchRecord:
     steps: list[RecordedStep] = field(default_factory=list)
     landmarks: list[LandmarkPose] = field(default_factory=list)
     explanations: list[ComparedExplanation] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
 
     def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:
         """Record poses T (h) or a single one; without scores, they must be in order, best first."""

@@ -121,6 +121,12 @@ class Landmarks:
         efficiency = spare * curvature.clamp(min=0.1).square() / (scatter * hessian).clamp(min=1e-3)
         return replace(self, share=efficiency / self.correlation)
 
+    def distance(self, states: States) -> float:
+        """Return the median distance of the matched points from the first state's pose, metres."""
+        g = int(states.mode.flatten()[0])
+        away = (self.points[g] - states.T.translation.reshape(-1, 3)[0]).norm(dim=-1)
+        return float(away[self.valid[g] > 0].median())
+
     def _odds(self, states: States) -> Float[Tensor, "h m"]:
         """Return the density of the residual 0, relative to that of an outlier."""
         return self.area / (

@@ -79,9 +79,11 @@ def differentiate(
     if not moving.requires_grad:  # no ray hits anything
         return Derivatives(value, *results)
     passes = [list(range(count))] if copies > 1 else [[channel] for channel in range(count)]
-    for number, wanted in enumerate(passes, start=1):
+    with torch.enable_grad():
         parts = moving.unflatten(0, (copies, -1))
-        total = torch.stack([parts[copy, :, channel].sum() for copy, channel in enumerate(wanted)]).sum()
+    for number, wanted in enumerate(passes, start=1):
+        with torch.enable_grad():
+            total = torch.stack([parts[copy, :, channel].sum() for copy, channel in enumerate(wanted)]).sum()
         gradients: tuple[Tensor | None, ...] = torch.autograd.grad(
             total, leaves, retain_graph=number < len(passes), allow_unused=True
         )
