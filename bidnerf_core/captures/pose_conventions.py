@@ -99,10 +99,10 @@ class PoseContradiction:
 def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
     """Return how the poses of ``images`` contradict them; None if they agree, or if the images do not determine it."""
     proposed = _pairs(images)
-    pairs = [pair for i, j in proposed if (pair := _matched(images, i, j)) is not None]
+    pairs = [pair for i, j in proposed if (pair := matched_pair(images, i, j)) is not None]
     if len(pairs) < MOST_PAIRS / 2:
         others = [pair for pair in _similar(images) if pair not in proposed][:MOST_PAIRS]
-        pairs += [pair for i, j in others if (pair := _matched(images, i, j)) is not None]
+        pairs += [pair for i, j in others if (pair := matched_pair(images, i, j)) is not None]
     if len(pairs) < ENOUGH_PAIRS:
         return None
     poses = SE3.stack([image.T_ref_camera for image in images])
@@ -120,7 +120,7 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
 
 
 @dataclass(frozen=True, eq=False)
-class _MatchedPair:
+class MatchedPair:
     """Two images, by index, and their matched points on the plane z = 1."""
 
     first: int
@@ -166,12 +166,12 @@ class _MatchedPair:
         return (shows.sum(-1) < ENOUGH_PARALLAX) | (front >= IN_FRONT * shows.sum(-1))
 
 
-def _agreeing(pairs: Sequence[_MatchedPair], T: SE3) -> Float[Tensor, "h"]:
+def _agreeing(pairs: Sequence[MatchedPair], T: SE3) -> Float[Tensor, "h"]:
     """Return how many pairs each set of poses (h n) agrees with."""
     return torch.stack([pair.agreeing(T).double() for pair in pairs]).sum(0)
 
 
-def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading]:
+def _fitted_positions(pairs: Sequence[MatchedPair], poses: SE3) -> list[Reading]:
     """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines
     of all pairs.
 
@@ -199,7 +199,7 @@ def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading
     return found
 
 
-def _fitted(pairs: Sequence[_MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]:
+def _fitted(pairs: Sequence[MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]:
     """Return matrices that, multiplied with the positions, put matches on their epipolar lines.
 
     The first and second are the least-squares solution with either sign, up to scale. The last stays near the
@@ -288,7 +288,7 @@ def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tenso
     return rows, partner[rows]
 
 
-def _matched(images: Sequence[ImageKeypoints], i: int, j: int) -> _MatchedPair | None:
+def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
     """Return two images' inlier matches to an essential matrix; None if these are too few."""
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
@@ -307,4 +307,4 @@ def _matched(images: Sequence[ImageKeypoints], i: int, j: int) -> _MatchedPair |
     kept = torch.from_numpy(mask[:, 0].astype(bool))
     if int(kept.sum()) < ENOUGH_MATCHES:
         return None
-    return _MatchedPair(i, j, first[kept], second[kept], pixel)
+    return MatchedPair(i, j, first[kept], second[kept], pixel)

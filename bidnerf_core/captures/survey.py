@@ -62,7 +62,7 @@ def surveyed(
     group = groups(links)
     near = nearby(views).within(group)
     count = torch.bincount(seen.image, minlength=len(views))
-    doubtful = suspects(seen, count, group)
+    doubtful = suspects(seen, links)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
     posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, config)
     exposure = exposures(views, seen, measures.brightness, near)
