@@ -106,7 +106,8 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     if len(pairs) < ENOUGH_PAIRS:
         return None
     poses = SE3.stack([image.T_ref_camera for image in images])
-    as_given = int(_agreeing(pairs, SE3.stack([poses]))[0])
+    agrees = [bool(pair.agreeing(poses[None])[0]) for pair in pairs]
+    as_given = sum(agrees)
     if as_given > NOT_ALL * len(pairs):
         return None
     tried = [*readings(len(images)), *_fitted_positions(pairs, poses)]
@@ -116,7 +117,20 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     if best >= (MOST if refused else NEARLY_ALL) * len(pairs):
         number = int((agreeing >= ALMOST_BEST * best).nonzero()[0, 0])
         return PoseContradiction(len(pairs), as_given, tried[number], int(agreeing[number]))
-    return PoseContradiction(len(pairs), as_given) if refused else None
+    if not refused:
+        return None
+    # Two images that do not agree with each other, but each with a neighbour, show places that look alike.
+    disputes = [{pair.first, pair.second} for pair, agreed in zip(pairs, agrees, strict=True) if not agreed]
+    near = likely_pairs_of_poses([image.T_ref_camera for image in images], 2).tolist()
+    nearby = [matched_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
+    sound = {
+        i
+        for pair in nearby
+        if pair and bool(pair.agreeing(poses[None])[0])
+        for i in (pair.first, pair.second)
+    }
+    alike = sum(both <= sound for both in disputes)
+    return PoseContradiction(len(pairs), as_given) if as_given < HALF * (len(pairs) - alike) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
-from bidnerf_core.captures import TrainingPoses, surveyed
+from bidnerf_core.captures import TrainingPoses, pose_contradiction, surveyed
 
 # Inside: the choice of poses is tested without a training around it
 from bidnerf_core.captures.training_poses import training_poses
 from bidnerf_core.localization import LandmarkMatcher, landmark_verdict, propose
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, posed_keypoints, tracked_views
 from landmark_scene import Points, looking_in
 
 EACH = 30
@@ -52,6 +52,13 @@ def test_exact_poses_in_identical_rooms_stay() -> None:
     assert torch.equal(found.tracked.T_world_camera.matrix(), SE3.stack(poses).matrix())
     report = surveyed(found.tracked, views)
     assert not report.with_problem("badly posed", "turned", "isolated")
+
+
+def test_the_order_of_the_photos_does_not_matter() -> None:
+    """Successive photos of different rooms look alike, but their exact poses contradict none in their own room."""
+    points, views, _ = capture(2)
+    mixed = [views[EACH * (i % 2) + i // 2] for i in range(2 * EACH)]
+    assert pose_contradiction(posed_keypoints(mixed, points)) is None
 
 
 def test_a_photo_of_either_room_is_not_accepted_in_the_other() -> None:
