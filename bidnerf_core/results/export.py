@@ -54,7 +54,8 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
 
-    All use the frame and unit of the map, which their headers state. Images are named as in the map, without file
+    These use the world and unit of the map, which their headers state, in double precision where it has an origin of its own;
+    installed exporters may write its own coordinates, see ``Map.origin``. Images are named as in the map, without file
     extensions. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
     export, and for a folder that is not empty unless ``overwrite`` is set.
     """

@@ -33,13 +33,15 @@ from bidnerf_core.geometry import Similarity
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import ImportedField
 
-# Inside: where a map's own coordinates begin, and what the names of its places mean
+# Inside: where a map's own coordinates begin, what the names of its places mean, and what the page of a map holds
 from bidnerf_core.maps.scaling import place_of
 from bidnerf_core.maps.views import chosen_origin
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
 from bidnerf_core.results import overlay
 from bidnerf_core.testing import POSES, training_views, view
+from bidnerf_core.viewer.answer import shown_answer
+from bidnerf_core.viewer.scene import shown_map
 
 ORIGIN = (500_000.0, 4_000_000.0, 100.0)
 OFFSET = torch.tensor(ORIGIN, dtype=torch.float64)
@@ -141,6 +143,8 @@ def test_exports_are_in_the_users_world(tmp_path: Path) -> None:
     expected = landmarks.positions.double() + OFFSET
     for to in ("ply", "colmap", "transforms.json"):
         export_map(far(), tmp_path / to, to)
+    for part in ("surface", "landmarks", "cameras"):
+        assert b"property double x" in (tmp_path / "ply" / f"{part}.ply").read_bytes()
     poses = SE3.stack([v.T_ref_camera for v in shifted(training_views())])
     cameras = json.loads((tmp_path / "ply" / "cameras.json").read_text())
     assert [c["position"] for c in cameras] == poses.translation.tolist()
@@ -219,3 +223,12 @@ def test_a_field_is_imported_into_survey_coordinates(tmp_path: Path, monkeypatch
     assert scene.origin == ORIGIN
     seen = view(POSES[0])
     assert torch.equal(scene.render(shifted([seen])[0]).rgb, near().render(seen).rgb)
+
+
+def test_the_viewer_shows_poses_beside_the_map() -> None:
+    T = POSES[0].translated(OFFSET)
+    found = Localizer(far())(queries()[0])
+    answer = shown_answer(far(), "query", found, truth=T)
+    assert answer.truth == pytest.approx(POSES[0].matrix().flatten().tolist(), abs=1e-6)
+    assert answer.path[-1] == pytest.approx(found.translated(-OFFSET).T_world_camera.translation.tolist())
+    assert "500,000" in dict(shown_map(far(), 0).facts)["origin"]
