@@ -33,15 +33,13 @@ from bidnerf_core.geometry import Similarity
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import ImportedField
 
-# Inside: where a map's own coordinates begin, what the names of its places mean, and what the page of a map holds
+# Inside: where a map's own coordinates begin, and what the names of its places mean
 from bidnerf_core.maps.scaling import place_of
 from bidnerf_core.maps.views import chosen_origin
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
 from bidnerf_core.results import overlay
 from bidnerf_core.testing import POSES, training_views, view
-from bidnerf_core.viewer.answer import shown_answer
-from bidnerf_core.viewer.scene import shown_map
 
 ORIGIN = (500_000.0, 4_000_000.0, 100.0)
 OFFSET = torch.tensor(ORIGIN, dtype=torch.float64)
@@ -223,12 +221,3 @@ def test_a_field_is_imported_into_survey_coordinates(tmp_path: Path, monkeypatch
     assert scene.origin == ORIGIN
     seen = view(POSES[0])
     assert torch.equal(scene.render(shifted([seen])[0]).rgb, near().render(seen).rgb)
-
-
-def test_the_viewer_shows_poses_beside_the_map() -> None:
-    T = POSES[0].translated(OFFSET)
-    found = Localizer(far())(queries()[0])
-    answer = shown_answer(far(), "query", found, truth=T)
-    assert answer.truth == pytest.approx(POSES[0].matrix().flatten().tolist(), abs=1e-6)
-    assert answer.path[-1] == pytest.approx(found.translated(-OFFSET).T_world_camera.translation.tolist())
-    assert "500,000" in dict(shown_map(far(), 0).facts)["origin"]
