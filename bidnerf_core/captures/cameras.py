@@ -43,6 +43,12 @@ class StoredCamera:
         """T_world_camera, float64."""
         return _pose(self.T_world_camera)
 
+    def translated(self, offset: Float[Tensor, "3"]) -> StoredCamera:
+        """Return the camera in a parallel world frame in which positions have ``offset`` added."""
+        given = self.given_T_world_camera
+        moved = None if given is None else _rows(_pose(given).translated(offset))
+        return replace(self, T_world_camera=_rows(self.pose.translated(offset)), given_T_world_camera=moved)
+
     def posed(self, view: View) -> View:
         """Return the view with this pose and motion."""
         motion = None if self.motion is None else torch.tensor(self.motion, dtype=torch.float64)

@@ -99,14 +99,15 @@ class PoseContradiction:
 def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
     """Return how the poses of ``images`` contradict them; None if they agree, or if the images do not determine it."""
     proposed = _pairs(images)
-    pairs = [pair for i, j in proposed if (pair := _matched(images, i, j)) is not None]
+    pairs = [pair for i, j in proposed if (pair := matched_pair(images, i, j)) is not None]
     if len(pairs) < MOST_PAIRS / 2:
         others = [pair for pair in _similar(images) if pair not in proposed][:MOST_PAIRS]
-        pairs += [pair for i, j in others if (pair := _matched(images, i, j)) is not None]
+        pairs += [pair for i, j in others if (pair := matched_pair(images, i, j)) is not None]
     if len(pairs) < ENOUGH_PAIRS:
         return None
     poses = SE3.stack([image.T_ref_camera for image in images])
-    as_given = int(_agreeing(pairs, SE3.stack([poses]))[0])
+    agrees = [bool(pair.agreeing(poses[None])[0]) for pair in pairs]
+    as_given = sum(agrees)
     if as_given > NOT_ALL * len(pairs):
         return None
     tried = [*readings(len(images)), *_fitted_positions(pairs, poses)]
@@ -116,11 +117,24 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     if best >= (MOST if refused else NEARLY_ALL) * len(pairs):
         number = int((agreeing >= ALMOST_BEST * best).nonzero()[0, 0])
         return PoseContradiction(len(pairs), as_given, tried[number], int(agreeing[number]))
-    return PoseContradiction(len(pairs), as_given) if refused else None
+    if not refused:
+        return None
+    # Two images that do not agree with each other, but each with a neighbour, show places that look alike.
+    disputes = [{pair.first, pair.second} for pair, agreed in zip(pairs, agrees, strict=True) if not agreed]
+    near = likely_pairs_of_poses([image.T_ref_camera for image in images], 2).tolist()
+    nearby = [matched_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
+    sound = {
+        i
+        for pair in nearby
+        if pair and bool(pair.agreeing(poses[None])[0])
+        for i in (pair.first, pair.second)
+    }
+    alike = sum(both <= sound for both in disputes)
+    return PoseContradiction(len(pairs), as_given) if as_given < HALF * (len(pairs) - alike) else None
 
 
 @dataclass(frozen=True, eq=False)
-class _MatchedPair:
+class MatchedPair:
     """Two images, by index, and their matched points on the plane z = 1."""
 
     first: int
@@ -166,12 +180,12 @@ class _MatchedPair:
         return (shows.sum(-1) < ENOUGH_PARALLAX) | (front >= IN_FRONT * shows.sum(-1))
 
 
-def _agreeing(pairs: Sequence[_MatchedPair], T: SE3) -> Float[Tensor, "h"]:
+def _agreeing(pairs: Sequence[MatchedPair], T: SE3) -> Float[Tensor, "h"]:
     """Return how many pairs each set of poses (h n) agrees with."""
     return torch.stack([pair.agreeing(T).double() for pair in pairs]).sum(0)
 
 
-def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading]:
+def _fitted_positions(pairs: Sequence[MatchedPair], poses: SE3) -> list[Reading]:
     """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines
     of all pairs.
 
@@ -199,7 +213,7 @@ def _fitted_positions(pairs: Sequence[_MatchedPair], poses: SE3) -> list[Reading
     return found
 
 
-def _fitted(pairs: Sequence[_MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]:
+def _fitted(pairs: Sequence[MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]:
     """Return matrices that, multiplied with the positions, put matches on their epipolar lines.
 
     The first and second are the least-squares solution with either sign, up to scale. The last stays near the
@@ -288,7 +302,7 @@ def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tenso
     return rows, partner[rows]
 
 
-def _matched(images: Sequence[ImageKeypoints], i: int, j: int) -> _MatchedPair | None:
+def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
     """Return two images' inlier matches to an essential matrix; None if these are too few."""
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
@@ -307,4 +321,4 @@ def _matched(images: Sequence[ImageKeypoints], i: int, j: int) -> _MatchedPair |
     kept = torch.from_numpy(mask[:, 0].astype(bool))
     if int(kept.sum()) < ENOUGH_MATCHES:
         return None
-    return _MatchedPair(i, j, first[kept], second[kept], pixel)
+    return MatchedPair(i, j, first[kept], second[kept], pixel)

@@ -7,19 +7,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
+from scipy.sparse import csr_array
 from torch import Tensor
 
+from bidnerf_core.captures.links import LEAST_GROUP, groups
+from bidnerf_core.captures.pose_conventions import matched_pair
 from bidnerf_core.captures.report import PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, mirror_image, propose
-from bidnerf_core.mapping import LandmarkConfig, TrackedKeypoints, TrackedViews
+from bidnerf_core.mapping import ImageKeypoints, LandmarkConfig, TrackedKeypoints, TrackedViews
 
 SUSPECT = 0.5
-"""A photo is suspect if the fraction of its keypoints that are landmarks is below this multiple of the
-capture's median."""
+"""A photo is suspect if the fraction of its keypoints that are landmarks is below this multiple of the median
+of its group."""
 MOST_SUSPECTS = 32
 """Largest number of photos that are relocalized."""
 POSE_DEVIATIONS, POSE_PIXELS = 6.0, 4.0
@@ -67,18 +70,40 @@ class Relocation:
         )  # fmt: skip
 
 
-def suspects(seen: TrackedKeypoints, count: Int[Tensor, "v"], group: Int[Tensor, "v"]) -> list[int]:
-    """Return the photos outside the largest group, and those with unusually few keypoints among the
-    landmarks.
+def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
+    """Return the photos whose given poses the others do not support; ``links`` are those of ``linked``.
+
+    A photo is suspect if it belongs to no group, or shows far fewer landmarks than is usual in its group,
+    unless enough photos agree with its pose. Photos that agree among themselves are not suspect even if they
+    are linked to none of the others: a place that looks like another is more likely than the same error in
+    all of them.
     """
-    keypoints = torch.tensor([len(image.keypoints) for image in seen.images])
-    share = count / keypoints.clamp(min=1)
-    main = group == 0
-    if not bool(main.any()):
+    group = groups(links)
+    if not bool((group >= 0).any()):
         return []
-    found = (~main | (share < SUSPECT * share[main].median())).nonzero()[:, 0].tolist()
+    keypoints = torch.tensor([len(image.keypoints) for image in seen.images])
+    share = torch.bincount(seen.image, minlength=len(group)) / keypoints.clamp(min=1)
+    doubtful = group < 0
+    for number in range(int(group.max()) + 1):
+        own = group == number
+        doubtful |= own & (share < SUSPECT * share[own].median())
+    found = [i for i in doubtful.nonzero()[:, 0].tolist() if not _has_support(seen.images, links, i)]
     step = max(1.0, len(found) / MOST_SUSPECTS)
     return [found[int(i * step)] for i in range(min(len(found), MOST_SUSPECTS))]
+
+
+def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int) -> bool:
+    """Return whether a photo's given pose agrees with as many linked photos as make a group with it.
+
+    Their matches are found without the poses, so that wrong ones agree with none of them.
+    """
+    poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
+    for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist():
+        pair = matched_pair(images, number, other)
+        needed -= pair is not None and bool(pair.agreeing(poses[None])[0])
+        if not needed:
+            return True
+    return False
 
 
 def relocated(
@@ -87,7 +112,11 @@ def relocated(
     numbers: Sequence[int],
     config: LandmarkConfig,
 ) -> dict[int, Relocation]:
-    """Localize the suspects with landmarks built without them, as they are and then mirrored."""
+    """Localize the suspects with landmarks built without them, as they are and then mirrored.
+
+    Of several poses that explain a photo, as in a building with identical rooms, the one nearest to the given
+    pose is taken.
+    """
     if not numbers:
         return {}
     try:
@@ -101,7 +130,7 @@ def relocated(
             view = views[number]
             if mirrored:
                 view = replace(view, frame=mirror_image(view.frame))
-            found = propose(matcher, [View(view.frame, SE3.identity())], features)
+            found = propose(matcher, [View(view.frame, SE3.identity())], features, seek_rivals=True)
             if found is not None and landmark_verdict(found).accepted:
                 answers[number] = _compared(found, views[number], mirrored)
                 break
@@ -110,7 +139,8 @@ def relocated(
 
 def _compared(found: LandmarkPose, view: View, mirrored: bool) -> Relocation:
     T = view.T_ref_camera.to("cpu", torch.float64)
-    update = (T.inverse() @ found.T_world_camera).log()
+    poses = [found.T_world_camera, *(rival.T_world_rig for rival in found.rivals)]
+    update = min(((T.inverse() @ pose).log() for pose in poses), key=lambda each: float(each[:3].norm()))
     deviations = float((update @ torch.linalg.solve(found.full_covariance, update)).clamp(min=0).sqrt())
     return Relocation(update, deviations, image_motion(update, view, found.distance), mirrored)
 

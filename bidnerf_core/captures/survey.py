@@ -53,8 +53,8 @@ def surveyed(
 ) -> CaptureReport:
     """Return the report on a capture whose keypoints are matched in ``tracked``, in the order of ``views``.
 
-    Photos that share few landmarks with others are localized with the landmarks of those that share many,
-    both as they are and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial``
+    Photos whose poses the others do not support are localized with the landmarks of those, both as they are
+    and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial``
     holds the errors of held-out photos, and ``up`` is the upward direction of the scene if known.
     """
     seen, positions = tracked.triangulated(config)
@@ -62,7 +62,7 @@ def surveyed(
     group = groups(links)
     near = nearby(views).within(group)
     count = torch.bincount(seen.image, minlength=len(views))
-    doubtful = suspects(seen, count, group)
+    doubtful = suspects(seen, links)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
     posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, config)
     exposure = exposures(views, seen, measures.brightness, near)
@@ -131,7 +131,9 @@ def _problems(
     for i in range(len(exposure)):
         found = posed.get(i)
         wrong = found.problem if found else None
-        place: PhotoProblem | None = wrong or (_place(int(group[i])) if grouped and not found else None)
+        # A photo of another group fits its own landmarks; an isolated one may have been localized all the same.
+        unlinked = grouped and (int(group[i]) > 0 or not found)
+        place: PhotoProblem | None = wrong or (_place(int(group[i])) if unlinked else None)
         listed: tuple[PhotoProblem | None, ...] = (
             place, "blurred" if blurred[i] else None, "badly exposed" if badly_exposed[i] else None,
         )  # fmt: skip

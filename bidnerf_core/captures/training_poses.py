@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.captures.cameras import PoseConsistency
-from bidnerf_core.captures.links import groups, linked
+from bidnerf_core.captures.links import linked
 from bidnerf_core.captures.pose_refinement import AdjustedPoses, adjusted_poses
 from bidnerf_core.captures.relocated_photos import Relocation, relocated, suspects
 from bidnerf_core.frames import View
@@ -42,8 +42,8 @@ def training_poses(
 ) -> TrainingPoses:
     """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
 
-    A photo whose given pose contradicts the landmarks of the others is moved to where these place it. All
-    poses are refined if errors of the given ones add at least ``least`` pixels to the deviation of the
+    A photo whose given pose no group of photos supports is moved to where the landmarks of the others place
+    it. All poses are refined if errors of the given ones add at least ``least`` pixels to the deviation of the
     keypoints; otherwise they are kept.
     """
     config = LandmarkConfig() if config is None else config
@@ -86,7 +86,5 @@ def _wrongly_posed(
 ) -> dict[int, Relocation]:
     """Return the photos, by index, that the landmarks of the others place elsewhere."""
     seen, _ = tracked.triangulated(config)
-    count = torch.bincount(seen.image, minlength=len(views))
-    doubtful = suspects(seen, count, groups(linked(seen)))
-    found = relocated(tracked, views, doubtful, config)
+    found = relocated(tracked, views, suspects(seen, linked(seen)), config)
     return {number: photo for number, photo in found.items() if photo.problem in ("badly posed", "turned")}

@@ -80,7 +80,8 @@ def view(
         raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
     if save is not None:
         check_output(save, (*query, *depth, results, trajectory))
-    path = None if trajectory is None else shown_trajectory(trajectory, load_info(map).unit)
+    info = load_info(map)
+    path = None if trajectory is None else shown_trajectory(trajectory, info.unit, info.origin)
     rows = () if results is None else rows_of(results)
     scene = load_map(map, device)
     localizer = Localizer(scene, method, warm_up=save is None)

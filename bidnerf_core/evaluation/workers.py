@@ -24,6 +24,7 @@ from bidnerf_core.fields import device_of, levels
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain, parse_json, to_plain
+from bidnerf_core.localization import origin_of
 from bidnerf_core.settings import to_flat
 
 PATIENCE = "20s"
@@ -155,7 +156,7 @@ def samples_per_ray(trial: Trial, scene: Opened | None = None) -> float:
     device = device_of(stored.field)
     pixels = draw(own, COUNTED_RAYS, uniform, torch.Generator().manual_seed(trial.seed), device=device)
     with torch.no_grad():
-        samples = level.sampler(pixels.rays(view.T_ref_camera, stored.bounds))
+        samples = level.sampler(pixels.rays(view.T_ref_camera.translated(-origin_of(stored)), stored.bounds))
     return float(samples.valid.sum()) / COUNTED_RAYS
 
 

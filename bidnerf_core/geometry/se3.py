@@ -123,6 +123,10 @@ class SE3:
         """Rotate directions, which the translation does not affect."""
         return _matvec(self.rotation, vectors)
 
+    def translated(self, offset: Float[Tensor, "3"]) -> SE3:
+        """Return the transform to a parallel left-hand frame in which points have ``offset`` added."""
+        return SE3(self.rotation, self.translation + offset.to(self.translation))
+
     def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
         """Approximate ``retract`` to first order in ``tangent``: cheaper, with the same value and derivative
         at 0, but not rigid elsewhere.

@@ -60,6 +60,7 @@ from .problem import Problem as Problem
 from .problem import SceneMap as SceneMap
 from .problem import landmark_cameras as landmark_cameras
 from .problem import on_device as on_device
+from .problem import origin_of as origin_of
 from .problem import rig as rig
 from .problem import unit_of as unit_of
 from .problem import window as window

@@ -28,7 +28,15 @@ from bidnerf_core.localization.methods import (
     require_use_of_depth,
     settings_of,
 )
-from bidnerf_core.localization.problem import Problem, SceneMap, landmark_cameras, on_device, rig, unit_of
+from bidnerf_core.localization.problem import (
+    Problem,
+    SceneMap,
+    landmark_cameras,
+    on_device,
+    origin_of,
+    rig,
+    unit_of,
+)
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 
 WARM_UP_RAYS = 64
@@ -88,7 +96,9 @@ class Localizer:
         """
         if depth_rays is not None:
             require_use_of_depth(self.method)
-        return self.solved(self.problem(query, start, depth_rays), seed)
+        origin = origin_of(self.scene)
+        near = None if start is None else start_pose(start).translated(-origin)
+        return self.solved(self.problem(query, near, depth_rays), seed).translated(origin)
 
     def problem(
         self,
@@ -96,7 +106,10 @@ class Localizer:
         start: Start | None = None,
         depth_rays: Observations | None = None,
     ) -> Problem:
-        """Return the problem that ``__call__`` solves; solving it several times detects the images' keypoints only once."""
+        """Return the problem that ``__call__`` solves; solving it several times detects the images' keypoints only once.
+
+        Unlike there, ``start`` is in the map's own coordinates, see ``Map.origin``, as is the answer of ``solved``.
+        """
         T_world_camera = None if start is None else start_pose(start)
         return rig(self.scene, _views(query), T_world_camera, depth_rays, self.matcher)
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import UNKNOWN, DepthSensorModel
@@ -58,6 +59,11 @@ class SceneMap(Protocol):
 def unit_of(scene: SceneMap) -> LengthUnit:
     """Return the unit of a map's lengths; "units" for maps that do not state it, such as other projects' fields."""
     return getattr(scene, "unit", "units")
+
+
+def origin_of(scene: SceneMap) -> Float[Tensor, "3"]:
+    """Return the origin of a map's own coordinates in its world (float64), see ``Map.origin``; 0 for maps that state none."""
+    return torch.tensor(getattr(scene, "origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
 
 
 def on_device(scene: _Map, device: torch.device | str) -> _Map:

@@ -99,6 +99,11 @@ class Localization:
         """Whether the method accepts its own answer."""
         return self.outcome is Outcome.CONVERGED
 
+    def translated(self, offset: Float[Tensor, "3"]) -> Localization:
+        """Return the answer in a parallel world frame in which positions have ``offset`` added."""
+        T, poses = self.T_world_camera.translated(offset), self.poses.translated(offset)
+        return replace(self, T_world_camera=T, poses=poses)
+
     def rejected(self, why: Verdict) -> Localization:
         """Return the answer with another verdict, whose reason comes before that of this one."""
         reason = f"{why.reason}; {self.reason}"

@@ -13,7 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
-from bidnerf_core.localization.problem import SceneMap, unit_of
+from bidnerf_core.localization.problem import SceneMap, origin_of, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey
@@ -72,7 +72,8 @@ class Tracker:
         config = TrackerConfig() if config is None else config
         self.localizer, self.config = _checked_localizer(localizer), config
         self._state = TrackerState(Clock(None, config.frame_seconds))
-        self._start = None if start is None else start_pose(start)
+        self._origin = origin_of(localizer.scene)
+        self._start = None if start is None else start_pose(start).translated(-self._origin)
         scene = map_with_distances(localizer)
         self._by_landmarks: ByLandmarks | None = None
         if localizer.matches_landmarks and localizer.matcher is not None:
@@ -114,6 +115,7 @@ class Tracker:
             answer, seconds=clocks.perf_counter() - began, focal_factor=1.0, intrinsics=None,
             unit=unit_of(self.localizer.scene),
         )  # fmt: skip
+        answer = answer.translated(self._origin)
         return answer if state.camera is None else state.camera.stated_in(answer, stated)
 
     def save(self, path: str | Path) -> None:

@@ -26,6 +26,7 @@ from bidnerf_core.localization import (
     Outcome,
     answer_by_landmarks,
     localization_by_landmarks,
+    origin_of,
     unit_of,
 )
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detected, find_features, pooled_views
@@ -190,7 +191,8 @@ class MapCollection:
             return _unrecognised(str(error), self.method)
         if answer is None:
             return _unrecognised("hardly any landmark of the map is in the image", self.method)
-        return replace(localization_by_landmarks(problem, answer, began), unit=unit_of(localizer.scene))
+        found = replace(localization_by_landmarks(problem, answer, began), unit=unit_of(localizer.scene))
+        return found.translated(origin_of(localizer.scene))
 
     def _index(self, progress: ProgressCallback | None, cancel: Cancel | None) -> None:
         count = counter("reading", "maps", progress, cancel)

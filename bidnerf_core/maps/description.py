@@ -50,6 +50,9 @@ class MapInfo:
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
     unit: LengthUnit = "units"  # of all lengths in the map; "units" if their length is unknown
+    # Of the map's own coordinates, in the world of poses that enter and leave it. All positions of the map, such as those
+    # of its cameras and bounds, are relative to it: in survey coordinates, single precision resolves only decimetres.
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     added: int = 0  # number of cameras added after training, at the end of ``cameras``
     gravity_up: tuple[float, float, float] | None = (
         None  # upward direction (world), if the capture measured gravity

@@ -144,7 +144,7 @@ def locate(
     for number, frame in enumerate(frames, start=1):
         check_cancelled(cancel, "extending")
         try:
-            found = localizer(frame)
+            found = localizer.solved(localizer.problem(frame))
         except InputError as error:
             left_out.append((frame.name, str(error)))
             count(number, len(frames))
@@ -224,9 +224,8 @@ def _old_views(
     """Return the images that the map was built from, or renderings at their cameras."""
     if data is not None:
         background = scene.bounds.background if isinstance(data, str | Path) else None
-        views = at_stored_poses(
-            read_views(data, split, background, progress=progress, cancel=cancel).views, scene.info.cameras
-        )
+        read = read_views(data, split, background, progress=progress, cancel=cancel)
+        views = at_stored_poses(read.about(scene.origin).views, scene.info.cameras)
         own = {camera.name for camera in scene.info.cameras}
         if not any(view.frame.name in own for view in views):
             raise InputError(

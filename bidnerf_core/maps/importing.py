@@ -30,7 +30,7 @@ from bidnerf_core.maps.map import Map, frozen_field
 from bidnerf_core.maps.same_scene import check_alike
 from bidnerf_core.maps.training import USUAL_BAKE, baked_or_kept
 from bidnerf_core.maps.viewpoints import viewpoints
-from bidnerf_core.maps.views import Images, read_views
+from bidnerf_core.maps.views import Images, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback
 from bidnerf_core.training import TrainingState
 
@@ -67,7 +67,8 @@ def import_map(
 
     ``importer`` is the name of one, by default the one that recognizes the file; ``config`` holds its
     settings: an object of its ``config_type``, or a dict of those that differ from the defaults. Lengths are
-    multiplied by ``scale``, and ``T_world_file`` then transforms the file's coordinates to the world.
+    multiplied by ``scale``, and ``T_world_file`` then transforms the file's coordinates to the world. If that
+    is far away, as survey coordinates are, the map gets an origin there, see ``Map.origin``.
     ``photos`` are images with poses in the world (a dataset, the path to one, or views), of which ``split``
     selects a part; landmarks are built from them. Without any, landmarks come from rendered images, which
     match photos less well. ``features`` is the name of the landmarks' detector. The map is stored in folder
@@ -84,7 +85,10 @@ def import_map(
     settings = config
     if config is None or isinstance(config, dict):
         settings = from_plain(chosen.config_type, config or {}, f"settings of importer {name!r}")
-    placement = Similarity(scale, SE3.identity() if T_world_file is None else T_world_file)
+    T = SE3.identity() if T_world_file is None else T_world_file
+    origin = chosen_origin(T.translation[None])
+    T = T.translated(-torch.tensor(origin, dtype=torch.float64)) if any(origin) else T
+    placement = Similarity(scale, T)
     place = None if out is None else Path(out)
     there = working_device(device)
     with contextlib.nullcontext() if place is None else map_folder(place, overwrite):
@@ -92,7 +96,11 @@ def import_map(
         for line in found.found:
             log.info(f"{path}: {line}")
         images = _own_photos(found, str(path)) if photos is None else photos
-        read = None if images is None else read_views(images, split, progress=progress, cancel=cancel)
+        read = (
+            None
+            if images is None
+            else read_views(images, split, progress=progress, cancel=cancel).about(origin)
+        )
         views: list[View] = [] if read is None else read.views
         unit: LengthUnit = "metres" if scale != 1 else "units" if read is None else read.unit
         _tell_extent(found, str(path), unit)
@@ -101,7 +109,7 @@ def import_map(
             bounds = replace(bounds, background=read.background)  # over which its images were composited
         info = MapInfo(
             found.backend, to_plain(found.config, "config"), bounds, found.steps, True, path.name,
-            landmark_features=features, unit=unit, gravity_up=None if read is None else read.gravity_up,
+            landmark_features=features, unit=unit, origin=origin, gravity_up=None if read is None else read.gravity_up,
         )  # fmt: skip
         field = frozen_field(info, found.tensors, None)
         scene = Map(info, field).to(there)

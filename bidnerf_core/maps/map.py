@@ -27,7 +27,7 @@ from bidnerf_core.fields import RadianceField, RenderedImage, SceneBounds, level
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, locked, read_tensors
-from bidnerf_core.localization import on_device
+from bidnerf_core.localization import on_device, origin_of
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedViews, find_features
 from bidnerf_core.maps.anchor import Anchor, load_anchor
 from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
@@ -83,6 +83,15 @@ class Map:
     def bounds(self) -> SceneBounds:
         """The scene's box, range of distances and background."""
         return self.info.bounds
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """The origin of the map's own coordinates in the world.
+
+        Poses given to the map and its localizers, and their answers, are in the world of the training data.
+        Positions of the map's parts are relative to the origin, which is 0 unless the data are far from that.
+        """
+        return self.info.origin
 
     @property
     def has_distances(self) -> bool:
@@ -175,7 +184,8 @@ class Map:
             if not 0 <= level < len(offered):
                 raise InputError(f"no level {level}", where=self.name, expected=f"0 to {len(offered) - 1}")
             field = offered[level]
-        return render_image(field, view.frame.intrinsics, view.T_ref_camera, self.bounds, motion=view.motion)
+        T = view.T_ref_camera.translated(-origin_of(self))
+        return render_image(field, view.frame.intrinsics, T, self.bounds, motion=view.motion)
 
     def bake(
         self,
@@ -222,7 +232,7 @@ class Map:
                     data, split, self._background(data), progress=progress, cancel=cancel,
                     largest=checked_side(largest), folder=self.folder,
                 )  # fmt: skip
-                views = at_stored_poses(found.views, self.info.cameras)
+                views = at_stored_poses(found.about(self.origin).views, self.info.cameras)
                 check_same_scene(self.info, self.field, views, self.name)
             settings = BakeConfig() if config is None else config
             return self.with_baked_parts(views, settings, rendered_landmarks, None, progress, cancel)

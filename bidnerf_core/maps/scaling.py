@@ -30,6 +30,7 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, spread
 from bidnerf_core.io import IMAGE_SUFFIXES
+from bidnerf_core.localization import origin_of
 from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
 from bidnerf_core.maps.anchor import scaled_anchor
 from bidnerf_core.maps.description import FieldFrame, MapInfo
@@ -106,9 +107,9 @@ def scaled_info(info: MapInfo, factor: float, unit: LengthUnit) -> MapInfo:
     frame = info.field_frame or FieldFrame(1.0, info.bounds)
     scale = frame.scale * factor
     bounds = frame.bounds if scale == 1 else scaled_bounds(info.bounds, factor)
-    cameras = tuple(_camera(camera, factor) for camera in info.cameras)
+    cameras, origin = tuple(_camera(camera, factor) for camera in info.cameras), _three(info.origin, factor)
     field_frame = None if scale == 1 else replace(frame, scale=scale)
-    return replace(info, bounds=bounds, cameras=cameras, unit=unit, field_frame=field_frame)
+    return replace(info, bounds=bounds, cameras=cameras, unit=unit, origin=origin, field_frame=field_frame)
 
 
 def scaled_bounds(bounds: SceneBounds, factor: float) -> SceneBounds:
@@ -197,15 +198,15 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
 
 
 def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
-    """Return the coordinates of a place of the map (float64), see ``Place``. Raises ``InputError`` if it has none."""
+    """Return the world coordinates of a place of the map (float64), see ``Place``. Raises ``InputError`` if it has none."""
     if not isinstance(place, str):
         return _position(place)
     if (camera := _camera_of(scene, place)) is not None:
-        return camera.pose.translation
+        return camera.pose.translation + origin_of(scene)
     name, at, pixel = place.rpartition("@")
     numbers = _numbers(pixel)
     if at and len(numbers) == 2 and (camera := _camera_of(scene, name)) is not None:
-        return _seen_at(scene, camera, numbers[0], numbers[1])
+        return _seen_at(scene, camera, numbers[0], numbers[1]) + origin_of(scene)
     if not at and len(numbers) == 3:
         return torch.tensor(numbers, dtype=torch.float64)
     raise InputError(f"no place {place!r} in the map: {_no_camera(scene, name if at else place)}")

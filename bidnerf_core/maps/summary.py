@@ -58,7 +58,8 @@ class MapSummary:
     landmarks: int
     trial: HeldOutTrial | None
     bytes: int | None  # total size of the files in its folder
-    bounds: SceneBounds
+    bounds: SceneBounds  # relative to the origin, as all positions in the map
+    origin: tuple[float, float, float]  # of the map's own coordinates, in the world
     config: dict[str, Any]
     bidnerf: str  # the version that wrote it
     moved: tuple[MovedCamera, ...]  # by the refinement of poses
@@ -87,6 +88,11 @@ class MapSummary:
             "training": f"{self.step} steps of backend {self.backend} in {time}, {state}",
             "field": self._field_line(),
             "scene": _scene_line(self.bounds),
+            **(
+                {"origin": f"{_shown(self.origin)}, to which positions are relative"}
+                if any(self.origin)
+                else {}
+            ),
             "distances": "known" if self.distances else "unknown, since all images were taken from one place",
             "frame": self._frame_line(),
             "surface": self._surface_line(),
@@ -156,6 +162,7 @@ def summarized(
         trial=None if landmarks is None else landmarks.trial,
         bytes=files,
         bounds=info.bounds,
+        origin=info.origin,
         config=info.config,
         bidnerf=info.bidnerf,
         moved=tuple(moved_cameras(info.cameras)),

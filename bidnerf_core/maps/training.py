@@ -35,7 +35,7 @@ from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.files import load_state, map_folder
 from bidnerf_core.maps.map import Map, build_field, frozen_field, load_map
 from bidnerf_core.maps.photos import posed_images
-from bidnerf_core.maps.views import Images, ReadViews, read_views
+from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
 from bidnerf_core.registry import PluginError
 from bidnerf_core.training import TrainingStopped
@@ -123,6 +123,10 @@ def train(
         read = read_views(
             images, split, background, depth_points, point_choice, progress, cancel, side, work.out, camera
         )
+        origin = chosen_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
+        if any(origin):
+            log.info(f"{read.place}: the map's own coordinates begin at {origin}, near its cameras")
+        read = read.about(origin)
         part = f" in split {split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
             log.info(f"{read.place}: no measured depth{part}; training on colour only")
@@ -138,7 +142,7 @@ def train(
             backend, to_plain(settings, "config"), bounds, 0, False, read.source, cameras=taken.cameras,
             pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=read.sparse_depth,
             hidden=read.hidden,
-            landmark_features=features, unit=read.unit, gravity_up=read.gravity_up,
+            landmark_features=features, unit=read.unit, origin=origin, gravity_up=read.gravity_up,
         )  # fmt: skip
         return _trained(chosen, info, taken.views, taken.tracked, work)
 
@@ -178,7 +182,7 @@ def resume(
         side = longest_side(info)
         read = read_views(
             images, split, background, depth_points, point_choice, progress, cancel, side, out, camera
-        )
+        ).about(info.origin)
         _check_same_views(out, info, read, split)
         views = at_stored_poses(read.views, info.cameras)
         if info.complete:  # interrupted between training and baking

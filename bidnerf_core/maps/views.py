@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import (
@@ -40,6 +45,27 @@ Images: TypeAlias = Dataset | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
 
 
+Origin: TypeAlias = tuple[float, float, float]
+"""The origin of a map's own coordinates, see ``Map.origin``."""
+LARGEST_COORDINATE = 1000.0
+"""Smallest coordinates that may be recentred. Single precision resolves 0.06 mm there, in metres."""
+FAR = 10.0
+"""Smallest ratio of the distance from 0 to the size of a scene at which it is recentred: it gains one digit."""
+
+
+def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
+    """Return the origin for a map of ``points``, such as its cameras: 0, or a round position near their middle
+    if they are far from 0.
+    """
+    low, high = points.double().amin(0), points.double().amax(0)
+    middle, size = (low + high) / 2, float((high - low).max())
+    if not float(middle.abs().max()) > max(LARGEST_COORDINATE, FAR * size):
+        return 0.0, 0.0, 0.0
+    step = 10.0 ** math.ceil(math.log10(max(size, 1.0)))
+    x, y, z = (step * (middle / step).round()).tolist()
+    return x, y, z
+
+
 @dataclass(frozen=True, eq=False)
 class ReadViews:
     """Views that were read, and their source."""
@@ -55,6 +81,14 @@ class ReadViews:
     )
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
     depth_unit: float | None = None  # metres per step of depth images, if their format accepts another
+
+    def about(self, origin: Origin) -> ReadViews:
+        """Return the views with poses relative to ``origin``, a point of their world."""
+        if not any(origin):
+            return self
+        offset = -torch.tensor(origin, dtype=torch.float64)
+        views = [replace(view, T_ref_camera=view.T_ref_camera.translated(offset)) for view in self.views]
+        return replace(self, views=views)
 
 
 def read_views(

@@ -18,6 +18,7 @@ from torch import Tensor
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
+from bidnerf_core.localization import origin_of
 from bidnerf_core.maps import Map
 from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.results.colmap_poses import write_colmap_poses
@@ -53,7 +54,8 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
 
-    All use the frame and unit of the map, which their headers state. Images are named as in the map, without file
+    These use the world and unit of the map, which their headers state, in double precision where it has an origin of its own;
+    installed exporters may write its own coordinates, see ``Map.origin``. Images are named as in the map, without file
     extensions. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
     export, and for a folder that is not empty unless ``overwrite`` is set.
     """
@@ -74,7 +76,11 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
     files = []
     if scene.surface is not None:
         parts = scene.surface.surfels
-        columns = {"x y z": parts.positions, "nx ny nz": parts.normals, "red green blue": parts.rgb}
+        columns = {
+            "x y z": _in_world(scene, parts.positions),
+            "nx ny nz": parts.normals,
+            "red green blue": parts.rgb,
+        }
         files.append(out / "surface.ply")
         write_file(files[-1], ply(columns, head(scene, images, amount(len(parts), "surfel"))))
     if scene.landmarks is not None:
@@ -83,8 +89,10 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
         vertices, faces = _pyramids(images, FRUSTUM * scene.bounds.side)
         what = f"{amount(len(images), 'camera')}, five points each, the first of which is its centre"
         files.append(out / "cameras.ply")
+        vertices = vertices if any(scene.origin) else vertices.float()
         write_file(files[-1], ply({"x y z": vertices}, head(scene, images, what), faces))
-        files += write_inria_cameras(out, scene.info.cameras)
+        cameras = [camera.translated(origin_of(scene)) for camera in scene.info.cameras]
+        files += write_inria_cameras(out, cameras)
     return files
 
 
@@ -109,9 +117,16 @@ def export_transforms(scene: Map, out: Path) -> list[Path]:
 
 def _images(scene: Map) -> list[PosedImage]:
     return [
-        PosedImage(camera.name, number, camera.intrinsics, camera.pose, unit=scene.unit)
+        PosedImage(
+            camera.name, number, camera.intrinsics, camera.pose.translated(origin_of(scene)), unit=scene.unit
+        )
         for number, camera in enumerate(scene.info.cameras)
     ]
+
+
+def _in_world(scene: Map, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Return positions of the map's parts in its world, in double precision if the map has an origin of its own."""
+    return positions.double() + origin_of(scene) if any(scene.origin) else positions
 
 
 def _needed_images(scene: Map, to: str) -> list[PosedImage]:
@@ -124,7 +139,11 @@ def _needed_images(scene: Map, to: str) -> list[PosedImage]:
 def _write_landmarks(scene: Map, images: list[PosedImage], out: Path) -> Path:
     landmarks = scene.landmarks
     assert landmarks is not None
-    columns = {"x y z": landmarks.positions, "red green blue": _colours(scene), "photos": landmarks.views}
+    columns = {
+        "x y z": _in_world(scene, landmarks.positions),
+        "red green blue": _colours(scene),
+        "photos": landmarks.views,
+    }
     write_file(out / "landmarks.ply", ply(columns, head(scene, images, amount(len(landmarks), "landmark"))))
     return out / "landmarks.ply"
 
@@ -132,13 +151,15 @@ def _write_landmarks(scene: Map, images: list[PosedImage], out: Path) -> Path:
 def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | None = None) -> bytes:
     """Return a binary PLY of points; keys of ``columns`` name the properties of each row.
 
-    Colours in [0, 1] are written as bytes, integers with 32 bits, and others in single precision.
+    Colours in [0, 1] are written as bytes, integers with 32 bits, and others in their own precision.
     """
     kinds, values = [], []
     for names, column in columns.items():
         table = column.detach().cpu().reshape(len(column), -1)
         if names == "red green blue":
             array, kind = (table.clamp(0, 1) * 255).round().to(torch.uint8).numpy(), "uchar"
+        elif table.dtype == torch.float64:
+            array, kind = table.numpy(), "double"
         elif table.dtype.is_floating_point:
             array, kind = table.float().numpy(), "float"
         else:
@@ -146,7 +167,9 @@ def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | Non
         for number, name in enumerate(names.split()):
             kinds.append((name, kind))
             values.append(array[:, number])
-    row = np.dtype([(name, {"uchar": "u1", "float": "<f4", "int": "<i4"}[kind]) for name, kind in kinds])
+    row = np.dtype(
+        [(name, {"uchar": "u1", "float": "<f4", "double": "<f8", "int": "<i4"}[kind]) for name, kind in kinds]
+    )
     rows = np.empty(len(values[0]), row)
     for (name, _), value in zip(kinds, values, strict=True):
         rows[name] = value
@@ -183,9 +206,10 @@ def _colmap_points(scene: Map) -> bytes:
     if scene.landmarks is None:
         return b""
     colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
-    places = scene.landmarks.positions.tolist()
+    places = _in_world(scene, scene.landmarks.positions).tolist()
+    digits = 16 if any(scene.origin) else 9
     lines = [
-        f"{number} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} {scene.landmarks.noise:.3f}\n"
+        f"{number} {x:.{digits}g} {y:.{digits}g} {z:.{digits}g} {r} {g} {b} {scene.landmarks.noise:.3f}\n"
         for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, colours, strict=True), start=1)
     ]
     return "".join(lines).encode()

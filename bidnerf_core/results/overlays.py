@@ -17,7 +17,7 @@ from bidnerf_core.fields import render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import reduced, write_file
-from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, start_pose
+from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, origin_of, start_pose
 
 PICTURE_SIDE = 240
 """Maximum pixels on the longer side; larger photos are downscaled, since each rendered pixel takes time."""
@@ -68,7 +68,8 @@ class Painter:
 
     def rendered(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
         """Render the map as the photo's camera would see it."""
-        return render_picture(self._map.field, self._camera, T_world_camera, self._map.bounds).rgb
+        T = T_world_camera.translated(-origin_of(self._map))
+        return render_picture(self._map.field, self._camera, T, self._map.bounds).rgb
 
     def blended(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
         """Return the photo blended with the rendering, with the edges of each."""

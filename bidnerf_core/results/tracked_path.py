@@ -120,7 +120,9 @@ class TrackedPath(Answers):
         super().__init__("" if info is None else info.backend, "units" if info is None else info.unit)
         self.unread = 0  # frames whose files could not be read
         cameras = () if info is None else as_given(info.cameras)
-        self._trained_on = {camera.name: camera.pose for camera in cameras}
+        origin = (0.0, 0.0, 0.0) if info is None else info.origin
+        self._origin = torch.tensor(origin, dtype=torch.float64)
+        self._trained_on = {camera.name: camera.pose.translated(self._origin) for camera in cameras}
         self._lost_at: int | None = None
         self._camera_sources: set[str] = set()
 
@@ -209,10 +211,10 @@ class TrackedPath(Answers):
         if not drawn:
             raise InputError("not drawn, since no frame was tracked", where=file)
         path = PlottedPath(
-            SE3.stack([answer.found.T_world_camera for answer in drawn]),
+            SE3.stack([a.found.T_world_camera for a in drawn]).translated(-self._origin),
             torch.tensor([answer.accepted for answer in drawn]),
             torch.tensor([_deviation(a.found.covariance) for a in drawn], dtype=torch.float64),
-            [answer.truth for answer in drawn],
+            [None if a.truth is None else a.truth.translated(-self._origin) for a in drawn],
             self.unit,
         )
         plot_path(path, surface, Path(file), up)

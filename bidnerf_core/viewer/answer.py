@@ -23,6 +23,7 @@ from bidnerf_core.localization import (
     Localization,
     SceneMap,
     SearchRecord,
+    origin_of,
     probability_of,
 )
 from bidnerf_core.registry import PluginError
@@ -137,7 +138,10 @@ def shown_answer(
     """Return a localization as JSON values, with renderings of at most ``side`` pixels if its ``frame`` is known.
 
     ``record`` is that of its search, ``truth`` the true T_world_camera. A ``quick`` answer has renderings of the surface.
+    Poses are shown in the map's own coordinates, see ``Map.origin``.
     """
+    found = found.translated(-origin_of(scene))
+    truth = None if truth is None else truth.translated(-origin_of(scene))
     T = found.T_world_camera.to("cpu", torch.float64)
     finite = bool(T.matrix().isfinite().all())
     given, frame = frame, None if frame is None else found.frame_as_taken(frame)

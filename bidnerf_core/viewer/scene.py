@@ -135,6 +135,8 @@ def rows_of(T: SE3) -> tuple[float, ...]:
 def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
     up = scene.up
     surfels = 0 if scene.surface is None else len(scene.surface.surfels)
+    x, y, z = scene.origin
+    offset = (("origin", f"positions shown here are relative to ({x:,.0f}, {y:,.0f}, {z:,.0f})"),)
     landmarks = 0 if scene.landmarks is None else len(scene.landmarks)
     return (
         ("backend", scene.info.backend),
@@ -143,6 +145,7 @@ def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
         ("landmarks", f"{landmarks:,}" if landmarks else "none"),
         ("lengths", "metres" if scene.unit == "metres" else "units of the map; no scale is known"),
         ("up", "not known" if up is None else f"from {up.source}"),
+        *(offset if any(scene.origin) else ()),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,10 +47,12 @@ class _Posed:
     unit: str | None = None  # None if the file does not state it
 
 
-def shown_trajectory(path: Path, unit: LengthUnit | None = None) -> ShownTrajectory:
+def shown_trajectory(
+    path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
+) -> ShownTrajectory:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or one of TUM, EuRoC or KITTI.
 
-    A remark is logged if the file states another unit than the map's ``unit``. Raises ``InputError`` for a file without poses.
+    Its poses are shown relative to ``origin``, that of the map. A remark is logged if the file states another unit than the map's ``unit``. Raises ``InputError`` for a file without poses.
     """
     found = _from_json(path) if path.suffix.lower() in (".json", ".jsonl") else _from_rows(path)
     if not found:
@@ -62,7 +65,13 @@ def shown_trajectory(path: Path, unit: LengthUnit | None = None) -> ShownTraject
     some = found[:: max(1, math.ceil(len(found) / MOST_POSES))]
     return ShownTrajectory(
         path.name,
-        packed(SE3.stack([each.T for each in some]).matrix()[:, :3].flatten(1).numpy()),
+        packed(
+            SE3.stack([each.T for each in some])
+            .translated(-torch.tensor(origin).double())
+            .matrix()[:, :3]
+            .flatten(1)
+            .numpy()
+        ),
         tuple(each.frame for each in some),
         tuple(each.time for each in some),
         tuple(each.sigma for each in some),

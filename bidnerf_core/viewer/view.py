@@ -75,7 +75,9 @@ def view(
                 Query(frame.name, (View(frame, SE3.identity()),)),
             )
         )
-    path = None if trajectory is None else shown_trajectory(Path(trajectory), scene_map.unit)
+    path = (
+        None if trajectory is None else shown_trajectory(Path(trajectory), scene_map.unit, scene_map.origin)
+    )
     return MapView(PageState(shown_map(scene_map), tuple(answers), title, trajectory=path))
 
 

@@ -137,6 +137,23 @@ def test_a_refusal_says_what_to_try_and_a_method_what_it_is(found: ShownAnswer, 
     assert found.method_summary == METHODS["auto"].summary
 
 
+def test_poses_are_shown_relative_to_the_origin_of_the_map(
+    tmp_path: Path, room: Map, query: Query, answer: Localization
+) -> None:
+    origin = (500_000.0, 4_000_000.0, 100.0)
+    offset = torch.tensor(origin, dtype=torch.float64)
+    surveyed, far = replace(room, info=replace(room.info, origin=origin)), answer.translated(offset)
+    shown = shown_answer(surveyed, query.name, far, truth=far.T_world_camera)
+    local = answer.T_world_camera.matrix().flatten().tolist()
+    assert shown.pose == pytest.approx(local, abs=1e-6)
+    assert shown.truth == pytest.approx(local, abs=1e-6)
+    assert "500,000" in dict(shown_map(surveyed, 0).facts)["origin"]
+    write_poses(tmp_path / "path.txt", [PosedImage("a", 0, query.frame.intrinsics, far.T_world_camera)])
+    drawn = shown_trajectory(tmp_path / "path.txt", origin=origin).poses
+    rows = np.frombuffer(b64decode(drawn.base64), np.float32).reshape(-1)
+    assert rows == pytest.approx(local[:12], abs=1e-3)
+
+
 def test_probabilities_of_the_answers_to_a_question_add_up(found: ShownAnswer, refused: ShownAnswer) -> None:
     shown = [contest for answer in (found, refused) for contest in answer.contests]
     assert shown

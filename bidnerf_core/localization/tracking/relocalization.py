@@ -57,7 +57,7 @@ def relocalized(
             return found
         return localizer.solved(replace(problem, start=predicted), seed)
     try:
-        return localizer(frame, predicted, seed=seed)
+        return localizer.solved(localizer.problem(frame, predicted), seed)
     except InputError:
         if lost:  # the sequence has begun, so the frame is at fault, not the map or the settings
             return None
