@@ -109,10 +109,9 @@ def test_fisheye_is_opencvs_and_resampling_its_undistortion() -> None:
 @pytest.mark.parametrize("model", LENS_MODELS)
 def test_an_undistorted_image_is_that_of_its_pinhole_camera(model: str) -> None:
     lens = lens_of(model)
-    from bidnerf_core.frames import Images
 
     depth = torch.ones(SIZE[1], SIZE[0])
-    frame = Frame.taken("f", lens, Images(torch.from_numpy(photo_of(lens)), depth, depth))
+    frame = Frame.taken("f", lens, torch.from_numpy(photo_of(lens)), depth, depth)
     assert error_of(frame) < 4
     assert frame.camera_source == lens.sentence
     assert f"{model} undistorted to a pinhole camera of {frame.intrinsics.width}x" in lens.sentence
@@ -193,7 +192,7 @@ def test_fisheye_in_transforms_has_masks_of_the_images_as_stored(
     assert hidden is not None
     assert bool(hidden[:, : middle - 2].all())
     assert not bool(hidden[40:-40, middle + 2 : -40].any())
-    assert second.frame.held_rgb.dtype == torch.uint8
+    assert second.frame.rgb_bytes.dtype == torch.uint8
 
 
 @pytest.mark.parametrize(("size", "factor"), [((400, 320), 2), ((100, 80), 0.5)])

@@ -23,7 +23,7 @@ from bidnerf_core.fields import (
     render,
     widened,
 )
-from bidnerf_core.frames import Frame, PixelDrawer, draw, drawer
+from bidnerf_core.frames import DRAWERS, Frame, draw
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.costs.rendered import RayCounts
 from bidnerf_core.localization.problem import Problem
@@ -69,13 +69,11 @@ class SampledLoss:
     rays: DescentSettings
     reach: ReachSettings
     generator: Generator
-    _drawer: PixelDrawer = field(init=False)
     _batches: list[Observations] | None = field(default=None, init=False)
     _calls: int = field(default=0, init=False)
     _candidates: int = field(default=1, init=False)
 
     def __post_init__(self) -> None:
-        self._drawer = drawer(self.rays.pixels)
         if self.reach.candidates > 1 and _shows_background(self.problem):
             self._candidates = self.reach.candidates
 
@@ -127,7 +125,7 @@ class SampledLoss:
         """Draw pixels (views, pixels per view) and any depth rays (1, rays)."""
         problem, device = self.problem, self.problem.device
         many = self.counts.pixels * self._candidates
-        pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
+        pixels = draw(problem.views, many, DRAWERS[self.rays.pixels], self.generator, device=device)
         if self._candidates > 1:
             count = max(1, self.counts.pixels // len(problem.views))
             order = self._rank(pixels, T_world_last).sort(dim=-1, descending=True, stable=True).indices
