@@ -1,9 +1,4 @@
 from .batch import CameraBatch as CameraBatch
-from .colmap_models import MODEL_IDS as MODEL_IDS
-from .colmap_models import MODELS as MODELS
-from .colmap_models import colmap_camera as colmap_camera
-from .colmap_models import colmap_model as colmap_model
-from .colmap_models import colmap_parameters as colmap_parameters
 from .exif import Exif as Exif
 from .exif import read_exif as read_exif
 from .files import CameraRecord as CameraRecord
@@ -16,12 +11,16 @@ from .intrinsics import centre_crop_cameras as centre_crop_cameras
 from .intrinsics import reduced_size as reduced_size
 from .intrinsics import same_aspect as same_aspect
 from .intrinsics import stretched_cameras as stretched_cameras
+from .lenses import MODEL_IDS as MODEL_IDS
+from .lenses import MODELS as MODELS
 from .lenses import PANORAMA as PANORAMA
 from .lenses import PANORAMA_FACES as PANORAMA_FACES
 from .lenses import Camera as Camera
 from .lenses import CentralLens as CentralLens
 from .lenses import Lens as Lens
 from .lenses import PanoramaFace as PanoramaFace
+from .lenses import colmap_camera as colmap_camera
+from .lenses import colmap_model as colmap_model
 from .orientation import UPRIGHT as UPRIGHT
 from .orientation import Orientation as Orientation
 from .rolling_shutter import AT_REST as AT_REST

@@ -139,7 +139,11 @@ class CameraSource:
         except InputError as error:
             raise InputError(error, where=where) from error
         if camera is None:
-            return replace(_found_camera(str(where), raster, exif, self.assumed), approximate=True)
+            found = None if exif.has_focal_length else _assumed(raster, self.assumed)
+            # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are
+            # ``assumed`` cameras only where landmarks are matched.
+            found = found or camera_from_exif(str(where), raster, exif, may_be_cropped=bool(self.assumed))
+            return replace(found, approximate=True)
         if isinstance(camera, Intrinsics | Lens):
             return _fitted(str(where), raster, camera, "camera as given")
         if not isinstance(camera, str | Path):
@@ -189,16 +193,6 @@ def folder_camera(
     return CameraSource(found)
 
 
-def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intrinsics]) -> FoundCamera:
-    """Return the camera from EXIF, or one of the ``assumed`` ones."""
-    if exif.has_focal_length and assumed and exif.size and _is_cropped(raster, exif.size):
-        # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are ``assumed``
-        # cameras only where landmarks are matched.
-        return _camera_of_crop(where, raster, exif, exif.size)
-    assumable = None if exif.has_focal_length else _assumed(raster, assumed)
-    return assumable or camera_from_exif(where, raster, exif)
-
-
 def _described(camera: Intrinsics, origin: str) -> FoundCamera:
     return FoundCamera(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
 
@@ -221,52 +215,48 @@ def _focal(camera: Intrinsics) -> str:
     return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
 
 
-def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
+def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: bool = False) -> FoundCamera:
     """Return the camera that EXIF describes, accurate to a few percent and assumed to be free of distortion.
 
-    Raises ``InputError`` if there is no focal length, and if the image was cropped after it was taken.
+    An image that was cropped after it was taken, if it may be, is assumed to have kept its resolution unless its size
+    differs greatly; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length, and for
+    any other cropped image.
     """
-    taken = exif.size
-    if taken and _is_cropped(raster, taken):
-        size = f"{raster.width}x{raster.height}"
-        raise InputError(
-            f"image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera:"
-            f" {WAYS_OF_PHOTO}",
-            where=where,
+    whole, taken, part = (
+        raster.size,
+        exif.size,
+        "",
+    )  # ``whole`` is the size of the image before it was cropped
+    if taken and not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size)):
+        if not may_be_cropped:
+            raise InputError(
+                f"image is {raster.width}x{raster.height}, but was {taken[0]}x{taken[1]} when EXIF was written; give its"
+                f" camera: {WAYS_OF_PHOTO}",
+                where=where,
+            )
+        ratio = max(raster.width / taken[0], raster.height / taken[1])
+        fits = raster.width <= taken[0] and raster.height <= taken[1]
+        scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
+        whole, part = (
+            (round(taken[0] * scale), round(taken[1] * scale)),
+            f"; cropped from a photo of {taken[0]}x{taken[1]}",
         )
-    return _by_exif(where, raster, exif, raster.size)
-
-
-def _camera_of_crop(where: str, raster: Raster, exif: Exif, taken: tuple[int, int]) -> FoundCamera:
-    """Return the camera of a photo that had the size ``taken`` when EXIF was written, and was cropped later.
-
-    It is assumed to have kept its resolution unless its size differs greatly; then it is treated as a resized
-    centre crop.
-    """
-    ratio = max(raster.width / taken[0], raster.height / taken[1])
-    fits = raster.width <= taken[0] and raster.height <= taken[1]
-    scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
-    whole = (round(taken[0] * scale), round(taken[1] * scale))
-    found = _by_exif(where, raster, exif, whole)
-    return replace(found, description=f"{found.description}; cropped from a photo of {taken[0]}x{taken[1]}")
-
-
-def _is_cropped(raster: Raster, taken: tuple[int, int]) -> bool:
-    return not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size))
-
-
-def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> FoundCamera:
-    """Return the camera of an image of the size ``whole``, or cropped from one."""
     if exif.equivalent_mm is not None:
         focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
-        return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF")
-    if exif.focal_mm is not None and exif.pixels_per_mm is not None:
+        origin = f"{exif.equivalent_mm:g} mm equivalent in EXIF"
+    elif exif.focal_mm is not None and exif.pixels_per_mm is not None:
         # ``pixels_per_mm`` refers to the image as it was taken.
-        scale = max(whole) / max(exif.size) if exif.size else 1.0
+        scale = max(whole) / max(taken) if taken else 1.0
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
-        return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
-    raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
+        origin = f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF"
+    else:
+        raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
+    try:
+        found = _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
+    except InputError as error:
+        raise InputError(f"EXIF: {error}; give its camera: {WAYS}", where=where) from error
+    return replace(found, description=found.description + part)
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
@@ -286,10 +276,3 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | Non
     if not others:
         return FoundCamera(likely, f"{origin}: {_focal(likely)}")
     return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)
-
-
-def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> FoundCamera:
-    try:
-        return _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
-    except InputError as error:
-        raise InputError(f"EXIF: {error}; give its camera: {WAYS}", where=where) from error
