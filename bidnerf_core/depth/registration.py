@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics, Raster, read_camera
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, rigid_of_rows
+from bidnerf_core.geometry import SE3, rigid_pose
 from bidnerf_core.io import read_record, resampled
 
 ENOUGH_REGISTERED = 1000
@@ -37,17 +37,14 @@ class DepthCamera:
         record = read_record(path)
         if record.size("w") is None or record.size("h") is None:
             raise record.error("no w and h", expected="the size of the depth images")
-        rows = record.items(EXTRINSICS)
-        if rows is None:
-            raise record.error(
-                f"no {EXTRINSICS}", expected="the 4x4 pose of the depth camera in the colour camera"
-            )
+        rows = record.matrix(EXTRINSICS, record.items(EXTRINSICS))
         camera = read_camera(path, (0, 0))
         if not isinstance(camera, Intrinsics):
             raise record.error(
                 "describes a lens that is not perspective", expected="the intrinsics of the depth camera"
             )
-        return DepthCamera(camera, rigid_of_rows(record, EXTRINSICS, rows))
+        T = rigid_pose(torch.tensor(rows, dtype=torch.float64), path, f"the rotation of {EXTRINSICS}")
+        return DepthCamera(camera, T)
 
     def registered(
         self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str
