@@ -24,39 +24,18 @@ RobustName = Literal["huber", "l2", "l1", "cauchy", "geman-mcclure"]
 
 MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
-
-
-def huber(residual: Float[Tensor, "*p"], delta: float) -> Float[Tensor, "*p"]:
-    """Return Huber's rho: ``r^2 / 2`` up to ``delta``, then linear with slope ``delta``."""
-    size = residual.abs()
-    return torch.where(size <= delta, 0.5 * size**2, delta * (size - 0.5 * delta))
-
-
-def l2(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``r^2 / 2``; the scale has no effect."""
-    return 0.5 * residual**2
-
-
-def l1(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``scale |r|``; its derivative at 0 is taken as 0."""
-    return scale * residual.abs()
-
-
-def cauchy(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``c^2 log(1 + (r/c)^2 / 2)``: the influence of a residual decreases as it grows large."""
-    return scale**2 * torch.log1p(0.5 * (residual / scale) ** 2)
-
-
-def geman_mcclure(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``2 c^2 r^2 / (r^2 + 4 c^2)``, which is bounded by ``2 c^2``: large residuals have almost no influence."""
-    squared = (residual / scale) ** 2
-    return scale**2 * 2 * squared / (squared + 4)
-
-
 LOSSES: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
-    "huber": huber, "l2": l2, "l1": l1, "cauchy": cauchy, "geman-mcclure": geman_mcclure,
-}  # fmt: skip
-
+    # up to c quadratic, then linear with the slope c
+    "huber": lambda r, c: torch.where(r.abs() <= c, 0.5 * r.abs() ** 2, c * (r.abs() - 0.5 * c)),
+    "l2": lambda r, c: 0.5 * r**2,
+    "l1": lambda r, c: c * r.abs(),  # its derivative at 0 is taken as 0
+    "cauchy": lambda r, c: (
+        c**2 * torch.log1p(0.5 * (r / c) ** 2)
+    ),  # large residuals have less and less influence
+    # bounded by 2 c^2: large residuals have almost none
+    "geman-mcclure": lambda r, c: 2 * c**2 * (r / c) ** 2 / ((r / c) ** 2 + 4),
+}
+"""``rho(r)`` of each loss at a scale c."""
 WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "huber": lambda r, c: c / r.abs().clamp(min=c),
     "l2": lambda r, c: torch.ones_like(r),
