@@ -1,10 +1,12 @@
-from .batch import CameraBatch as CameraBatch
+from .exif import UPRIGHT as UPRIGHT
 from .exif import Exif as Exif
+from .exif import Orientation as Orientation
 from .exif import read_exif as read_exif
 from .files import CameraRecord as CameraRecord
 from .files import camera_record as camera_record
 from .files import read_camera as read_camera
 from .files import read_text_cameras as read_text_cameras
+from .intrinsics import CameraBatch as CameraBatch
 from .intrinsics import Intrinsics as Intrinsics
 from .intrinsics import cameras_at_size as cameras_at_size
 from .intrinsics import centre_crop_cameras as centre_crop_cameras
@@ -21,8 +23,6 @@ from .lenses import Lens as Lens
 from .lenses import PanoramaFace as PanoramaFace
 from .lenses import colmap_camera as colmap_camera
 from .lenses import colmap_model as colmap_model
-from .orientation import UPRIGHT as UPRIGHT
-from .orientation import Orientation as Orientation
 from .rolling_shutter import AT_REST as AT_REST
 from .rolling_shutter import STILL as STILL
 from .rolling_shutter import MotionPrior as MotionPrior

@@ -32,7 +32,6 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io import Record, Row, parse_json, parse_record, parse_rows, read_file
 
 LENSES = tuple(name for name, (_, kind, _) in MODELS.items() if kind != PERSPECTIVE)
-DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k", "M1", "M")
 COEFFICIENTS = (
@@ -72,21 +71,21 @@ class CameraRecord:
         try:
             if self.lens == PANORAMA:
                 return PanoramaFace(self.face or "front", (width, height))
-            fx, *rest = (
-                focal_length(size, focal) if is_angle else focal
-                for size, (focal, is_angle) in zip(
-                    (width, height), filter(None, (self.fx, self.fy)), strict=False
-                )
-            )
-            middle = (
+            fx = _pixels(self.fx, width)
+            fy = fx if self.fy is None else _pixels(self.fy, height)
+            cx, cy = (
                 size / 2 if c is None else c for size, c in zip((width, height), self.centre, strict=True)
             )
-            lens = self.coefficients if self.lens is None else ()
-            flat = Intrinsics(fx, *(rest or [fx]), *middle, width, height, lens)
+            flat = Intrinsics(fx, fy, cx, cy, width, height, self.coefficients if self.lens is None else ())
             question_focal(fx, width, height)
             return flat if self.lens is None else CentralLens(self.lens, flat, self.coefficients)
         except InputError as error:
             raise self.record.error(error) from error
+
+
+def _pixels(focal: tuple[float, bool], size: int) -> float:
+    value, is_angle = focal
+    return focal_length(size, value) if is_angle else value
 
 
 def camera_record(record: Record) -> CameraRecord:
@@ -146,7 +145,7 @@ def _distortion(record: Record) -> tuple[float, ...]:
     """Return the coefficients in OpenCV's order; an ideal lens has none."""
     if record.number("k4"):
         raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
-    values = tuple(record.number(key) or 0.0 for key in DISTORTION_KEYS)
+    values = tuple(record.number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3"))
     if not any(values):
         return ()
     return values if values[4] else values[:4]

@@ -7,6 +7,7 @@ Camera axes are OpenCV's: x right, y down, z forward. Pixel (column u, row v) of
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Integral, Real
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
-from bidnerf_core.camera.orientation import QUARTER_TURNS, Orientation
+from bidnerf_core.camera.exif import QUARTER_TURNS, Orientation
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
@@ -116,9 +117,9 @@ class Intrinsics:
             )
         if size is None or len(size) != 2:
             raise InputError(f"size is {size!r:.60}", expected="(width, height) of the image in pixels")
-        sides = (int(side) if side.is_integer() else side for side in _numbers("size", size).tolist())
-        camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, *sides, tuple(lens) if any(lens) else ())
-        question_focal(fx, camera.width, camera.height)
+        width, height = (int(side) if side.is_integer() else side for side in _numbers("size", size).tolist())
+        camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height, tuple(lens) if any(lens) else ())
+        question_focal(fx, width, height)
         return camera
 
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
@@ -231,6 +232,33 @@ class Intrinsics:
         return constant(rows, points).reshape(3, 3), constant(tuple(self.distortion), points)
 
 
+@dataclass(frozen=True, eq=False)
+class CameraBatch:
+    """The intrinsics of several cameras as tensors."""
+
+    matrices: Float[Tensor, "c 3 3"]  # float64, pixels
+    distortion: Float[Tensor, "c d"]  # float64, in OpenCV's order; has no columns if no lens is distorted
+
+    @staticmethod
+    def of(cameras: Sequence[Intrinsics]) -> CameraBatch:
+        """Build a batch from ``cameras``; shorter coefficient lists are padded with zeros."""
+        longest = max((len(camera.distortion) for camera in cameras), default=0)
+        rows = [[*camera.distortion, *[0.0] * (longest - len(camera.distortion))] for camera in cameras]
+        return CameraBatch(
+            torch.stack([camera.matrix() for camera in cameras]), torch.tensor(rows, dtype=torch.float64)
+        )
+
+    def unproject(self, pixels: Float[Tensor, "p 2"], camera: Int[Tensor, "p"]) -> Float[Tensor, "p 3"]:
+        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); ``camera`` is the index of
+        each pixel's camera.
+        """
+        matrix, exact = self.matrices[camera], pixels.double()
+        if self.distortion.shape[1]:
+            exact = undistort_points(exact[:, None], matrix, self.distortion[camera], num_iters=20)[:, 0]
+        focal, middle = matrix.diagonal(dim1=1, dim2=2)[:, :2], matrix[:, :2, 2]
+        return torch.cat([(exact - middle) / focal, torch.ones_like(exact[:, :1])], dim=-1).to(pixels.dtype)
+
+
 def question_focal(focal: float, width: int, height: int) -> None:
     """Raise ``InputError`` for a focal length that cannot be in pixels because no lens has such a wide view."""
     if MILLIMETRE <= focal < SHORTEST_FOCAL * max(width, height) and max(width, height) >= PHOTO:
@@ -296,11 +324,12 @@ def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[Came
     """
     size = (width, height)
     same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
-    if same:
-        return (same,)
-    turned = [c.quarter_turns() for c in cameras if same_aspect((c.height, c.width), size)]
-    sides = zip(*filter(None, turned), strict=True)
-    return tuple(tuple(camera.resized(*size) for camera in side) for side in sides)
+    turned = tuple(c for c in cameras if same_aspect((c.height, c.width), size))
+    return (
+        (same,)
+        if same
+        else tuple(tuple(c.resized(*size) for c in group) for group in _oriented(turned, *size))
+    )
 
 
 @lru_cache(maxsize=64)

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from bidnerf_core.camera.exif import UPRIGHT, Orientation
 from bidnerf_core.camera.intrinsics import COEFFICIENT, Intrinsics, check_number, same_aspect
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.errors import InputError
 
 WIDEST = math.radians(60)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from bidnerf_core.camera.exif import Exif
+from bidnerf_core.camera.exif import UPRIGHT, Exif, Orientation
 from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import (
     Intrinsics,
@@ -19,7 +19,6 @@ from bidnerf_core.camera.intrinsics import (
     same_aspect,
 )
 from bidnerf_core.camera.lenses import Camera, Lens
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.errors import InputError
 
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
@@ -30,7 +29,6 @@ CAMERA_FILES = ("camera.json", "cameras.txt")
 """Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 NO_EXIF = Exif()
-MIDDLE = "the principal point is assumed to be the image centre"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
 WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, focal=, hfov=, or assumed= with a map's cameras)"
 
@@ -194,7 +192,9 @@ def folder_camera(
 
 
 def _described(camera: Intrinsics, origin: str) -> FoundCamera:
-    return FoundCamera(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
+    return FoundCamera(
+        camera, f"{origin}: {_focal(camera)} (the principal point is assumed to be the image centre)"
+    )
 
 
 def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCamera:
@@ -222,11 +222,8 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
     differs greatly; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length, and for
     any other cropped image.
     """
-    whole, taken, part = (
-        raster.size,
-        exif.size,
-        "",
-    )  # ``whole`` is the size of the image before it was cropped
+    taken, whole = exif.size, raster.size  # ``whole`` is the size before the image was cropped
+    part = ""
     if taken and not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size)):
         if not may_be_cropped:
             raise InputError(
@@ -237,10 +234,8 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
         ratio = max(raster.width / taken[0], raster.height / taken[1])
         fits = raster.width <= taken[0] and raster.height <= taken[1]
         scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
-        whole, part = (
-            (round(taken[0] * scale), round(taken[1] * scale)),
-            f"; cropped from a photo of {taken[0]}x{taken[1]}",
-        )
+        whole = round(taken[0] * scale), round(taken[1] * scale)
+        part = f"; cropped from a photo of {taken[0]}x{taken[1]}"
     if exif.equivalent_mm is not None:
         focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
         origin = f"{exif.equivalent_mm:g} mm equivalent in EXIF"
