@@ -27,7 +27,7 @@ from .met_pieces import listed as listed
 from .met_pieces import met_pieces as met_pieces
 from .met_pieces import pieces_about as pieces_about
 from .met_pieces import values_of_pieces as values_of_pieces
-from .observations import Observations as Observations
+from .rendering import Observations as Observations
 from .rendering import RenderedImage as RenderedImage
 from .rendering import Rendering as Rendering
 from .rendering import query_samples as query_samples
@@ -42,7 +42,6 @@ from .residuals import Objective as Objective
 from .residuals import Residual as Residual
 from .residuals import Term as Term
 from .residuals import colour_term as colour_term
-from .residuals import coloured as coloured
 from .residuals import depth_residual as depth_residual
 from .residuals import depth_term as depth_term
 from .residuals import first_surface_residual as first_surface_residual
@@ -58,13 +57,13 @@ from .sampling import HitsAroundDepth as HitsAroundDepth
 from .sampling import Importance as Importance
 from .sampling import OccupiedOnly as OccupiedOnly
 from .sampling import Resampled as Resampled
+from .sampling import ScaledField as ScaledField
 from .sampling import SplittingSampler as SplittingSampler
 from .sampling import Stratified as Stratified
 from .sampling import gathered as gathered
 from .sampling import inverse_transform as inverse_transform
 from .sampling import rows_of as rows_of
-from .scaled import ScaledField as ScaledField
-from .scaled import scaled_field as scaled_field
-from .scaled import trained_field as trained_field
+from .sampling import scaled_field as scaled_field
+from .sampling import trained_field as trained_field
 from .voxel_grid import OccupancyMask as OccupancyMask
 from .voxel_grid import VoxelGrid as VoxelGrid

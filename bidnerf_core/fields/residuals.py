@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import Rendering
+from bidnerf_core.fields.rendering import Observations, Rendering
 from bidnerf_core.geometry import Robust
 
 
@@ -131,8 +130,14 @@ class Term:
     residual: Residual
     robust: Robust
     weight: float
-    applies: Callable[[Observations], Bool[Tensor, "*p"]]  # which rays it is defined for
+    of_distance: bool = (
+        True  # whether it is defined for the rays along which a distance, not a colour, was measured
+    )
     channels: int = 1
+
+    def applies(self, observed: Observations) -> Bool[Tensor, "*p"]:
+        """Return the mask of the rays for which it is defined."""
+        return observed.measured if self.of_distance else observed.coloured
 
     def loss(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*k"]:
         """Return the weighted mean of rho over the rays (last axis) that the term applies to, summed over channels."""
@@ -182,7 +187,7 @@ class Objective:
     @property
     def uses_depth(self) -> bool:
         """Whether any term needs measured distances."""
-        return any(term.applies is measured for term in self.terms)
+        return any(term.of_distance for term in self.terms)
 
     def _by_term(
         self, residuals: Float[Tensor, "*p c"], function: Callable[[Term, Tensor], Tensor]
@@ -191,47 +196,32 @@ class Objective:
         return torch.cat([function(term, part) for term, part in zip(self.terms, parts, strict=True)], -1)
 
 
-def coloured(observed: Observations) -> Bool[Tensor, "*p"]:
-    """Return the mask of the rays along which a colour was measured."""
-    return observed.coloured
-
-
-def measured(observed: Observations) -> Bool[Tensor, "*p"]:
-    """Return the mask of the rays along which a distance was measured."""
-    return observed.measured
-
-
 def colour_term(robust: Robust) -> Term:
     """Return the photometric term, with weight 1 and three channels."""
-    return Term(colour_residual, robust, 1.0, coloured, channels=3)
+    return Term(colour_residual, robust, 1.0, of_distance=False, channels=3)
 
 
 def depth_term(
     robust: Robust, weight: float, residual: DepthResidual = depth_residual, miss: float | None = None
 ) -> Term:
     """Return the depth term with its weight lambda_d; ``robust`` is in the unit of ``residual``."""
-
-    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        return torch.where(observed.measured, residual(rendering, observed, miss), 0)[..., None]
-
-    return Term(channel, robust, weight, measured)
+    return Term(
+        lambda rendering, observed: torch.where(observed.measured, residual(rendering, observed, miss), 0)[..., None],
+        robust, weight,
+    )  # fmt: skip
 
 
 def free_space_term(robust: Robust, weight: float) -> Term:
     """Return the term for matter that lies in front of the measured distance by more than the scale of
     ``robust`` (metres).
     """
-
-    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        return free_space(rendering, observed.distance, robust.scale)[..., None]
-
-    return Term(channel, robust, weight, measured)
+    return Term(
+        lambda rendering, observed: free_space(rendering, observed.distance, robust.scale)[..., None],
+        robust,
+        weight,
+    )
 
 
 def opacity_term(weight: float) -> Term:
     """Return the term for light that passes where a distance was measured: the scene must be opaque there."""
-
-    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        return (1 - rendering.opacity)[..., None]
-
-    return Term(channel, Robust("l2", 1.0), weight, measured)
+    return Term(lambda rendering, observed: (1 - rendering.opacity)[..., None], Robust("l2", 1.0), weight)

@@ -307,7 +307,11 @@ class Frame:
                 raise InputError(
                     "rgb has an alpha channel, and alpha is given;", where=where, expected="only one of them"
                 )
-            cover = _mask(alpha, (colour.shape[1], colour.shape[0]), where)
+            values = pixel_array(alpha, f"{where}: alpha")
+            if values.shape != (*colour.shape[:2], 1):
+                found, size = ("x".join(map(str, shape)) for shape in (values.shape, colour.shape[:2]))
+                raise InputError(f"alpha is {found}", where=where, expected=f"{size} as rgb (rows x columns)")
+            cover = values[..., 0]
         raster = Raster(colour.shape[1], colour.shape[0])
         intrinsics = raster.upright(camera)
         if intrinsics is None:
@@ -440,16 +444,6 @@ def _has_rays(camera: Intrinsics) -> bool:
     """Return whether the corners, the middles of the sides and the centre of the image have rays."""
     u, v = torch.linspace(0, camera.width, 3), torch.linspace(0, camera.height, 3)
     return bool(camera.unproject(torch.cartesian_prod(u.double(), v.double())).isfinite().all())
-
-
-def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Float[Tensor, "h w"]:
-    values = pixel_array(alpha, f"{where}: alpha")
-    if values.shape[2] != 1 or (values.shape[1], values.shape[0]) != size:
-        found = "x".join(map(str, values.shape))
-        raise InputError(
-            f"alpha is {found}", where=where, expected=f"{size[1]}x{size[0]} as rgb (rows x columns)"
-        )
-    return values[..., 0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,9 @@ class MaskFolder:
             raise InputError("contains no images", where=self.path, expected="masks")
         self._by_name = defaultdict[str, list[Path]](list)
         for file in files:
-            parts = (*file.relative_to(self.path).parts[:-1], photo_of(file.name))
+            photo = PurePath(AFFIXES.sub("", file.stem))
+            stem = photo.stem if photo.suffix.lower() in IMAGE_SUFFIXES else photo.name
+            parts = (*file.relative_to(self.path).parts[:-1], stem)
             for depth in range(1, len(parts) + 1):
                 self._by_name["_".join(parts[-depth:])].append(file)
 
@@ -156,12 +158,6 @@ class MaskFolder:
         """
         file = self.file_of(name)
         return None if file is None else read_mask(file, raster, size, self.hides)
-
-
-def photo_of(mask: str) -> str:
-    """Return the stem of the photo to which the file ``mask`` belongs."""
-    photo = PurePath(AFFIXES.sub("", PurePath(mask).stem))
-    return photo.stem if photo.suffix.lower() in IMAGE_SUFFIXES else photo.name
 
 
 def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:

@@ -57,7 +57,7 @@ def observe(
     They are on ``device``, by default that of the image. Nothing is copied if the image, the pose and ``pixels`` are there.
     """
     frame = view.frame
-    columns, rows = pixels.to(frame.rgb_bytes.device).unbind(-1)
+    columns, rows = pixels.unbind(-1)
     ray, length = frame.intrinsics.rays(pixels.double() + 0.5)
     depth = torch.zeros_like(length)
     if frame.depth is not None:
