@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+from jaxtyping import Shaped
+from torch import Tensor
+
 from bidnerf_core.camera.exif import UPRIGHT, Exif, Orientation
 from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import (
@@ -94,6 +97,22 @@ class Raster:
         if same_aspect(given, self.size):
             return camera.resized(*self.size).upright(self.orientation)
         return camera.resized(*self.upright_size) if same_aspect(given, self.upright_size) else None
+
+    def turned(
+        self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None
+    ) -> Shaped[Tensor, "h w"]:
+        """Return a mask or depth of the image, at any resolution, upright: one that fits the stored image is turned with it.
+
+        Raises ``InputError`` about ``what``, at ``where``, for another aspect ratio.
+        """
+        given = image.shape[1], image.shape[0]
+        if same_aspect(given, self.size):
+            return self.orientation.upright(image)
+        if same_aspect(given, self.upright_size):
+            return image
+        size = "x".join(map(str, self.upright_size))
+        found = f"{what} is {given[0]}x{given[1]}, but its image is {size};"
+        raise InputError(found, where=where, expected="the same aspect ratio")
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,3 @@
-from .box_tree import level_sizes as level_sizes
-from .box_tree import tree_of as tree_of
 from .contract import LARGEST_LENGTH as LARGEST_LENGTH
 from .contract import FieldValues as FieldValues
 from .contract import HitField as HitField
@@ -21,12 +19,14 @@ from .encoding import encoded_width as encoded_width
 from .encoding import frequency_encoding as frequency_encoding
 from .encoding import octaves as octaves
 from .encoding import query_network as query_network
-from .met_pieces import Meeting as Meeting
-from .met_pieces import flattened as flattened
-from .met_pieces import listed as listed
-from .met_pieces import met_pieces as met_pieces
-from .met_pieces import pieces_about as pieces_about
-from .met_pieces import values_of_pieces as values_of_pieces
+from .pieces import Meeting as Meeting
+from .pieces import flattened as flattened
+from .pieces import level_sizes as level_sizes
+from .pieces import listed as listed
+from .pieces import met_pieces as met_pieces
+from .pieces import pieces_about as pieces_about
+from .pieces import tree_of as tree_of
+from .pieces import values_of_pieces as values_of_pieces
 from .rendering import Observations as Observations
 from .rendering import RenderedImage as RenderedImage
 from .rendering import Rendering as Rendering

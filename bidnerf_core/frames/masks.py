@@ -67,20 +67,12 @@ def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[
     given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
     if own != UPRIGHT and same_aspect(own.upright_size(*given), raster.upright_size):
         return own.upright(stored)
-    is_upright = same_aspect(given, raster.upright_size)
-    if same_aspect(given, raster.size):
-        if is_upright and raster.orientation != UPRIGHT:
-            text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
-            warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
-        return raster.orientation.upright(stored)
-    if is_upright:
-        return stored
-    expected = "x".join(map(str, raster.upright_size))
-    raise InputError(
-        f"mask is {given[0]}x{given[1]}, but its image is {expected};",
-        where=path,
-        expected="the same aspect ratio",
-    )
+    if raster.orientation != UPRIGHT and all(
+        same_aspect(given, x) for x in (raster.size, raster.upright_size)
+    ):
+        text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
+        warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
+    return raster.turned(stored, "mask", path)
 
 
 def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Camera, Intrinsics, Raster, same_aspect
+from bidnerf_core.camera import Camera, Intrinsics, Raster
 from bidnerf_core.depth import DepthImage
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import (
@@ -37,15 +37,7 @@ def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what:
     Depth whose shape fits the stored image is turned with it. Raises ``InputError``, whose message begins
     with ``what``, if the aspect ratio is that of another image.
     """
-    metres = measured.metres
-    given = (metres.shape[1], metres.shape[0])
-    if same_aspect(given, raster.size):
-        metres = raster.orientation.upright(metres)
-    elif not same_aspect(given, raster.upright_size):
-        expected = "x".join(map(str, raster.upright_size))
-        raise InputError(
-            f"{what} is {given[0]}x{given[1]}, but its image is {expected};", expected="the same aspect ratio"
-        )
+    metres = raster.turned(measured.metres, what)
     return metres if tuple(metres.shape) == size[::-1] else resampled(metres, *size)
 
 
