@@ -42,6 +42,7 @@ from .residuals import Objective as Objective
 from .residuals import Residual as Residual
 from .residuals import Term as Term
 from .residuals import colour_term as colour_term
+from .residuals import coloured as coloured
 from .residuals import depth_residual as depth_residual
 from .residuals import depth_term as depth_term
 from .residuals import first_surface_residual as first_surface_residual

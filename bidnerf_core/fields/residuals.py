@@ -130,14 +130,8 @@ class Term:
     residual: Residual
     robust: Robust
     weight: float
-    of_distance: bool = (
-        True  # whether it is defined for the rays along which a distance, not a colour, was measured
-    )
+    applies: Callable[[Observations], Bool[Tensor, "*p"]]  # which rays it is defined for
     channels: int = 1
-
-    def applies(self, observed: Observations) -> Bool[Tensor, "*p"]:
-        """Return the mask of the rays for which it is defined."""
-        return observed.measured if self.of_distance else observed.coloured
 
     def loss(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*k"]:
         """Return the weighted mean of rho over the rays (last axis) that the term applies to, summed over channels."""
@@ -187,7 +181,7 @@ class Objective:
     @property
     def uses_depth(self) -> bool:
         """Whether any term needs measured distances."""
-        return any(term.of_distance for term in self.terms)
+        return any(term.applies is measured for term in self.terms)
 
     def _by_term(
         self, residuals: Float[Tensor, "*p c"], function: Callable[[Term, Tensor], Tensor]
@@ -196,9 +190,19 @@ class Objective:
         return torch.cat([function(term, part) for term, part in zip(self.terms, parts, strict=True)], -1)
 
 
+def coloured(observed: Observations) -> Bool[Tensor, "*p"]:
+    """Return the mask of the rays along which a colour was measured."""
+    return observed.coloured
+
+
+def measured(observed: Observations) -> Bool[Tensor, "*p"]:
+    """Return the mask of the rays along which a distance was measured."""
+    return observed.measured
+
+
 def colour_term(robust: Robust) -> Term:
     """Return the photometric term, with weight 1 and three channels."""
-    return Term(colour_residual, robust, 1.0, of_distance=False, channels=3)
+    return Term(colour_residual, robust, 1.0, coloured, channels=3)
 
 
 def depth_term(
@@ -207,7 +211,7 @@ def depth_term(
     """Return the depth term with its weight lambda_d; ``robust`` is in the unit of ``residual``."""
     return Term(
         lambda rendering, observed: torch.where(observed.measured, residual(rendering, observed, miss), 0)[..., None],
-        robust, weight,
+        robust, weight, measured,
     )  # fmt: skip
 
 
@@ -219,9 +223,12 @@ def free_space_term(robust: Robust, weight: float) -> Term:
         lambda rendering, observed: free_space(rendering, observed.distance, robust.scale)[..., None],
         robust,
         weight,
+        measured,
     )
 
 
 def opacity_term(weight: float) -> Term:
     """Return the term for light that passes where a distance was measured: the scene must be opaque there."""
-    return Term(lambda rendering, observed: (1 - rendering.opacity)[..., None], Robust("l2", 1.0), weight)
+    return Term(
+        lambda rendering, observed: (1 - rendering.opacity)[..., None], Robust("l2", 1.0), weight, measured
+    )
