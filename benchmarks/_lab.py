@@ -98,7 +98,7 @@ class Scene:
 
 
 def without_depth(view: View) -> View:
-    return replace(view, frame=replace(view.frame, depth=None))
+    return replace(view, frame=view.frame.replace(depth=None))
 
 
 def modes(views: Sequence[View], wanted: Iterable[str] = ("RGB", "RGB-D")) -> dict[str, list[View]]:

@@ -382,7 +382,7 @@ class Planes:
                 key = (name, "RGB", "plane", view.frame.name)
                 made = Question(key, view.frame, localizer, [view], unit=scene.distance)
                 self._questions.append((key, lambda made=made: made))  # type: ignore[misc]
-            bare = replace(view, frame=wall(replace(view.frame, name=f"{scene.name}/wall")))
+            bare = replace(view, frame=wall(view.frame.replace(name=f"{scene.name}/wall")))
             key = (name, "RGB", "plain wall", bare.frame.name)
             asked = Question(key, bare.frame, localizer)
             self._questions.append((key, lambda asked=asked: asked))  # type: ignore[misc]

@@ -139,7 +139,7 @@ def two_places(views: list[View], others: list[View]) -> Case:
     """Join half of a capture with a quarter of another one, moved so that the cameras of both are in one place."""
     shift = SE3(torch.eye(3, dtype=torch.float64), _middle(views) - _middle(others))
     strangers = [
-        View(replace(v.frame, name=f"other {v.frame.name}"), shift @ v.T_ref_camera.to("cpu", torch.float64))
+        View(v.frame.replace(name=f"other {v.frame.name}"), shift @ v.T_ref_camera.to("cpu", torch.float64))
         for v in others[::4]
     ]
     return Case([*views[::2], *strangers], {"apart": {v.frame.name for v in strangers}})

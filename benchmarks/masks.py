@@ -83,7 +83,7 @@ def under_mask(view: View, there: Tensor) -> View:
     """Return the view with the person hidden by a mask that is a little too large."""
     size = 2 * GROWN + 1
     hidden = torch.nn.functional.max_pool2d(there.float()[None], size, 1, GROWN)[0] > 0
-    return replace(view, frame=replace(view.frame, hidden=hidden))
+    return replace(view, frame=view.frame.replace(hidden=hidden))
 
 
 def capture(views: Sequence[View], way: str, share: float) -> tuple[list[View], list[Tensor]]:

@@ -97,7 +97,7 @@ def without_files(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def renamed(view: View, name: str) -> View:
-    return replace(view, frame=replace(view.frame, name=name))
+    return replace(view, frame=view.frame.replace(name=name))
 
 
 def _quiet() -> Any:
@@ -190,7 +190,7 @@ def localized(scene: Map, queries: Sequence[View], align: Similarity) -> dict[st
     """Return how photos without their poses are localized, in the frame of the dataset."""
     localizer, rows = bn.Localizer(scene), list[Row]()
     for number, view in enumerate(queries):
-        found = localizer(replace(view.frame, depth=None), seed=number)
+        found = localizer(view.frame.replace(depth=None), seed=number)
         error = pose_error(aligned(found.T_world_camera, align), view.T_ref_camera)
         finite = bool(found.T_world_camera.matrix().isfinite().all())
         rows.append(

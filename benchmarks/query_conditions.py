@@ -66,7 +66,7 @@ def of_unknown_focal(frame: Frame) -> Frame:
     """Return the image with a focal length that is 10 % too long and declared as approximate."""
     camera = frame.intrinsics
     wrong = replace(camera, fx=camera.fx * WRONG_FOCAL, fy=camera.fy * WRONG_FOCAL)
-    return replace(frame, intrinsics=wrong, focal_is_approximate=True)
+    return frame.replace(intrinsics=wrong, focal_is_approximate=True)
 
 
 def compressed(frame: Frame) -> Frame:

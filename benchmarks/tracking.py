@@ -132,7 +132,7 @@ def carried(frames: Frames) -> Run:
 def depth_stops(frames: Frames) -> Run:
     """Remove the depth of the second half, and the frames there that have nothing else."""
     half = len(frames) // 2
-    bare = [replace(f, frame=replace(f.frame, depth=None)) for f in frames[half:] if f.frame.has_colour]
+    bare = [replace(f, frame=f.frame.replace(depth=None)) for f in frames[half:] if f.frame.has_colour]
     return Run(frames[:half] + bare)
 
 
@@ -244,7 +244,7 @@ def tracked(
     """Track a run; return one row per frame."""
     rows = []
     for timed in run.frames:
-        frame = timed.frame if depth else replace(timed.frame, depth=None)
+        frame = timed.frame if depth else timed.frame.replace(depth=None)
         began = time.process_time()
         found = step(frame, timed.time)
         seconds = time.process_time() - began
@@ -403,7 +403,7 @@ def remembered(tracker: Tracker, frames: Iterator[TimedFrame], depth: bool) -> I
     for number, timed in enumerate(frames, start=1):
         hidden = (number - 1) % EVERY in COVERED
         frame = covered_frame(timed.frame, generator) if hidden else timed.frame
-        frame = frame if depth else replace(frame, depth=None)
+        frame = frame if depth else frame.replace(depth=None)
         began = time.process_time()
         found = tracker(frame, timed.time)
         milliseconds.append(1000 * (time.process_time() - began))

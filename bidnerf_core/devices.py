@@ -122,9 +122,13 @@ def _moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, Tensor):
         return value if _is_on(value, device) else value.to(device)
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {part.name: getattr(value, part.name) for part in fields(value)}
+        parts = {part.name: vars(value)[part.name] for part in fields(value) if part.name in vars(value)}
         there = _moved(parts, device)
-        return value if there is parts else _with_fields(value, there)
+        if there is parts:
+            return value
+        found = object.__new__(type(value))
+        vars(found).update(there)  # also the fields that its constructor does not take
+        return found
     if isinstance(value, dict):
         content = {key: _moved(part, device) for key, part in value.items()}
         return content if any(content[key] is not value[key] for key in value) else value
@@ -133,14 +137,6 @@ def _moved(value: Any, device: torch.device) -> Any:
         same = all(new is old for new, old in zip(items, value, strict=True))
         return value if same else type(value)(items)
     return value
-
-
-def _with_fields(value: Any, parts: dict[str, Any]) -> Any:
-    """Return a new instance of a dataclass with these fields, including those that its constructor does not take."""
-    found = object.__new__(type(value))
-    for name, part in parts.items():
-        object.__setattr__(found, name, part)
-    return found
 
 
 def _is_on(tensor: Tensor, device: torch.device) -> bool:

@@ -8,13 +8,53 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Shaped
 from PIL.ExifTags import IFD, Base
+from torch import Tensor
 
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.io import open_image
 
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Length of the unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre."""
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """The operations that turn the stored raster upright: mirror columns, mirror rows, then transpose."""
+
+    mirrors_columns: bool = False
+    mirrors_rows: bool = False
+    transposes: bool = False
+
+    @staticmethod
+    def from_exif(code: int) -> Orientation:
+        """Return the orientation of EXIF tag 0x0112 (CIPA DC-008, table 6); unknown codes mean an upright image."""
+        return Orientation(*CODES.get(code, (False, False, False)))
+
+    def upright(self, image: Shaped[Tensor, "sh sw *channels"]) -> Shaped[Tensor, "h w *channels"]:
+        """Turn a stored image upright."""
+        axes = [axis for axis, flips in ((0, self.mirrors_rows), (1, self.mirrors_columns)) if flips]
+        turned = image.flip(axes) if axes else image
+        return turned.transpose(0, 1).contiguous() if self.transposes else turned
+
+    def upright_size(self, width: int, height: int) -> tuple[int, int]:
+        """Return the width and height of the upright image for a stored image of this size."""
+        return (height, width) if self.transposes else (width, height)
+
+
+UPRIGHT = Orientation()
+CODES = {
+    1: (False, False, False),
+    2: (True, False, False),
+    3: (True, True, False),
+    4: (False, True, False),
+    5: (False, False, True),
+    6: (False, True, True),  # the camera was turned by 90 degrees: most portrait photos
+    7: (True, True, True),
+    8: (True, False, True),
+}
+QUARTER_TURNS = tuple(Orientation(*CODES[code]) for code in (6, 8))
+"""The orientations of a camera turned by 90 degrees to one side and to the other."""
 
 
 @dataclass(frozen=True)
@@ -49,28 +89,17 @@ def read_exif(path: Path) -> Exif:
 
 
 def _exif(tags: Mapping[int, Any]) -> Exif:
-    code = tags.get(Base.Orientation, 1)
+    code, unit = tags.get(Base.Orientation, 1), MILLIMETRES.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
+    keys = (Base.ExifImageWidth, Base.ExifImageHeight, Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
+    width, height, x, y = (_positive(tags.get(key)) for key in keys)
     return Exif(
         Orientation.from_exif(code) if isinstance(code, int) else UPRIGHT,
-        _size(tags),
+        (int(width), int(height)) if width and height and min(width, height) >= 1 else None,
         _positive(tags.get(Base.FocalLengthIn35mmFilm)),
         _positive(tags.get(Base.FocalLength)),
-        _resolution(tags),
+        (x / unit, (y or x) / unit) if x and unit else None,
         _positive(tags.get(Base.DigitalZoomRatio)) or 1.0,  # 0 means that no digital zoom was used
     )
-
-
-def _size(tags: Mapping[int, Any]) -> tuple[int, int] | None:
-    width, height = (_positive(tags.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight))
-    return (int(width), int(height)) if width and height and min(width, height) >= 1 else None
-
-
-def _resolution(tags: Mapping[int, Any]) -> tuple[float, float] | None:
-    unit = tags.get(Base.FocalPlaneResolutionUnit, 2)
-    x, y = (_positive(tags.get(tag)) for tag in (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution))
-    if x is None or unit not in MILLIMETRES:
-        return None
-    return x / MILLIMETRES[unit], (y or x) / MILLIMETRES[unit]
 
 
 def _positive(value: Any) -> float | None:

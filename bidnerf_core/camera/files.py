@@ -1,56 +1,66 @@
 """Files of camera intrinsics.
 
 Supported formats are the JSON of NeRF, nerfstudio, Open3D and 3D Gaussian Splatting, COLMAP's
-``cameras.txt``, hloc's lists of images with cameras, and the YAML that ``calibrations`` reads. Pixel centres
-are at +0.5 unless the format follows OpenCV.
+``cameras.txt``, hloc's lists of images with cameras, and YAML from ROS, OpenCV, ORB-SLAM and Kalibr. Pixel centres
+are at +0.5 unless the format follows OpenCV, as Open3D and the YAML files do.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
-from bidnerf_core.camera.calibrations import (
-    calibrated_camera,
-    gaussian_splatting_camera,
-    read_yaml_camera,
-)
-from bidnerf_core.camera.colmap_models import MODELS, colmap_camera
+import numpy as np
+import yaml
+
 from bidnerf_core.camera.intrinsics import Intrinsics, focal_length, question_focal
 from bidnerf_core.camera.lenses import (
-    LENS_MODELS,
+    FISHEYE,
+    MODELS,
     PANORAMA,
+    PERSPECTIVE,
     Camera,
     CentralLens,
     PanoramaFace,
+    colmap_camera,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import Record, Row, parse_json, parse_record, parse_rows, read_file
 
+LENSES = tuple(name for name, (_, kind, _) in MODELS.items() if kind != PERSPECTIVE)
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
-FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
-DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k", "M1", "M")
+COEFFICIENTS = (
+    "distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "distortion", "D", "d", "D1",
+)  # fmt: skip
+WIDTHS = ("image_width", "image_Width", "width", "Camera.width", "img_width")
+HEIGHTS = ("image_height", "image_Height", "height", "Camera.height", "img_height")
+SIZES = ("image_size", "imageSize", "resolution", "size")
+FISHEYES = ("equidistant", "fisheye", "kannalabrandt8", "kannala_brandt", "opencv_fisheye")
+UNDISTORTED = (
+    "plumb_bob", "rational_polynomial", "radtan", "none", "pinhole", "perspective", "opencv", "thin_prism", "",
+)  # fmt: skip
+EXPECTED = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
 
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """Intrinsics before the image size is known; each axis has a focal length (pixels) or a field of view
-    (radians).
+    """Intrinsics before the image size is known; a focal length is in pixels or, if ``True`` follows, a field of view in
+    radians.
     """
 
     record: Record
     width: int | None
     height: int | None
-    focal_x: float | None
-    focal_y: float | None
-    angle_x: float | None
-    angle_y: float | None
-    cx: float | None
-    cy: float | None
-    distortion: tuple[float, ...]
-    lens: str | None = None  # the model of a non-perspective lens; its coefficients are ``distortion``
+    lens: str | None = None  # the model of a lens that is not perspective
+    fx: tuple[float, bool] = (0.0, False)
+    fy: tuple[float, bool] | None = None  # None: that of x
+    centre: tuple[float | None, float | None] = (None, None)
+    coefficients: tuple[float, ...] = ()
     face: str | None = None  # of a panorama
 
     def intrinsics(self, width: int, height: int) -> Camera:
@@ -60,27 +70,22 @@ class CameraRecord:
         """
         try:
             if self.lens == PANORAMA:
-                return PanoramaFace(self.face or "front", width, height)
-            return self._central(width, height)
+                return PanoramaFace(self.face or "front", (width, height))
+            fx = _pixels(self.fx, width)
+            fy = fx if self.fy is None else _pixels(self.fy, height)
+            cx, cy = (
+                size / 2 if c is None else c for size, c in zip((width, height), self.centre, strict=True)
+            )
+            flat = Intrinsics(fx, fy, cx, cy, width, height, self.coefficients if self.lens is None else ())
+            question_focal(fx, width, height)
+            return flat if self.lens is None else CentralLens(self.lens, flat, self.coefficients)
         except InputError as error:
             raise self.record.error(error) from error
 
-    def _central(self, width: int, height: int) -> Camera:
-        fx = self.focal_x if self.angle_x is None else focal_length(width, self.angle_x)
-        fy = self.focal_y if self.angle_y is None else focal_length(height, self.angle_y)
-        assert fx is not None  # ensured by camera_record
-        cx = width / 2 if self.cx is None else self.cx
-        cy = height / 2 if self.cy is None else self.cy
-        fy = fx if fy is None else fy
-        lens = self.distortion if self.lens is None else ()
-        flat = Intrinsics(fx, fy, cx, cy, width, height, lens)
-        question_focal(fx, width, height)
-        if self.lens is None:
-            return flat
-        model, places = LENS_MODELS[self.lens]
-        return CentralLens(
-            model, fx, fy, cx, cy, width, height, self.distortion[: len(places) - 4], self.lens
-        )
+
+def _pixels(focal: tuple[float, bool], size: int) -> float:
+    value, is_angle = focal
+    return focal_length(size, value) if is_angle else value
 
 
 def camera_record(record: Record) -> CameraRecord:
@@ -88,74 +93,59 @@ def camera_record(record: Record) -> CameraRecord:
 
     Raises ``InputError`` for an unknown camera model and for a focal length that is missing or not positive.
     """
-    lens = _lens(record)
-    width, height = record.size("w"), record.size("h")
+    lens, width, height = _lens(record), record.size("w"), record.size("h")
     if lens == PANORAMA:
-        return CameraRecord(record, width, height, None, None, None, None, None, None, (), lens)
-    focal_x, angle_x = _focal(record, "x")
-    focal_y, angle_y = _focal(record, "y")
-    if focal_x is None and angle_x is None:
+        return CameraRecord(record, width, height, lens)
+    fx, fy = _focal(record, "x"), _focal(record, "y")
+    if fx is None:
         raise record.error("no focal length", expected="fl_x (pixels) or camera_angle_x (radians)")
-    return CameraRecord(
-        record,
-        width,
-        height,
-        focal_x,
-        focal_y,
-        angle_x,
-        angle_y,
-        record.number("cx"),
-        record.number("cy"),
-        _distortion(record) if lens is None else _coefficients(record),
-        lens,
-    )
+    centre = record.number("cx"), record.number("cy")
+    coefficients = _distortion(record) if lens is None else _coefficients(record, len(MODELS[lens][2]) - 4)
+    return CameraRecord(record, width, height, lens, fx, fy, centre, coefficients)
 
 
 def _lens(record: Record) -> str | None:
-    """Return the name of a non-perspective model (from ``LENS_MODELS``, or ``PANORAMA``); None for
-    perspective ones.
-    """
+    """Return the name of a model that is not perspective, from ``LENSES``; None for perspective ones."""
     model = (record.text("camera_model") or "").upper()
     if record.value("is_fisheye") and model in ("", *PERSPECTIVE_MODELS):  # some programs write 1 for true
         return "OPENCV_FISHEYE"
-    if model in (*LENS_MODELS, PANORAMA):
+    if model in LENSES:
         return model
     if model and model not in PERSPECTIVE_MODELS:
-        expected = ", ".join((*PERSPECTIVE_MODELS, *LENS_MODELS, PANORAMA))
+        expected = ", ".join((*PERSPECTIVE_MODELS, *LENSES))
         raise record.error(f"camera_model is {model}", expected=f"one of {expected}")
     return None
 
 
-def _coefficients(record: Record) -> tuple[float, ...]:
+def _coefficients(record: Record, count: int) -> tuple[float, ...]:
     """Return the coefficients of a fisheye or division lens; a single one may be called k."""
-    first, *rest = (record.number(key) for key in FISHEYE_KEYS)
-    if first is None:
-        first = record.number("k")
-    return tuple(value or 0.0 for value in (first, *rest))
+    found = [record.number(key) for key in ("k1", "k2", "k3", "k4")]
+    first = record.number("k") if found[0] is None else found[0]
+    return tuple(value or 0.0 for value in (first, *found[1:]))[:count]
 
 
-def _focal(record: Record, axis: str) -> tuple[float | None, float | None]:
-    """Return the focal length or angle of an axis. A frame's own value takes precedence over the file's, and
-    pixels over radians.
+def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
+    """Return the focal length of an axis, or its field of view and ``True``. A frame's own value takes precedence over the
+    file's, and pixels over radians.
     """
     for scope in record.scopes():
         focal, angle = scope.number(f"fl_{axis}"), scope.number(f"camera_angle_{axis}")
         if focal is not None:
             if focal <= 0:
                 raise record.error(f"fl_{axis} is {focal:g}", expected="a positive number of pixels")
-            return focal, None
+            return focal, False
         if angle is not None:
             if not 0 < angle < math.pi:
                 raise record.error(f"camera_angle_{axis} is {angle:g}", expected="radians between 0 and pi")
-            return None, angle
-    return None, None
+            return angle, True
+    return None
 
 
 def _distortion(record: Record) -> tuple[float, ...]:
     """Return the coefficients in OpenCV's order; an ideal lens has none."""
     if record.number("k4"):
         raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
-    values = tuple(record.number(key) or 0.0 for key in DISTORTION_KEYS)
+    values = tuple(record.number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3"))
     if not any(values):
         return ()
     return values if values[4] else values[:4]
@@ -177,7 +167,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     if start[:1] == b"[":
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
-        return read_yaml_camera(str(path), content, size)
+        return calibrated_camera(str(path), _yaml(str(path), content), size)
     return _chosen(path, _text_cameras(path, content), photo)
 
 
@@ -204,9 +194,12 @@ def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
             raise InputError(
                 f"entry {number} is not a camera", where=path, expected="img_name, width, height, fx and fy"
             )
-        found[str(entry.get("img_name", number))] = gaussian_splatting_camera(
-            f"{path}: entry {number}", entry
+        where = f"{path}: entry {number}"
+        fx, fy, *sides = (
+            float(_array(where, entry.get(key, "none"))) for key in ("fx", "fy", "width", "height")
         )
+        K = ((fx, 0, sides[0] / 2 - 0.5), (0, fy, sides[1] / 2 - 0.5), (0, 0, 1))
+        found[str(entry.get("img_name", number))] = _opencv_camera(where, K, (), "", tuple(map(int, sides)))
     return found
 
 
@@ -254,3 +247,118 @@ def _text_camera(row: Row, named: bool) -> tuple[str, Camera]:
     width, height = (row.integer(words[place]) for place in (2, 3))
     key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
     return key, colmap_camera(row.where, words[1], width, height, row.numbers(words[4:]))
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML loader for plain values, with OpenCV's matrices as mappings."""
+
+
+_Loader.add_multi_constructor("", lambda loader, suffix, node: _plain(loader, node))
+_Loader.add_multi_constructor("tag:yaml.org,2002:opencv", lambda loader, suffix, node: _plain(loader, node))
+
+
+def _plain(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    return loader.construct_scalar(node)
+
+
+def _yaml(where: str, content: bytes) -> Mapping[str, Any]:
+    """Parse a YAML file whose tags are ignored, as OpenCV's of matrices. Raises ``InputError``, whose message begins with
+    ``where``.
+    """
+    try:
+        text = re.sub(r"\A\s*%YAML.*\n", "", content.decode("utf-8-sig"))
+        values = next(iter(yaml.load_all(text, Loader=_Loader)), None)
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"is not YAML ({reason})", where=where, expected=EXPECTED) from error
+    if not isinstance(values, Mapping):
+        raise InputError(where=where, expected=EXPECTED)
+    return values
+
+
+def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
+    """Parse the camera in an object that a calibration tool or a robot wrote. If it gives no image size, ``size`` (width,
+    height) is assumed.
+
+    Raises ``InputError``, whose message begins with ``where``.
+    """
+    inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]
+    if len(inner) > 1:
+        raise InputError(
+            f"holds {len(inner)} cameras",
+            where=where,
+            expected="one; keep only the lines of this photo's camera",
+        )
+    if isinstance(values.get("intrinsic"), Mapping):  # a view in Open3D
+        return calibrated_camera(where, values["intrinsic"], size)
+    orb_slam = next((name for name in ("Camera", "Camera1") if f"{name}.fx" in values), None)
+    if inner and isinstance(inner[0], Mapping):  # Kalibr
+        values = inner[0]
+        four, kind = _array(where, values.get("intrinsics", [])), str(values.get("camera_model", "pinhole"))
+        if kind != "pinhole" or four.size != 4:
+            found = f"camera_model is {kind} with {four.size} intrinsics"
+            raise InputError(found, where=where, expected="pinhole with 4")
+        fx, fy, cx, cy = four.ravel().tolist()
+        K: Any = ((fx, 0, cx), (0, fy, cy), (0, 0, 1))
+        lens = _array(where, values.get("distortion_coeffs", []))
+        model = str(values.get("distortion_model", "none"))
+    elif orb_slam is not None:
+        model = str(values.get("Camera.type", "pinhole"))
+        keys = ("k1", "k2", "k3", "k4") if model.lower() in FISHEYES else ("k1", "k2", "p1", "p2", "k3")
+        fx, fy, cx, cy, *rest = (
+            float(_array(where, values.get(f"{orb_slam}.{key}", 0.0)))
+            for key in ("fx", "fy", "cx", "cy", *keys)
+        )
+        K, lens = ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), np.array(rest)
+    else:
+        given = _first(values, MATRICES)
+        if given is None:
+            raise InputError(
+                f"no camera matrix ({', '.join(MATRICES[:3])} or K)", where=where, expected=EXPECTED
+            )
+        K, lens = _array(where, given), _array(where, _first(values, COEFFICIENTS) or [])
+        if "intrinsic_matrix" in values and not isinstance(given, Mapping) and K.shape == (9,):  # by columns
+            K = K.reshape(3, 3).T
+        model = str(values.get("distortion_model", values.get("camera_model", "")))
+    pair = _first(values, SIZES)
+    sides = _array(
+        where, pair if pair is not None else [_first(values, keys) or 0 for keys in (WIDTHS, HEIGHTS)]
+    )
+    if sides.size != 2 or not np.isfinite(sides).all():
+        raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")
+    width, height = (int(value) for value in sides.ravel())
+    return _opencv_camera(
+        where, K, tuple(lens.ravel().tolist()), model, (width, height) if width > 0 and height > 0 else size
+    )
+
+
+def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size: tuple[int, ...]) -> Camera:
+    """Return the camera of a matrix and coefficients, as ``Intrinsics.from_opencv`` does, or a fisheye lens."""
+    kind = model.lower()
+    if kind not in (*FISHEYES, *UNDISTORTED):
+        expected = "plumb_bob, rational_polynomial or equidistant"
+        raise InputError(f"distortion model {model}", where=where, expected=expected)
+    try:
+        if kind not in FISHEYES:
+            return Intrinsics.from_opencv(K, lens or None, size)  # type: ignore[arg-type]
+        flat = Intrinsics.from_opencv(K, None, size)  # type: ignore[arg-type]
+        return CentralLens(FISHEYE, flat, (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
+    except InputError as error:
+        raise InputError(error, where=where) from error
+
+
+def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> Any:
+    return next((values[key] for key in keys if values.get(key) is not None), None)
+
+
+def _array(where: str, given: Any) -> np.ndarray:
+    """Return a list, or the data of an OpenCV or ROS matrix."""
+    found = given.get("data") if isinstance(given, Mapping) else given
+    try:
+        return np.asarray(found, dtype=float)  # YAML reads 1e-05 as text
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{str(given)[:60]!r}", where=where, expected="numbers") from error

@@ -7,6 +7,7 @@ Camera axes are OpenCV's: x right, y down, z forward. Pixel (column u, row v) of
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Integral, Real
@@ -18,14 +19,16 @@ from jaxtyping import Bool, Float, Int
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
-from bidnerf_core.camera.orientation import QUARTER_TURNS, Orientation
+from bidnerf_core.camera.exif import QUARTER_TURNS, Orientation
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
-LARGEST_SIZE = 1_000_000
-"""Maximum number of columns or rows of an image."""
-SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
-"""Limits of focal lengths and of the principal point's distance, in pixels. Beyond them, float32 overflows."""
+FOCAL = (Real, 1e-6, 1e9, "a positive number, at least 1e-06 pixels and at most 1e+09 pixels")
+PRINCIPAL_POINT = (Real, -1e9, 1e9, "pixels near the image")
+SIZE = (Integral, 1, 1_000_000, "a whole number of pixels from 1 to 1000000")
+COEFFICIENT = (Real, -1e6, 1e6, "coefficients of a real lens")
+"""The types and limits of a camera's numbers. Beyond them, float32 overflows; coefficients of rational models reach
+some hundreds."""
 LARGEST_FOCAL = 1000
 """Largest focal length, in image widths or heights: that of a telescope with a field of view of 0.06 degrees."""
 SHORTEST_FOCAL, PHOTO, MILLIMETRE = 0.1, 240, 1.0
@@ -34,8 +37,6 @@ pixels along a side. A shorter one above ``MILLIMETRE`` is probably given in mil
 about 4.2 mm."""
 SKEW = 1e-6
 """Maximum skew of a camera matrix, as a fraction of its focal length."""
-LARGEST_COEFFICIENT = 1e6
-"""Largest distortion coefficient; those of rational models reach some hundreds."""
 ASPECT_TOLERANCE = 0.005
 """Relative difference between two aspect ratios that is attributed to rounding when an image was resized."""
 
@@ -56,42 +57,28 @@ class Intrinsics:
         given: Any = self.distortion
         if isinstance(given, np.ndarray | Tensor):
             object.__setattr__(self, "distortion", tuple(_numbers("distortion", given).ravel().tolist()))
-        self._check_types()
         for name in ("fx", "fy"):
-            value = getattr(self, name)
-            if not SMALLEST_FOCAL <= value <= LARGEST_PIXELS:
-                raise InputError(f"focal length {name} is {value}", expected=_expected_focal(value))
-        if not (1 <= self.width <= LARGEST_SIZE and 1 <= self.height <= LARGEST_SIZE):
-            expected = f"1x1 to {LARGEST_SIZE}x{LARGEST_SIZE}"
-            raise InputError(f"image size is {self.width}x{self.height}", expected=expected)
+            check_number(f"focal length {name}", getattr(self, name), *FOCAL)
         for name in ("cx", "cy"):
-            value = getattr(self, name)
-            if not abs(value) <= LARGEST_PIXELS:
-                raise InputError(f"principal point {name} is {value}", expected="pixels near the image")
-        if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.distortion):
-            raise InputError(f"distortion is {self.distortion}", expected="coefficients of a real lens")
+            check_number(f"principal point {name}", getattr(self, name), *PRINCIPAL_POINT)
+        for name in ("width", "height"):
+            check_number(name, getattr(self, name), *SIZE)
+        if not isinstance(self.distortion, tuple | list):
+            raise InputError(f"distortion is a {type(self.distortion).__name__}", expected="coefficients")
+        for value in self.distortion:
+            check_number("distortion", value, *COEFFICIENT)
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
             raise InputError(
                 f"distortion has {len(self.distortion)} coefficients", expected="0, 4, 5, 8, 12 or 14"
             )
 
-    def _check_types(self) -> None:
-        """Raise ``InputError`` for values that are not numbers, and for sizes that are not integers."""
-        for name in ("fx", "fy", "cx", "cy"):
-            _require(name, getattr(self, name), Real, "a number of pixels")
-        for name in ("width", "height"):
-            _require(name, getattr(self, name), Integral, "a whole number of pixels")
-        if not isinstance(self.distortion, tuple | list):
-            raise InputError(f"distortion is a {type(self.distortion).__name__}", expected="coefficients")
-        for value in self.distortion:
-            _require("distortion", value, Real, "coefficients of a real lens")
-
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
         """Return an undistorted camera; ``focal`` is in pixels, and the principal point is the image centre."""
-        _require_size("width", width)
-        _require_size("height", height)
-        _require("focal length", focal, Real, "a number of pixels")
+        kind, least, _, expected = FOCAL
+        check_number("fx", focal, kind, least, math.inf, expected)
+        check_number("width", width, *SIZE)
+        check_number("height", height, *SIZE)
         question_focal(focal, width, height)
         if focal > LARGEST_FOCAL * max(width, height):
             raise InputError(
@@ -103,17 +90,10 @@ class Intrinsics:
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
         """Return an undistorted camera with a horizontal field of view of ``degrees``."""
-        _require("horizontal field of view", degrees, Real, "degrees between 0 and 180")
-        _require_size("width", width)
-        if not 0 < degrees < 180:
-            raise InputError(
-                f"horizontal field of view is {degrees}", expected="degrees between 0 and 180 (both excluded)"
-            )
-        focal = focal_length(width, math.radians(degrees))
-        if not SMALLEST_FOCAL <= focal <= LARGEST_PIXELS:
-            found = f"horizontal field of view is {degrees}, which gives a focal length of {focal:.3g} pixels"
-            raise InputError(found, expected=_expected_focal(focal))
-        return Intrinsics.from_focal(focal, width, height)
+        expected = "degrees between 0 and 180 (both excluded)"
+        check_number("horizontal field of view", degrees, Real, 1e-9, math.nextafter(180, 0), expected)
+        check_number("width", width, *SIZE)
+        return Intrinsics.from_focal(focal_length(width, math.radians(degrees)), width, height)
 
     @staticmethod
     def from_opencv(K: Any, distortion: Any = None, size: tuple[int, int] | None = None) -> Intrinsics:
@@ -125,10 +105,8 @@ class Intrinsics:
         centre at (0, 0), ours at (0.5, 0.5), so half a pixel is added to the principal point. Raises
         ``InputError`` if they do not describe a camera.
         """
-        matrix, lens = (
-            _numbers("K", K),
-            () if distortion is None else _numbers("distortion", distortion).ravel(),
-        )
+        matrix = _numbers("K", K)
+        lens = () if distortion is None else _numbers("distortion", distortion).ravel().tolist()
         if matrix.size != 9:
             raise InputError(f"K has shape {matrix.shape}", expected="the 3 x 3 matrix of a camera")
         (fx, skew, cx), (zero, fy, cy), last = matrix.reshape(3, 3).tolist()
@@ -139,9 +117,10 @@ class Intrinsics:
             )
         if size is None or len(size) != 2:
             raise InputError(f"size is {size!r:.60}", expected="(width, height) of the image in pixels")
-        width, height = (_whole(name, value) for name, value in zip(("width", "height"), size, strict=True))
+        width, height = (int(side) if side.is_integer() else side for side in _numbers("size", size).tolist())
+        camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height, tuple(lens) if any(lens) else ())
         question_focal(fx, width, height)
-        return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height, tuple(lens) if any(lens) else ())
+        return camera
 
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
@@ -253,6 +232,33 @@ class Intrinsics:
         return constant(rows, points).reshape(3, 3), constant(tuple(self.distortion), points)
 
 
+@dataclass(frozen=True, eq=False)
+class CameraBatch:
+    """The intrinsics of several cameras as tensors."""
+
+    matrices: Float[Tensor, "c 3 3"]  # float64, pixels
+    distortion: Float[Tensor, "c d"]  # float64, in OpenCV's order; has no columns if no lens is distorted
+
+    @staticmethod
+    def of(cameras: Sequence[Intrinsics]) -> CameraBatch:
+        """Build a batch from ``cameras``; shorter coefficient lists are padded with zeros."""
+        longest = max((len(camera.distortion) for camera in cameras), default=0)
+        rows = [[*camera.distortion, *[0.0] * (longest - len(camera.distortion))] for camera in cameras]
+        return CameraBatch(
+            torch.stack([camera.matrix() for camera in cameras]), torch.tensor(rows, dtype=torch.float64)
+        )
+
+    def unproject(self, pixels: Float[Tensor, "p 2"], camera: Int[Tensor, "p"]) -> Float[Tensor, "p 3"]:
+        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); ``camera`` is the index of
+        each pixel's camera.
+        """
+        matrix, exact = self.matrices[camera], pixels.double()
+        if self.distortion.shape[1]:
+            exact = undistort_points(exact[:, None], matrix, self.distortion[camera], num_iters=20)[:, 0]
+        focal, middle = matrix.diagonal(dim1=1, dim2=2)[:, :2], matrix[:, :2, 2]
+        return torch.cat([(exact - middle) / focal, torch.ones_like(exact[:, :1])], dim=-1).to(pixels.dtype)
+
+
 def question_focal(focal: float, width: int, height: int) -> None:
     """Raise ``InputError`` for a focal length that cannot be in pixels because no lens has such a wide view."""
     if MILLIMETRE <= focal < SHORTEST_FOCAL * max(width, height) and max(width, height) >= PHOTO:
@@ -273,30 +279,10 @@ def _numbers(name: str, given: Any) -> np.ndarray:
     return array
 
 
-def _whole(name: str, value: Any) -> int:
-    _require(name, value, Real, "a whole number of pixels")
-    if value != int(value):
-        raise InputError(f"{name} is {value!r:.60}", expected="a whole number of pixels")
-    return int(value)
-
-
-def _require(name: str, value: object, kind: type, expected: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, kind):
-        raise InputError(f"{name} is {value!r:.60}", expected=expected)
-
-
-def _expected_focal(value: float) -> str:
-    if value > LARGEST_PIXELS:
-        return f"at most {LARGEST_PIXELS:g} pixels"
-    if 0 < value < SMALLEST_FOCAL:
-        return f"at least {SMALLEST_FOCAL:g} pixels"
-    return "a positive number of pixels"
-
-
-def _require_size(name: str, value: object) -> None:
-    _require(name, value, Integral, "a whole number of pixels")
-    if not 1 <= int(value) <= LARGEST_SIZE:  # type: ignore[call-overload]
-        raise InputError(f"{name} is {value!r:.30}", expected=f"1 to {LARGEST_SIZE} pixels")
+def check_number(what: str, value: Any, kind: type, least: float, most: float, expected: str) -> None:
+    """Raise ``InputError`` for anything but a number of that kind within the limits."""
+    if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:  # type: ignore[operator]
+        raise InputError(f"{what} is {value!r:.60}", expected=expected)
 
 
 P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13
@@ -338,11 +324,12 @@ def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[Came
     """
     size = (width, height)
     same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
-    if same:
-        return (same,)
-    turned = [c.quarter_turns() for c in cameras if same_aspect((c.height, c.width), size)]
-    sides = zip(*filter(None, turned), strict=True)
-    return tuple(tuple(camera.resized(*size) for camera in side) for side in sides)
+    turned = tuple(c for c in cameras if same_aspect((c.height, c.width), size))
+    return (
+        (same,)
+        if same
+        else tuple(tuple(c.resized(*size) for c in group) for group in _oriented(turned, *size))
+    )
 
 
 @lru_cache(maxsize=64)

@@ -1,9 +1,8 @@
-"""Lenses that no pinhole camera with polynomial distortion describes. Their images are resampled to pinhole
-cameras on reading.
+"""COLMAP's camera models (https://colmap.github.io/cameras.html), whose pixel centres are at +0.5, like ours.
 
-Fisheye and division lenses become one pinhole camera each, panoramas (equirectangular images) six, see
-``PANORAMA_FACES``. The models are COLMAP's (https://colmap.github.io/cameras.html), whose four-coefficient
-fisheye model is OpenCV's (Kannala and Brandt 2006). Pixel centres are at +0.5.
+Perspective ones are ``Intrinsics``. Images of the others are resampled to pinhole cameras on reading: fisheye and
+division lenses become one pinhole camera each, panoramas (equirectangular images) six, see ``PANORAMA_FACES``. The
+four-coefficient fisheye model is OpenCV's (Kannala and Brandt 2006).
 """
 
 from __future__ import annotations
@@ -17,41 +16,40 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from bidnerf_core.camera.intrinsics import LARGEST_COEFFICIENT, Intrinsics, same_aspect
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
+from bidnerf_core.camera.exif import UPRIGHT, Orientation
+from bidnerf_core.camera.intrinsics import COEFFICIENT, Intrinsics, check_number, same_aspect
 from bidnerf_core.errors import InputError
 
 WIDEST = math.radians(60)
 """Largest angle between the optical axis and the middle of a side of an undistorted image: beyond it, pixels
 are stretched."""
-FISHEYE, DIVISION, PANORAMA = "OPENCV_FISHEYE", "DIVISION", "EQUIRECTANGULAR"
-LENS_MODELS: dict[str, tuple[str, tuple[int, ...]]] = {
-    # Our model name, and the indices of fx, fy, cx, cy and its coefficients among the parameters; -1 stands
-    # for a coefficient of 0.
-    "OPENCV_FISHEYE": (FISHEYE, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "SIMPLE_RADIAL_FISHEYE": (FISHEYE, (0, 0, 1, 2, 3, -1, -1, -1)),
-    "RADIAL_FISHEYE": (FISHEYE, (0, 0, 1, 2, 3, 4, -1, -1)),
-    "SIMPLE_FISHEYE": (FISHEYE, (0, 0, 1, 2, -1, -1, -1, -1)),
-    "FISHEYE": (FISHEYE, (0, 1, 2, 3, -1, -1, -1, -1)),
-    "SIMPLE_DIVISION": (DIVISION, (0, 0, 1, 2, 3)),
-    "DIVISION": (DIVISION, (0, 1, 2, 3, 4)),
+PERSPECTIVE, FISHEYE, DIVISION, PANORAMA = "PERSPECTIVE", "OPENCV_FISHEYE", "DIVISION", "EQUIRECTANGULAR"
+MODELS: dict[str, tuple[int, str, tuple[int, ...]]] = {
+    # The id in ``cameras.bin``, our kind of model, and the indices of fx, fy, cx, cy and the coefficients (in OpenCV's
+    # order) among the parameters; -1 means a coefficient of 0.
+    "SIMPLE_PINHOLE": (0, PERSPECTIVE, (0, 0, 1, 2)),
+    "PINHOLE": (1, PERSPECTIVE, (0, 1, 2, 3)),
+    "SIMPLE_RADIAL": (2, PERSPECTIVE, (0, 0, 1, 2, 3, -1, -1, -1)),
+    "RADIAL": (3, PERSPECTIVE, (0, 0, 1, 2, 3, 4, -1, -1)),
+    "OPENCV": (4, PERSPECTIVE, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "FULL_OPENCV": (6, PERSPECTIVE, (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)),
+    "OPENCV_FISHEYE": (5, FISHEYE, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "SIMPLE_RADIAL_FISHEYE": (8, FISHEYE, (0, 0, 1, 2, 3, -1, -1, -1)),
+    "RADIAL_FISHEYE": (9, FISHEYE, (0, 0, 1, 2, 3, 4, -1, -1)),
+    "SIMPLE_FISHEYE": (14, FISHEYE, (0, 0, 1, 2, -1, -1, -1, -1)),
+    "FISHEYE": (15, FISHEYE, (0, 1, 2, 3, -1, -1, -1, -1)),
+    "SIMPLE_DIVISION": (12, DIVISION, (0, 0, 1, 2, 3)),
+    "DIVISION": (13, DIVISION, (0, 1, 2, 3, 4)),
+    PANORAMA: (17, PANORAMA, (0, 1)),
 }
-"""COLMAP's models of such lenses."""
-LENS_MODEL_IDS = {
-    5: "OPENCV_FISHEYE",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-    12: "SIMPLE_DIVISION",
-    13: "DIVISION",
-    14: "SIMPLE_FISHEYE",
-    15: "FISHEYE",
-    17: "EQUIRECTANGULAR",
-}
-"""The ids of these models in ``cameras.bin``."""
-
-
+"""COLMAP's models by name; a panorama has its size as parameters."""
+MODEL_IDS = {number: name for name, (number, _, _) in MODELS.items()}
+"""The names of the models by their ids."""
+MOST_TERMS = 8
+"""Number of distortion coefficients in COLMAP's largest perspective model, in OpenCV's order."""
 PANORAMA_FACES = {  # name: yaw to the right and pitch upwards, degrees
     "front": (0, 0), "right": (90, 0), "back": (180, 0), "left": (270, 0), "up": (0, 90), "down": (0, -90),
 }  # fmt: skip
@@ -66,19 +64,18 @@ class Lens(ABC):
     ``orientation`` turns upright.
     """
 
-    stored_width: int
-    stored_height: int
+    stored_size: tuple[int, int]  # width and height of the stored image in pixels
     orientation: Orientation
 
     @property
     def width(self) -> int:
         """Width of the upright image in pixels."""
-        return self.orientation.upright_size(self.stored_width, self.stored_height)[0]
+        return self.orientation.upright_size(*self.stored_size)[0]
 
     @property
     def height(self) -> int:
         """Height of the upright image in pixels."""
-        return self.orientation.upright_size(self.stored_width, self.stored_height)[1]
+        return self.orientation.upright_size(*self.stored_size)[1]
 
     @abstractmethod
     def resized(self, width: int, height: int) -> Lens:
@@ -130,40 +127,29 @@ Camera: TypeAlias = Intrinsics | Lens
 
 @dataclass(frozen=True)
 class CentralLens(Lens):
-    """A fisheye or division lens: focal lengths, principal point and size in pixels of the image as stored."""
+    """A fisheye or division lens."""
 
-    model: str  # FISHEYE or DIVISION
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    stored_width: int
-    stored_height: int
+    model: str  # its name among ``MODELS``
+    stored: Intrinsics  # focal lengths, principal point and size of the image as stored
     coefficients: tuple[float, ...]
-    name: str  # of the model, as in its file
     orientation: Orientation = UPRIGHT
 
     def __post_init__(self) -> None:
-        Intrinsics(
-            self.fx, self.fy, self.cx, self.cy, self.stored_width, self.stored_height
-        )  # checks the numbers
-        if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.coefficients):
-            raise InputError(
-                f"the coefficients of {self.name} are {self.coefficients}", expected="those of a real lens"
-            )
+        for value in self.coefficients:
+            check_number(f"a coefficient of {self.model}", value, *COEFFICIENT)
         if not all(map(math.isfinite, self._angles)):
             raise InputError(
-                f"{self.name} with coefficients {self.coefficients} maps no ray to a side of its image",
+                f"{self.model} with coefficients {self.coefficients} maps no ray to a side of its image",
                 expected="coefficients of a real lens",
             )
 
+    @property
+    def stored_size(self) -> tuple[int, int]:  # type: ignore[override]
+        return self.stored.width, self.stored.height
+
     def resized(self, width: int, height: int) -> CentralLens:
-        stored = self.orientation.upright_size(width, height)  # a transposition is its own inverse
-        x, y = stored[0] / self.stored_width, stored[1] / self.stored_height
-        return replace(
-            self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, stored_width=stored[0],
-            stored_height=stored[1],
-        )  # fmt: skip
+        # A transposition is its own inverse.
+        return replace(self, stored=self.stored.resized(*self.orientation.upright_size(width, height)))
 
     def upright(self, orientation: Orientation) -> CentralLens:
         return replace(self, orientation=orientation)
@@ -174,16 +160,17 @@ class CentralLens(Lens):
         that side, but at most 60 degrees from the axis.
         """
         left, right, top, bottom = (math.tan(min(angle, WIDEST)) for angle in self._angles)
-        width, height = (math.ceil(size) for size in (self.fx * (left + right), self.fy * (top + bottom)))
-        return Intrinsics(self.fx, self.fy, self.fx * left, self.fy * top, width, height)
+        fx, fy = self.stored.fx, self.stored.fy
+        size = math.ceil(fx * (left + right)), math.ceil(fy * (top + bottom))
+        return Intrinsics(fx, fy, fx * left, fy * top, *size)
 
     @property
     def _angles(self) -> tuple[float, ...]:
         """Angles (radians) from the axis to the left, right, top and bottom sides; NaN if no ray meets a
         side.
         """
-        w, h = self.stored_width, self.stored_height
-        sides = (self.cx / self.fx, (w - self.cx) / self.fx, self.cy / self.fy, (h - self.cy) / self.fy)
+        c = self.stored
+        sides = (c.cx / c.fx, (c.width - c.cx) / c.fx, c.cy / c.fy, (c.height - c.cy) / c.fy)
         return tuple(self._angle(radius) for radius in sides)
 
     def _angle(self, radius: float) -> float:
@@ -192,7 +179,7 @@ class CentralLens(Lens):
         """
         if radius <= 0:
             return math.nan
-        if self.model == DIVISION:
+        if MODELS[self.model][1] == DIVISION:
             stretch = 1 + self.coefficients[0] * radius**2
             return math.atan(radius / stretch) if stretch > 0 else WIDEST
         angles = np.linspace(0, math.pi, 2049)
@@ -208,20 +195,23 @@ class CentralLens(Lens):
 
     def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         radius = np.linalg.norm(points, axis=-1)
-        if self.model == DIVISION:  # the smaller root of k r d^2 - d + r = 0, d being the distorted radius
+        if (
+            MODELS[self.model][1] == DIVISION
+        ):  # the smaller root of k r d^2 - d + r = 0, d being the distorted radius
             inside = 1 - 4 * self.coefficients[0] * radius * radius
             ratio = np.where(inside >= 0, 2 / (1 + np.sqrt(np.maximum(inside, 0))), np.nan)
         else:
             ratio = self._fisheye_radius(np.arctan(radius)) / np.maximum(radius, 1e-12)
             ratio = np.where(radius > 1e-9, ratio, 1.0)
-        found: np.ndarray = points * ratio[..., None] * (self.fx, self.fy) + (self.cx, self.cy)
+        c = self.stored
+        found: np.ndarray = points * ratio[..., None] * (c.fx, c.fy) + (c.cx, c.cy)
         return found
 
     @property
     def sentence(self) -> str:
         flat = self.pinhole
         return (
-            f"{self.name} undistorted to a pinhole camera of {flat.width}x{flat.height}, fx {flat.fx:.0f} px"
+            f"{self.model} undistorted to a pinhole camera of {flat.width}x{flat.height}, fx {flat.fx:.0f} px"
         )
 
 
@@ -232,17 +222,16 @@ class PanoramaFace(Lens):
     """
 
     face: str
-    stored_width: int
-    stored_height: int
+    stored_size: tuple[int, int]
     orientation: Orientation = UPRIGHT
 
     def __post_init__(self) -> None:
-        if not same_aspect((self.stored_width, self.stored_height), (2, 1)):
-            size = f"{self.stored_width}x{self.stored_height}"
+        if not same_aspect(self.stored_size, (2, 1)):
+            size = "x".join(map(str, self.stored_size))
             raise InputError(f"an equirectangular image is {size}", expected="twice as many columns as rows")
 
     def resized(self, width: int, height: int) -> PanoramaFace:
-        return replace(self, stored_width=width, stored_height=height)
+        return replace(self, stored_size=(width, height))
 
     def upright(self, orientation: Orientation) -> PanoramaFace:
         if orientation != UPRIGHT:
@@ -252,7 +241,7 @@ class PanoramaFace(Lens):
     @property
     def flat(self) -> Intrinsics:
         """A camera with a 90 degree field of view and the panorama's resolution at the horizon."""
-        focal = self.stored_width / (2 * math.pi)
+        focal = self.stored_size[0] / (2 * math.pi)
         side = max(1, round(2 * focal))
         return Intrinsics(side / 2, side / 2, side / 2, side / 2, side, side)
 
@@ -270,8 +259,9 @@ class PanoramaFace(Lens):
         rays = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ self.rotation.T
         x, y, z = np.moveaxis(rays, -1, 0)
         longitude, latitude = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))  # downwards
-        u, v = longitude / (2 * math.pi) + 0.5, latitude / math.pi + 0.5
-        return np.stack([u * self.stored_width, v * self.stored_height], axis=-1)
+        return (
+            np.stack([longitude / (2 * math.pi) + 0.5, latitude / math.pi + 0.5], axis=-1) * self.stored_size
+        )
 
     def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
         """Resample the face; the left and right edges of the panorama join."""
@@ -299,28 +289,48 @@ def _lookup(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     columns, rows = (np.arange(size) + 0.5 for size in (flat.width, flat.height))
     places = np.stack(np.meshgrid((columns - flat.cx) / flat.fx, (rows - flat.cy) / flat.fy), axis=-1)
     u, v = np.moveaxis(lens.project(places), -1, 0)
-    u = lens.stored_width - u if turn.mirrors_columns else u
-    v = lens.stored_height - v if turn.mirrors_rows else v
-    axes = [axis for axis, flips in ((0, turn.mirrors_rows), (1, turn.mirrors_columns)) if flips]
-    u, v = (np.flip(part, tuple(axes)) if axes else part for part in (u, v))
+    u = lens.stored_size[0] - u if turn.mirrors_columns else u
+    v = lens.stored_size[1] - v if turn.mirrors_rows else v
+    u, v = (turn.upright(torch.from_numpy(np.ascontiguousarray(part))).numpy() for part in (u, v))
     if turn.transposes:
-        u, v = v.T, u.T
+        u, v = v, u
     found = [np.ascontiguousarray(np.nan_to_num(part - 0.5, nan=-9.0), dtype=np.float32) for part in (u, v)]
     return found[0], found[1]
 
 
-def lens_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Lens:
-    """Return a camera of one of ``LENS_MODELS``, or the front face of a panorama.
+def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Camera:
+    """Build a camera from one of ``MODELS``, its size (pixels) and its parameters in COLMAP's order.
 
-    Raises ``InputError``, whose message begins with ``where``.
+    A panorama becomes its front face. Raises ``InputError``, whose message begins with ``where``, if the number of
+    parameters is wrong or a value is invalid.
     """
+    _, kind, places = MODELS[model]
     try:
-        if model == PANORAMA:
-            return PanoramaFace("front", width, height)
-        ours, places = LENS_MODELS[model]
         if len(parameters) != max(places) + 1:
             raise InputError(f"{model} has {len(parameters)} parameters", expected=max(places) + 1)
+        if kind == PANORAMA:
+            return PanoramaFace("front", (width, height))
         fx, fy, cx, cy, *rest = (0.0 if place < 0 else float(parameters[place]) for place in places)
-        return CentralLens(ours, fx, fy, cx, cy, width, height, tuple(rest), model)
+        lens = tuple(rest) if any(rest) else ()
+        flat = Intrinsics(fx, fy, cx, cy, width, height, lens if kind == PERSPECTIVE else ())
+        return flat if kind == PERSPECTIVE else CentralLens(model, flat, tuple(rest))
     except InputError as error:
         raise InputError(error, where=where) from error
+
+
+def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
+    """Return the name and parameters of the simplest COLMAP model that describes a camera.
+
+    Raises ``InputError`` for thin prism distortion or a tilted sensor, which no COLMAP model has.
+    """
+    k = camera.distortion
+    if any(k[MOST_TERMS:]):
+        raise InputError(
+            "a camera with thin prism distortion or a tilted sensor",
+            expected="one that a COLMAP model describes",
+        )
+    model, count = (
+        ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", MOST_TERMS)
+    )
+    lens = [*k, *[0.0] * MOST_TERMS][:count]
+    return model, [camera.fx, camera.fy, camera.cx, camera.cy, *lens]

@@ -8,7 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from bidnerf_core.camera.exif import Exif
+from jaxtyping import Shaped
+from torch import Tensor
+
+from bidnerf_core.camera.exif import UPRIGHT, Exif, Orientation
 from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import (
     Intrinsics,
@@ -19,7 +22,6 @@ from bidnerf_core.camera.intrinsics import (
     same_aspect,
 )
 from bidnerf_core.camera.lenses import Camera, Lens
-from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.errors import InputError
 
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
@@ -30,7 +32,6 @@ CAMERA_FILES = ("camera.json", "cameras.txt")
 """Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 NO_EXIF = Exif()
-MIDDLE = "the principal point is assumed to be the image centre"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
 WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, focal=, hfov=, or assumed= with a map's cameras)"
 
@@ -97,6 +98,22 @@ class Raster:
             return camera.resized(*self.size).upright(self.orientation)
         return camera.resized(*self.upright_size) if same_aspect(given, self.upright_size) else None
 
+    def turned(
+        self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None
+    ) -> Shaped[Tensor, "h w"]:
+        """Return a mask or depth of the image, at any resolution, upright: one that fits the stored image is turned with it.
+
+        Raises ``InputError`` about ``what``, at ``where``, for another aspect ratio.
+        """
+        given = image.shape[1], image.shape[0]
+        if same_aspect(given, self.size):
+            return self.orientation.upright(image)
+        if same_aspect(given, self.upright_size):
+            return image
+        size = "x".join(map(str, self.upright_size))
+        found = f"{what} is {given[0]}x{given[1]}, but its image is {size};"
+        raise InputError(found, where=where, expected="the same aspect ratio")
+
 
 @dataclass(frozen=True)
 class CameraSource:
@@ -139,7 +156,11 @@ class CameraSource:
         except InputError as error:
             raise InputError(error, where=where) from error
         if camera is None:
-            return replace(_found_camera(str(where), raster, exif, self.assumed), approximate=True)
+            found = None if exif.has_focal_length else _assumed(raster, self.assumed)
+            # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are
+            # ``assumed`` cameras only where landmarks are matched.
+            found = found or camera_from_exif(str(where), raster, exif, may_be_cropped=bool(self.assumed))
+            return replace(found, approximate=True)
         if isinstance(camera, Intrinsics | Lens):
             return _fitted(str(where), raster, camera, "camera as given")
         if not isinstance(camera, str | Path):
@@ -189,18 +210,10 @@ def folder_camera(
     return CameraSource(found)
 
 
-def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intrinsics]) -> FoundCamera:
-    """Return the camera from EXIF, or one of the ``assumed`` ones."""
-    if exif.has_focal_length and assumed and exif.size and _is_cropped(raster, exif.size):
-        # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are ``assumed``
-        # cameras only where landmarks are matched.
-        return _camera_of_crop(where, raster, exif, exif.size)
-    assumable = None if exif.has_focal_length else _assumed(raster, assumed)
-    return assumable or camera_from_exif(where, raster, exif)
-
-
 def _described(camera: Intrinsics, origin: str) -> FoundCamera:
-    return FoundCamera(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
+    return FoundCamera(
+        camera, f"{origin}: {_focal(camera)} (the principal point is assumed to be the image centre)"
+    )
 
 
 def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCamera:
@@ -221,52 +234,43 @@ def _focal(camera: Intrinsics) -> str:
     return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
 
 
-def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
+def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: bool = False) -> FoundCamera:
     """Return the camera that EXIF describes, accurate to a few percent and assumed to be free of distortion.
 
-    Raises ``InputError`` if there is no focal length, and if the image was cropped after it was taken.
+    An image that was cropped after it was taken, if it may be, is assumed to have kept its resolution unless its size
+    differs greatly; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length, and for
+    any other cropped image.
     """
-    taken = exif.size
-    if taken and _is_cropped(raster, taken):
-        size = f"{raster.width}x{raster.height}"
-        raise InputError(
-            f"image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera:"
-            f" {WAYS_OF_PHOTO}",
-            where=where,
-        )
-    return _by_exif(where, raster, exif, raster.size)
-
-
-def _camera_of_crop(where: str, raster: Raster, exif: Exif, taken: tuple[int, int]) -> FoundCamera:
-    """Return the camera of a photo that had the size ``taken`` when EXIF was written, and was cropped later.
-
-    It is assumed to have kept its resolution unless its size differs greatly; then it is treated as a resized
-    centre crop.
-    """
-    ratio = max(raster.width / taken[0], raster.height / taken[1])
-    fits = raster.width <= taken[0] and raster.height <= taken[1]
-    scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
-    whole = (round(taken[0] * scale), round(taken[1] * scale))
-    found = _by_exif(where, raster, exif, whole)
-    return replace(found, description=f"{found.description}; cropped from a photo of {taken[0]}x{taken[1]}")
-
-
-def _is_cropped(raster: Raster, taken: tuple[int, int]) -> bool:
-    return not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size))
-
-
-def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> FoundCamera:
-    """Return the camera of an image of the size ``whole``, or cropped from one."""
+    taken, whole = exif.size, raster.size  # ``whole`` is the size before the image was cropped
+    part = ""
+    if taken and not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size)):
+        if not may_be_cropped:
+            raise InputError(
+                f"image is {raster.width}x{raster.height}, but was {taken[0]}x{taken[1]} when EXIF was written; give its"
+                f" camera: {WAYS_OF_PHOTO}",
+                where=where,
+            )
+        ratio = max(raster.width / taken[0], raster.height / taken[1])
+        fits = raster.width <= taken[0] and raster.height <= taken[1]
+        scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
+        whole = round(taken[0] * scale), round(taken[1] * scale)
+        part = f"; cropped from a photo of {taken[0]}x{taken[1]}"
     if exif.equivalent_mm is not None:
         focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
-        return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF")
-    if exif.focal_mm is not None and exif.pixels_per_mm is not None:
+        origin = f"{exif.equivalent_mm:g} mm equivalent in EXIF"
+    elif exif.focal_mm is not None and exif.pixels_per_mm is not None:
         # ``pixels_per_mm`` refers to the image as it was taken.
-        scale = max(whole) / max(exif.size) if exif.size else 1.0
+        scale = max(whole) / max(taken) if taken else 1.0
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
-        return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
-    raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
+        origin = f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF"
+    else:
+        raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
+    try:
+        found = _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
+    except InputError as error:
+        raise InputError(f"EXIF: {error}; give its camera: {WAYS}", where=where) from error
+    return replace(found, description=found.description + part)
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
@@ -286,10 +290,3 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | Non
     if not others:
         return FoundCamera(likely, f"{origin}: {_focal(likely)}")
     return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)
-
-
-def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> FoundCamera:
-    try:
-        return _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
-    except InputError as error:
-        raise InputError(f"EXIF: {error}; give its camera: {WAYS}", where=where) from error

@@ -84,7 +84,7 @@ class FreeSpace:
 
 def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
     """Return the planar z (metres) up to which each pixel is free: infinite over background, 0 where nothing is known."""
-    free = torch.zeros(frame.held_rgb.shape[:2])
+    free = torch.zeros(frame.rgb_bytes.shape[:2])
     if frame.depth is not None:
         free = frame.depth.float() * (1 - tolerance)
     if frame.alpha is not None:  # a pixel on an edge covers two depths but has one measurement

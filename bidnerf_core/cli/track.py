@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time as clocks
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -227,7 +226,7 @@ def _follow(
             if isinstance(request, InputError):
                 raise request
             frame = request.read(camera, sensor, tracker.localizer.scene.bounds.background)
-            found = tracker(frame if depth else replace(frame, depth=None), request.time)
+            found = tracker(frame if depth else frame.replace(depth=None), request.time)
             answer = path.add(frame, found, request.time)
             if video is not None:
                 video.add(frame, answer)

@@ -128,7 +128,7 @@ class SparsePoints:
         if view.frame.has_depth or len(points) == 0:
             return view
         depth = nearest_depth(points, view.frame.intrinsics)
-        return View(view.frame.with_images(depth=depth), view.T_ref_camera)
+        return View(view.frame.replace(depth=depth), view.T_ref_camera)
 
     def _measured(self, places: Sequence[tuple[str, SE3]], split: str) -> Unit:
         """Estimate the unit from the training cameras, and again without outliers."""

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera import MODEL_IDS, Camera, colmap_camera, colmap_parameters, read_text_cameras
+from bidnerf_core.camera import MODEL_IDS, MODELS, Camera, colmap_camera, read_text_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import Row, read_file, read_lines
@@ -126,7 +126,7 @@ def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
             where=file.path,
             expected=f"one of {expected}; undistort the images with COLMAP",
         )
-    parameters = file.array(np.dtype("<f8"), colmap_parameters(name)).tolist()
+    parameters = file.array(np.dtype("<f8"), max(MODELS[name][2]) + 1).tolist()
     return int(number), colmap_camera(
         f"{file.path}: camera {number}", name, int(width), int(height), parameters
     )

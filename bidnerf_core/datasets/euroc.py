@@ -87,12 +87,7 @@ def _sensor(file: Path, options: ReadOptions) -> tuple[CameraSource, SE3]:
     """Return the camera, given or calibrated, and its pose in the body frame. Raises ``InputError``."""
     text = read_file(file, "EuRoC's sensor.yaml").decode("utf-8", "replace")
     matrix = torch.tensor(_numbers(file, text, "T_BS", 16), dtype=torch.float64).reshape(4, 4)
-    try:
-        T_body_camera = rigid_pose(matrix[:3])
-    except InputError as error:
-        raise InputError(
-            f"the rotation of T_BS is {error}", where=file, expected="a rigid transform"
-        ) from error
+    T_body_camera = rigid_pose(matrix[:3], file, "the rotation of T_BS")
     if options.camera is not None:
         return CameraSource(options.camera), T_body_camera
     fx, fy, cx, cy = _numbers(file, text, "intrinsics", 4)

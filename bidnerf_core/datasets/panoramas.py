@@ -16,5 +16,5 @@ def faces_of(T_world_panorama: SE3) -> list[tuple[str, SE3]]:
 def panorama_pose(face: str) -> SE3:
     """Return T_panorama_face: the pose of a view in the camera of its panorama (OpenCV axes, float64)."""
     T = torch.eye(4, dtype=torch.float64)
-    T[:3, :3] = torch.from_numpy(PanoramaFace(face, 2, 1).rotation)
+    T[:3, :3] = torch.from_numpy(PanoramaFace(face, (2, 1)).rotation)
     return SE3.from_matrix(T)

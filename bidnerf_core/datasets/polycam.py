@@ -25,13 +25,14 @@ from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import present, remark
 from bidnerf_core.datasets.phone_scans import CENTRE_OF_PIXEL, Measured, SureDepth, scan_frame
 from bidnerf_core.datasets.phone_scans import HIGH_CONFIDENCE as ARKIT_CONFIDENCE
+from bidnerf_core.datasets.pose_rows import pose_of_rows
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.depth import MILLIMETRE, read_depth_image
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame, natural_order
-from bidnerf_core.geometry import SE3, LengthUnit, pose_of_rows
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import Background, Record, decode, is_file, read_compact_image, read_record
 
 BORDER = 15

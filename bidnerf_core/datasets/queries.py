@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -126,7 +126,7 @@ class Photos:
         self._remark(name, f"{frame.camera_source}")
         if self._depth and file not in self._depth:
             log.info("%s: no measured depth was given; colour only", name)
-        views = (View(replace(frame, name=name), SE3.identity()),)
+        views = (View(frame.replace(name=name), SE3.identity()),)
         rays = None if self._points is None else self._points.rays(views, "")
         return Query(name, views, depth_rays=rays, file=file)
 

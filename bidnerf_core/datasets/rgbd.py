@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Camera, Intrinsics, Raster
 from bidnerf_core.depth import DepthCamera, DepthImage
-from bidnerf_core.frames import Frame, Images, fit_depth, pinhole_of
+from bidnerf_core.frames import Frame, fit_depth, pinhole_of
 from bidnerf_core.io import read_compact_image, read_header
 
 
@@ -96,5 +96,4 @@ def read_rgbd(
         else:
             raster = Raster(rgb.shape[1], rgb.shape[0])
             metres = fit_depth(measured, raster, raster.size, f"{depth.path}: depth")
-    hidden = hidden_of(*size)
-    return Frame.taken(name, camera, Images(rgb, metres, alpha, hidden))
+    return Frame.taken(name, camera, rgb, metres, alpha, hidden_of(*size))

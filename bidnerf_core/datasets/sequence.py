@@ -126,8 +126,7 @@ class FileSequence:
             return FileSequence(self._path, self._entries[place])
         entry = self._entries[place]
         frame, truth = entry.read()
-        # Converted to floats at once: a tracker reads the colours of a frame often, and holds few frames.
-        return TimedFrame(entry.time, replace(frame, rgb=frame.rgb), truth, entry.split)
+        return TimedFrame(entry.time, frame, truth, entry.split)
 
 
 def timestamp(stem: str) -> float | None:

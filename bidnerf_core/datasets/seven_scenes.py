@@ -30,6 +30,7 @@ import torch
 from bidnerf_core.camera import CameraSource, Intrinsics, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.incomplete import present
+from bidnerf_core.datasets.pose_rows import read_pose_matrix
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -37,7 +38,7 @@ from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, natural_order
-from bidnerf_core.geometry import SE3, LengthUnit, read_pose_matrix
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import Background, read_rows
 
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)

@@ -244,12 +244,7 @@ def _kitti(path: Path, rows: Sequence[Row], times: Sequence[float] | None) -> Tr
 
 
 def _kitti_pose(row: Row) -> SE3:
-    try:
-        return rigid_pose(torch.tensor(row.numbers(_words(row)), dtype=torch.float64).reshape(3, 4))
-    except InputError as error:
-        if error.where is not None:
-            raise
-        raise InputError(f"the rotation is {error}", where=row.where, expected="a rigid transform") from error
+    return rigid_pose(torch.tensor(row.numbers(_words(row)), dtype=torch.float64).reshape(3, 4), row.where)
 
 
 def read_matrices(path: Path) -> list[SE3]:

@@ -12,10 +12,11 @@ from bidnerf_core.camera import PANORAMA, CameraRecord, camera_record
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.incomplete import remark
 from bidnerf_core.datasets.panoramas import faces_of
+from bidnerf_core.datasets.pose_rows import pose_and_scale
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.geometry import SE3, LengthUnit, pose_and_scale
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 
 SPLITS = ("train", "val", "test")

@@ -18,6 +18,7 @@ import torch
 
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.pose_rows import LARGEST_POSE, read_pose_matrix
 from bidnerf_core.datasets.posed_images import ImageFrame, MetricImageDataset, images_posed
 from bidnerf_core.datasets.reader import OpenQuestion, Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile
@@ -26,7 +27,7 @@ from bidnerf_core.datasets.splits import Splits, hold_out
 from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
-from bidnerf_core.geometry import LARGEST_POSE, SE3, read_pose_matrix
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, read_rows
 
 INFO = ("info.txt", "_info.txt")

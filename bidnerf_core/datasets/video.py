@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 from bidnerf_core.camera import CameraSource, Raster
 from bidnerf_core.datasets.sequence import TimedFrame
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame, Images, as_floats
+from bidnerf_core.frames import Frame
 from bidnerf_core.io import LARGEST_IMAGE, looks_like_image, open_binary, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
@@ -58,10 +58,9 @@ class Video:
             yield TimedFrame(time, self._frame(pixels, number))
 
     def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
-        rgb = as_floats(torch.from_numpy(pixels))  # at once, since a tracker reads them often
         found = self.camera.find(self.path, Raster(pixels.shape[1], pixels.shape[0]))
         return Frame.taken(
-            _name(number), found.camera, Images(rgb), camera_source=found.description,
+            _name(number), found.camera, torch.from_numpy(pixels), camera_source=found.description,
             focal_is_approximate=found.approximate,
         )  # fmt: skip
 

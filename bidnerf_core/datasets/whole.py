@@ -97,7 +97,7 @@ class WholeDataset:
                 if names is not None:
                     raise
                 continue
-            found += [replace(view, frame=replace(view.frame, name=known[place])) for view in views]
+            found += [replace(view, frame=view.frame.replace(name=known[place])) for view in views]
             if progress is not None:
                 progress(done, len(asked))
         return found

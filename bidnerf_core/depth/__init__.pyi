@@ -4,7 +4,6 @@ from .images import DepthImage as DepthImage
 from .images import DepthReader as DepthReader
 from .images import depth_image as depth_image
 from .images import read_depth_image as read_depth_image
-from .noise import depth_steps as depth_steps
 from .noise import estimated_depth_noise as estimated_depth_noise
 from .noise import noise_remark as noise_remark
 from .registration import DepthCamera as DepthCamera

@@ -23,8 +23,6 @@ NOTHING = 1e10
 """Floating-point values from here on mean "nothing", whatever the unit: Blender's 1e10, the largest float."""
 MILLIMETRE = 0.001
 """Metres."""
-INTEGER_UNIT, FLOAT_UNIT = MILLIMETRE, 1.0
-"""Metres per step if the user gives no unit."""
 SPIKE, SPIKE_PIXELS = 0.05, 20
 """Share and number of pixels above which an image's largest value may be the sensor's limit, not a measurement ..."""
 NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
@@ -96,7 +94,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
         found = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
         raise InputError(f"{what} is {found}", expected="one channel of integer or floating-point numbers")
     if unit is None:
-        unit = FLOAT_UNIT if values.dtype.kind == "f" else INTEGER_UNIT
+        unit = 1.0 if values.dtype.kind == "f" else MILLIMETRE
     given: Any = unit
     if not isinstance(given, Real) or not 0 < unit <= FARTHEST:
         raise InputError(
@@ -121,7 +119,7 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
         saturated = values == largest
         far = ~saturated & (metres > FARTHEST)
         return {"negative": values < 0, str(largest): saturated, f"over {FARTHEST:g} m": far}
-    clipped = SATURATED * INTEGER_UNIT
+    clipped = SATURATED * MILLIMETRE
     absent = {
         "NaN": np.isnan(values),
         "infinite": np.isinf(values),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics, Raster, read_camera
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, rigid_of_rows
+from bidnerf_core.geometry import SE3, rigid_pose
 from bidnerf_core.io import read_record, resampled
 
 ENOUGH_REGISTERED = 1000
@@ -37,22 +37,23 @@ class DepthCamera:
         record = read_record(path)
         if record.size("w") is None or record.size("h") is None:
             raise record.error("no w and h", expected="the size of the depth images")
-        rows = record.items(EXTRINSICS)
-        if rows is None:
-            raise record.error(
-                f"no {EXTRINSICS}", expected="the 4x4 pose of the depth camera in the colour camera"
-            )
+        rows = record.matrix(EXTRINSICS, record.items(EXTRINSICS))
         camera = read_camera(path, (0, 0))
         if not isinstance(camera, Intrinsics):
             raise record.error(
                 "describes a lens that is not perspective", expected="the intrinsics of the depth camera"
             )
-        return DepthCamera(camera, rigid_of_rows(record, EXTRINSICS, rows))
+        T = rigid_pose(torch.tensor(rows, dtype=torch.float64), path, f"the rotation of {EXTRINSICS}")
+        return DepthCamera(camera, T)
 
     def registered(
         self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str
     ) -> Float[Tensor, "h w"]:
         """Register depth to the colour camera (planar z, metres); error messages begin with ``file``.
+
+        Each measurement is transformed to the colour camera's frame and written to the pixel into which it
+        projects. If several fall into one pixel, the nearest is kept, which removes what is occluded from the
+        colour camera. The result is 0 where none falls.
 
         Depth of a lower resolution than the colour image is registered at its own resolution and then
         resampled, since its points would otherwise be too far apart to occlude each other. Raises
@@ -67,8 +68,11 @@ class DepthCamera:
                 f"depth is {width}x{height}", where=file, expected=f"the aspect ratio of its camera, {given}"
             )
         coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
-        found = register_depth(depth, camera, coarse, self.T_colour_depth)
-        if int((depth > 0).sum()) >= ENOUGH_REGISTERED and not bool((found > 0).any()):
+        measured = depth > 0
+        rays = camera.unproject(camera.pixel_centres(torch.float64)[measured])
+        points = self.T_colour_depth.apply(rays * depth[measured].double()[:, None])
+        found = nearest_depth(points[_ahead(points, coarse)], coarse)
+        if int(measured.sum()) >= ENOUGH_REGISTERED and not bool((found > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
             raise InputError(
                 f"no measurement falls into the colour image; {EXTRINSICS} puts the depth camera {away:.3g}"
@@ -77,21 +81,6 @@ class DepthCamera:
                 expected="metres and OpenCV axes",
             )
         return found if coarse == colour else resampled(found, colour.width, colour.height)
-
-
-def register_depth(
-    depth: Float[Tensor, "dh dw"], depth_camera: Intrinsics, colour_camera: Intrinsics, T_colour_depth: SE3
-) -> Float[Tensor, "h w"]:
-    """Register depth to the colour camera: planar z (metres), 0 where no measurement falls.
-
-    Each measurement is transformed to the colour camera's frame and written to the pixel into which it
-    projects. If several fall into one pixel, the nearest is kept, which removes what is occluded from the
-    colour camera.
-    """
-    measured = depth > 0
-    rays = depth_camera.unproject(depth_camera.pixel_centres(torch.float64)[measured])
-    points = T_colour_depth.apply(rays * depth[measured].double()[:, None])
-    return nearest_depth(points[_ahead(points, colour_camera)], colour_camera)
 
 
 def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Tensor, "h w"]:

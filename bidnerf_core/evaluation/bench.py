@@ -13,6 +13,7 @@ from typing import Any
 
 from bidnerf_core.datasets import Dataset, in_other_split, wholly_hidden
 from bidnerf_core.errors import InputError, InputWarning, amount
+from bidnerf_core.evaluation.arcs import arc
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -29,7 +30,6 @@ from bidnerf_core.evaluation.trials import (
     trial_views,
 )
 from bidnerf_core.frames import INVERTED, HiddenColour
-from bidnerf_core.geometry import arc
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import RENAMED, find_method, require_use_of_depth
 from bidnerf_core.progress import Cancel, Progress, ProgressCallback

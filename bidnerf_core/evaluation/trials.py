@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -100,7 +100,7 @@ def trial_views(trial: Trial, dataset: Dataset) -> list[View]:
     views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
     if trial.depth:
         return views
-    return [View(replace(view.frame, depth=None), view.T_ref_camera) for view in views]
+    return [View(view.frame.replace(depth=None), view.T_ref_camera) for view in views]
 
 
 def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:

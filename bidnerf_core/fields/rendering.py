@@ -1,7 +1,8 @@
-"""Volume rendering (Mildenhall et al. 2020, eq. 3; BID-NeRF, eq. 3)."""
+"""Rays that were measured, and their volume rendering (Mildenhall et al. 2020, eq. 3; BID-NeRF, eq. 3)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,7 @@ from torch.nn.functional import interpolate, max_pool2d
 
 from bidnerf_core.camera import Intrinsics, exposure_times, poses_of_rows
 from bidnerf_core.devices import constant, may_wait
+from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import (
     FieldValues,
     HitField,
@@ -26,6 +28,128 @@ from bidnerf_core.progress import check_stopped
 
 PICTURE_CONTRAST = 0.12
 """Difference of neighbours (of colours and opacity; of distances, as a share) beyond which pictures are rendered pixel by pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Half-lines in a reference frame with the colours and distances that sensors measured along them.
+
+    They are the pixels of an RGB-D image, the returns of a lidar or the points of structure from motion.
+    """
+
+    origins: Float[Tensor, "*p 3"]  # metres, reference frame
+    directions: Float[Tensor, "*p 3"]  # unit, reference frame
+    rgb: Float[Tensor, "*p 3"]  # in [0, 1]; 0 where not coloured
+    distance: Float[Tensor, "*p"]  # metres along the ray, not z; 0 where nothing was measured
+    coloured: Bool[Tensor, "*p"]  # whether a colour was measured
+
+    @staticmethod
+    def from_points(points: Float[Tensor, "n 3"], T_ref_sensor: SE3) -> Observations:
+        """Return rays to ``points`` (metres), as measured by a sensor at the origin of their frame; float64.
+
+        Points that are not finite or lie at the origin are a lidar's missing returns and are left out. Raises
+        ``InputError`` if none is left.
+        """
+        points = points.to(torch.float64)
+        distance = torch.linalg.vector_norm(points, dim=-1)
+        measured = distance.isfinite() & (distance > 0)
+        T = T_ref_sensor.to(points)
+        directions = T.rotate(points[measured] / distance[measured][:, None])
+        return Observations.of_depth(T.translation.expand_as(directions), directions, distance[measured])
+
+    @staticmethod
+    def of_depth(
+        origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]
+    ) -> Observations:
+        """Return rays along which only a distance (metres, > 0) was measured. Raises ``InputError`` if there are none."""
+        if len(distance) == 0:
+            raise InputError(
+                "nothing was measured", where="depth rays", expected="at least one finite point in front"
+            )
+        coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
+        return Observations(origins, directions, torch.zeros_like(directions), distance, coloured)
+
+    @staticmethod
+    def joined(parts: Sequence[Observations]) -> Observations:
+        """Concatenate the rays of ``parts``, which share a reference frame, along the first axis."""
+        return _together(parts, torch.cat)
+
+    @staticmethod
+    def stacked(parts: Sequence[Observations]) -> Observations:
+        """Stack parts with equal numbers of rays along a new first axis."""
+        return _together(parts, torch.stack)
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+    def __getitem__(self, index: Tensor | slice | None) -> Observations:
+        """Return some of the rays, by index along the first axis or by a mask; None adds an axis of length 1."""
+        return self._changed(lambda part: part[index])
+
+    @property
+    def measured(self) -> Bool[Tensor, "*p"]:
+        """The mask of the rays along which a distance was measured."""
+        return self.distance > 0
+
+    @property
+    def points(self) -> Float[Tensor, "*p 3"]:
+        """The measured points (metres, reference frame); the ray's origin where no distance was measured."""
+        return self.origins + self.distance[..., None] * self.directions
+
+    def without_colour(self) -> Observations:
+        """Return the rays along which a distance was measured, without colours. Raises ``InputError`` if there are none."""
+        measured = self[self.measured]
+        return Observations.of_depth(measured.origins, measured.directions, measured.distance)
+
+    def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
+        """Return m rays from each row of rays of shape (k p), at ``index`` along the second axis."""
+        return self._changed(
+            lambda part: part.take_along_dim(index.reshape(*index.shape, *(1,) * (part.ndim - 2)), 1)
+        )
+
+    def flattened(self) -> Observations:
+        """Return these rays flattened to one axis."""
+        return self._changed(lambda part: part.reshape(-1, *part.shape[self.distance.ndim :]))
+
+    def repeated(self, times: int) -> Observations:
+        """Repeat rays of shape (n) ``times`` times in sequence, for as many poses."""
+        return self._changed(lambda part: part.expand(times, *part.shape).flatten(0, 1))
+
+    def drawn(
+        self,
+        count: int,
+        generator: Generator,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> Observations:
+        """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more than that."""
+        if count >= len(self):
+            return self.to(device, dtype)
+        index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
+        return self[index.to(self.distance.device)].to(device, dtype)
+
+    def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
+        """Return a copy on another device and in another floating-point type."""
+        return self._changed(lambda part: part.to(device, dtype if part.is_floating_point() else part.dtype))
+
+    def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
+        """Return the rays in the world, clipped to the scene's bounds; differentiable with respect to the transform.
+
+        A batch of transforms (h) gives rays of shape (h *p).
+        """
+        T = T_world_ref.to(self.origins)
+        if T.translation.ndim > 1:
+            ones = (1,) * self.distance.ndim
+            batch = T.translation.shape[:-1]
+            T = SE3(T.rotation.reshape(*batch, *ones, 3, 3), T.translation.reshape(*batch, *ones, 3))
+        return bounds.rays(T.apply(self.origins), T.rotate(self.directions))
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> Observations:
+        return Observations(*(change(part) for part in vars(self).values()))
+
+
+def _together(parts: Sequence[Observations], join: Callable[[tuple[Tensor, ...]], Tensor]) -> Observations:
+    return Observations(*map(join, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,48 +181,21 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
     """
     valid = samples.valid
     if not may_wait(valid.device) or bool(valid.all()):
-        return _query_all(field, rays, samples)
-    found = _query_valid(field, rays, samples)
-    rgb = found.values.rgb.new_zeros((valid.numel(), 3)).index_copy(0, found.index, found.values.rgb)
-    return FieldValues(_padded(found.values.density, found.index, valid), rgb.reshape(*valid.shape, 3))
-
-
-@dataclass(frozen=True, eq=False)
-class _ValidSamples:
-    """The valid samples of all rays, ray by ray, and the field's values there."""
-
-    index: Int[Tensor, "n"]  # index of each among all samples
-    ray: Int[Tensor, "n"]  # index of each sample's ray
-    values: FieldValues
-
-
-def _query_all(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
-    """Return the values at all samples, either because all are valid or because the host must not wait to count them."""
-    positions = rays.at(samples.middles)
-    directions = rays.directions[..., None, :].expand_as(positions)
-    if may_wait(samples.valid.device):
-        return field.query(positions, directions)
-    found = field.query(torch.where(samples.valid[..., None], positions, 0), directions)
-    return FieldValues(torch.where(samples.valid, found.density, 0), found.rgb)
-
-
-def _query_valid(field: RadianceField, rays: Rays, samples: RaySamples) -> _ValidSamples:
-    count = samples.valid.shape[-1]
-    ray, slot = samples.valid.reshape(-1, count).nonzero(as_tuple=True)
-    index = ray * count + slot
+        positions = rays.at(samples.middles)
+        directions = rays.directions[..., None, :].expand_as(positions)
+        found = field.query(torch.where(valid[..., None], positions, 0), directions)
+        return FieldValues(torch.where(valid, found.density, 0), found.rgb)
+    index = valid.reshape(-1).nonzero()[:, 0]
+    ray = index // valid.shape[-1]
     # Positions are computed only for these samples: often most of a row is padding.
     origins, directions = (
         part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions)
     )
     middles = samples.middles.reshape(-1).index_select(0, index)
-    return _ValidSamples(index, ray, field.query(origins + middles[:, None] * directions, directions))
-
-
-def _padded(
-    values: Float[Tensor, "n"], index: Int[Tensor, "n"], valid: Bool[Tensor, "*r s"]
-) -> Float[Tensor, "*r s"]:
-    """Return the values of the valid samples in place, and 0 elsewhere."""
-    return values.new_zeros(valid.numel()).index_copy(0, index, values).reshape(valid.shape)
+    found = field.query(origins + middles[:, None] * directions, directions)
+    density = found.density.new_zeros(valid.numel()).index_copy(0, index, found.density)
+    rgb = found.rgb.new_zeros((valid.numel(), 3)).index_copy(0, index, found.rgb)
+    return FieldValues(density.reshape(valid.shape), rgb.reshape(*valid.shape, 3))
 
 
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
@@ -129,8 +226,8 @@ def render_samples(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
 ) -> Rendering:
     """Render rays from given samples, see ``render``."""
-    weights, density, colour = _composed(field, rays, samples)
-    return _over(background, colour, weights, samples, density)
+    values = query_samples(field, rays, samples)
+    return _over(background, values.rgb, rendering_weights(values.density, samples), samples, values.density)
 
 
 def render_hits(
@@ -142,37 +239,18 @@ def render_hits(
     passed = torch.cumprod(1 - hits.alpha, dim=-1)
     before = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], dim=-1)[..., : passed.shape[-1]]
     weights = hits.alpha * before
-    colour = (weights[..., None] * hits.rgb).sum(-2)
-    return _over(background, colour, weights, hits.samples, None)
+    return _over(background, hits.rgb, weights, hits.samples, None)
 
 
 def _over(
-    background: tuple[float, float, float] | Float[Tensor, "*#r 3"], colour: Float[Tensor, "*r 3"],
+    background: tuple[float, float, float] | Float[Tensor, "*#r 3"], colours: Float[Tensor, "*r s 3"],
     weights: Float[Tensor, "*r s"], samples: RaySamples, density: Float[Tensor, "*r s"] | None,
 ) -> Rendering:  # fmt: skip
-    """Return the rendering of rays with these colours in front of ``background``."""
+    """Return the rendering of weighted samples with these colours in front of ``background``."""
     opacity = weights.sum(-1)
     behind = constant(background, weights) if isinstance(background, tuple) else background.to(weights)
-    rgb = colour + (1 - opacity)[..., None] * behind
+    rgb = (weights[..., None] * colours).sum(-2) + (1 - opacity)[..., None] * behind
     return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples, density)
-
-
-def _composed(
-    field: RadianceField, rays: Rays, samples: RaySamples
-) -> tuple[Float[Tensor, "*r s"], Float[Tensor, "*r s"], Float[Tensor, "*r 3"]]:
-    """Return the weights and densities of the samples, and the sum of weight times colour (eq. 3)."""
-    valid = samples.valid
-    # On other devices a sum over the samples of each ray has no fixed order, and would differ from run to run.
-    if valid.device.type != "cpu" or bool(valid.all()):
-        values = query_samples(field, rays, samples)
-        weights = rendering_weights(values.density, samples)
-        return weights, values.density, (weights[..., None] * values.rgb).sum(-2)
-    found = _query_valid(field, rays, samples)
-    density = _padded(found.values.density, found.index, valid)
-    weights = rendering_weights(density, samples)
-    share = weights.reshape(-1).index_select(0, found.index)[:, None] * found.values.rgb
-    colour = share.new_zeros((rays.near.numel(), 3)).index_add(0, found.ray, share)
-    return weights, density, colour.reshape(*valid.shape[:-1], 3)
 
 
 @torch.no_grad()

@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.fields.observations import Observations
-from bidnerf_core.fields.rendering import Rendering
+from bidnerf_core.fields.rendering import Observations, Rendering
 from bidnerf_core.geometry import Robust
 
 
@@ -210,28 +209,26 @@ def depth_term(
     robust: Robust, weight: float, residual: DepthResidual = depth_residual, miss: float | None = None
 ) -> Term:
     """Return the depth term with its weight lambda_d; ``robust`` is in the unit of ``residual``."""
-
-    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        return torch.where(observed.measured, residual(rendering, observed, miss), 0)[..., None]
-
-    return Term(channel, robust, weight, measured)
+    return Term(
+        lambda rendering, observed: torch.where(observed.measured, residual(rendering, observed, miss), 0)[..., None],
+        robust, weight, measured,
+    )  # fmt: skip
 
 
 def free_space_term(robust: Robust, weight: float) -> Term:
     """Return the term for matter that lies in front of the measured distance by more than the scale of
     ``robust`` (metres).
     """
-
-    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        return free_space(rendering, observed.distance, robust.scale)[..., None]
-
-    return Term(channel, robust, weight, measured)
+    return Term(
+        lambda rendering, observed: free_space(rendering, observed.distance, robust.scale)[..., None],
+        robust,
+        weight,
+        measured,
+    )
 
 
 def opacity_term(weight: float) -> Term:
     """Return the term for light that passes where a distance was measured: the scene must be opaque there."""
-
-    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        return (1 - rendering.opacity)[..., None]
-
-    return Term(channel, Robust("l2", 1.0), weight, measured)
+    return Term(
+        lambda rendering, observed: (1 - rendering.opacity)[..., None], Robust("l2", 1.0), weight, measured
+    )

@@ -1,9 +1,9 @@
-"""Samplers: where on each ray a field is queried."""
+"""Samplers: where on each ray a field is queried; and fields that wrap others."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +20,9 @@ from bidnerf_core.fields.contract import (
     RaySampler,
     RaySamples,
     SceneBounds,
+    SplatField,
+    Splats,
+    levels,
 )
 from bidnerf_core.fields.rendering import query_samples, rendering_weights
 from bidnerf_core.fields.voxel_grid import OccupancyMask
@@ -77,14 +80,18 @@ class AroundDepth:
     otherwise: RaySampler
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        measured = self.distance > 0
-        near = torch.maximum(rays.near, self.distance - self.reach)
-        far = torch.minimum(rays.far, self.distance + self.reach)
-        window = replace(rays, near=near, far=torch.maximum(near, far))
+        measured, window = self.distance > 0, _around(rays, self.distance, self.reach)
         rest = replace(
             rays, far=torch.where(measured, rays.near, rays.far)
         )  # empty where a distance was measured
         return either(measured, Stratified(self.count)(window, jitter), self.otherwise(rest, jitter))
+
+
+def _around(rays: Rays, distance: Float[Tensor, "*r"], reach: float) -> Rays:
+    """Limit rays to ``reach`` metres about the measured ``distance``; those without a measurement stay as they are."""
+    near = torch.where(distance > 0, torch.maximum(rays.near, distance - reach), rays.near)
+    far = torch.where(distance > 0, torch.minimum(rays.far, distance + reach), rays.far)
+    return replace(rays, near=near, far=torch.maximum(near, far))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +110,7 @@ class HitsAroundDepth:
         return self.field.query(positions, directions)
 
     def hits(self, rays: Rays) -> RayHits:
-        measured = self.distance > 0
-        near = torch.where(measured, torch.maximum(rays.near, self.distance - self.reach), rays.near)
-        far = torch.where(measured, torch.minimum(rays.far, self.distance + self.reach), rays.far)
-        return self.field.hits(replace(rays, near=near, far=far))
+        return self.field.hits(_around(rays, self.distance, self.reach))
 
 
 @dataclass(frozen=True)
@@ -387,3 +391,79 @@ def _interpolated(
     x0, x1, y0, y1 = (part.gather(-1, index) for part in (x, y) for index in (right - 1, right))
     slope = (y1 - y0) / (x1 - x0).clamp(min=torch.finfo(x.dtype).tiny)
     return torch.minimum(torch.maximum(y0 + (at - x0) * slope, y0), y1)
+
+
+class ScaledField(nn.Module):
+    """A field whose world is ``scale`` times as large as that of the wrapped field; colours stay, and
+    densities are per new length.
+    """
+
+    def __init__(self, field: RadianceField, scale: float) -> None:
+        super().__init__()
+        self.trained: Any = field
+        self.scale = scale
+
+    @property
+    def sampler(self) -> RaySampler:
+        """The sampler of the field, for rays in the scaled world."""
+        return ScaledSampler(self.trained.sampler, self.scale)
+
+    @property
+    def levels(self) -> tuple[RadianceField, ...]:
+        """The levels of detail of the field, coarsest first; the last one is this field."""
+        return (*(scaled_field(level, self.scale) for level in levels(self.trained)[:-1]), self)
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Return density and colour at ``positions`` in the scaled world."""
+        found = self.trained.query(positions / self.scale, directions)
+        return replace(found, density=found.density / self.scale)
+
+
+class ScaledHitField(ScaledField):
+    """A scaled field that computes the hits of whole rays."""
+
+    def hits(self, rays: Rays) -> RayHits:
+        """Return the hits of rays in the scaled world."""
+        trained: HitField = self.trained
+        found = trained.hits(shrunk(rays, self.scale))
+        return replace(found, distance=found.distance * self.scale)
+
+
+class ScaledSplatField(ScaledHitField):
+    """A scaled field that consists of pieces."""
+
+    def splats(self) -> Splats:
+        """Return the pieces in the scaled world."""
+        trained: SplatField = self.trained
+        found = trained.splats()
+        return replace(found, positions=found.positions * self.scale, radius=found.radius * self.scale)
+
+
+def scaled_field(field: RadianceField, scale: float) -> ScaledField:
+    """Return a field in a world that is ``scale`` times as large; it has the same optional parts as ``field``."""
+    if isinstance(field, HitField) and isinstance(field, SplatField):
+        return ScaledSplatField(field, scale)
+    return (ScaledHitField if isinstance(field, HitField) else ScaledField)(field, scale)
+
+
+def shrunk(rays: Rays, scale: float) -> Rays:
+    """Convert rays of a scaled world to the world of the field."""
+    return Rays(rays.origins / scale, rays.directions, rays.near / scale, rays.far / scale)
+
+
+@dataclass(frozen=True)
+class ScaledSampler:
+    """A sampler for rays in a world that is ``scale`` times as large."""
+
+    sampler: RaySampler
+    scale: float
+
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        """Return the samples of rays in the scaled world."""
+        found = self.sampler(shrunk(rays, self.scale), jitter)
+        return replace(found, starts=found.starts * self.scale, ends=found.ends * self.scale)
+
+
+def trained_field(field: RadianceField) -> RadianceField:
+    """Return the field as its backend built it, in the unit of its training; its weights are the ones stored."""
+    return field.trained if isinstance(field, ScaledField) else field

@@ -4,30 +4,68 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from bidnerf_core.camera import UPRIGHT, Camera, CameraSource, Intrinsics, Lens, Orientation, Raster
-from bidnerf_core.depth import DepthCamera, depth_image
+from bidnerf_core.camera import (
+    UPRIGHT,
+    Camera,
+    CameraSource,
+    Intrinsics,
+    Lens,
+    Orientation,
+    Raster,
+    read_exif,
+)
+from bidnerf_core.depth import DepthCamera, depth_image, read_depth_image
+from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.frames.colours import HELD, LAST, Colours, as_bytes
 from bidnerf_core.frames.masks import HiddenColour, WhollyHidden, read_mask
-from bidnerf_core.frames.photos import fit_depth, read_photo
-from bidnerf_core.frames.resampling import Images
+from bidnerf_core.frames.photos import fit_depth, pinhole_of
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Background, background_colour, over, pixel_array, reduced, resampled, split_alpha
+from bidnerf_core.io import (
+    Background,
+    background_colour,
+    over,
+    pixel_array,
+    read_compact_image,
+    read_header,
+    read_image,
+    reduced,
+    resampled,
+    split_alpha,
+)
 
 SPARSE = 0.05
 """Fraction of pixels with depth below which depth counts as sparse: the pixels in between then remain unknown."""
 BLACK = (0.0, 0.0, 0.0)
+FULL_BYTE = 255
+IMAGES = ("rgb", "depth", "alpha", "hidden")
+
+
+def as_floats(colours: Shaped[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Convert bytes to floats in [0, 1]; floats are returned unchanged."""
+    return colours.float().div_(FULL_BYTE) if colours.dtype == torch.uint8 else colours
+
+
+class _Colours:
+    """The attribute ``rgb`` of a frame: it is given as bytes or as floats, stored as bytes and read as floats."""
+
+    def __get__(self, frame: Frame | None, owner: type) -> Float[Tensor, "h w 3"]:
+        if frame is None:
+            raise AttributeError("rgb")  # by which dataclasses learn that the field has no default
+        return as_floats(frame.rgb_bytes)
+
+    def __set__(self, frame: Frame, colours: Shaped[Tensor, "h w channels"]) -> None:
+        frame.__dict__["rgb"] = colours  # rounded once it is known to be an image
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +75,10 @@ class Frame:
     name: str
     # rgb is in [0, 1], already composited over the background if there was an alpha channel; alpha is 1 where
     # the scene covers the pixel and 0 where the background shows. All are dense tensors of the camera's image
-    # size with finite floats, which is checked here. Colours may be given as bytes (uint8): they are stored
-    # as bytes and read as floats.
-    rgb: Float[Tensor, "h w channels"]
-    intrinsics: Intrinsics
+    # size with finite floats, which is checked here. Colours are stored as bytes (uint8), to which floats are
+    # rounded, and converted whenever they are read.
+    rgb: Float[Tensor, "h w channels"] = _Colours()  # type: ignore[assignment]
+    intrinsics: Intrinsics  # type: ignore[misc]
     depth: Float[Tensor, "dh dw"] | None = None
     alpha: Float[Tensor, "ah aw"] | None = None
     camera_source: str | None = None
@@ -67,32 +105,38 @@ class Frame:
     """How the image in its file was turned upright on reading."""
 
     def __post_init__(self) -> None:
+        self._check(IMAGES)
+
+    def _check(self, new: Collection[str]) -> None:
+        """Check that all images fit the camera, and the values of those that are ``new``."""
         where, camera = f"frame {self.name}", self.intrinsics
         if not isinstance(camera, Intrinsics):
             raise InputError(f"intrinsics is a {type(camera).__name__}", where=where, expected="Intrinsics")
-        _require_rays(where, camera)
-        for what, image, channels in (
-            ("rgb", self.held_rgb, 3),
-            ("depth", self.depth, None),
-            ("alpha", self.alpha, None),
-            ("hidden", self.hidden, None),
-        ):
+        if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
+            raise InputError(
+                f"distortion is {camera.distortion}, which maps no ray to some of its pixels;",
+                where=where,
+                expected="coefficients of a real lens",
+            )
+        for what in IMAGES:
+            image = self.__dict__[what]
             if image is not None or what == "rgb":
-                _check_image(where, what, image, camera, channels)
-        if self.depth is not None and not _is_finite(self.depth):
-            object.__setattr__(self, "depth", self.depth.nan_to_num(0.0, 0.0, 0.0))
-        if self.hidden is not None:
-            self._hide(self.hidden)
-
-    def _hide(self, hidden: Bool[Tensor, "h w"]) -> None:
-        where, expected = f"frame {self.name}", "booleans that leave something visible"
-        if hidden.dtype != torch.bool:
-            raise InputError(f"hidden has dtype {hidden.dtype}", where=where, expected=expected)
-        if bool(hidden.all()):
-            raise WhollyHidden("hidden is all true", where=where, expected=expected)
-        if self.depth is not None and bool((self.depth[hidden.to(self.depth.device)] != 0).any()):
-            depth = torch.where(hidden.to(self.depth.device), 0, self.depth)
-            object.__setattr__(self, "depth", depth)
+                _check_image(where, what, image, camera, is_new=what in new)
+        if "rgb" in new and self.rgb_bytes.dtype != torch.uint8:
+            rounded = (self.rgb_bytes * FULL_BYTE).round_().clamp_(0, FULL_BYTE).to(torch.uint8)
+            self.__dict__["rgb"] = rounded
+        if self.depth is not None and "depth" in new and not _is_finite(self.depth):
+            self.__dict__["depth"] = self.depth.nan_to_num(0.0, 0.0, 0.0)
+        if self.hidden is None or not {"depth", "hidden"} & {*new}:
+            return
+        if bool(self.hidden.all()):
+            raise WhollyHidden(
+                "hidden is all true", where=where, expected="booleans that leave something visible"
+            )
+        if self.depth is not None:
+            hidden = self.hidden.to(self.depth.device)
+            if bool((self.depth[hidden] != 0).any()):
+                self.__dict__["depth"] = torch.where(hidden, 0, self.depth)
 
     @staticmethod
     def open(
@@ -150,45 +194,67 @@ class Frame:
         mask_hides: HiddenColour = "black",
     ) -> Frame:
         """Read a photo as ``open`` does; depth is registered to it from ``sensor``, if given."""
-        path = Path(path)
-        photo = read_photo(
-            path,
-            camera,
-            depth=None if depth is None else Path(depth),
-            depth_unit=depth_unit,
-            sensor=sensor,
-            background=background,
-            largest=largest,
-        )
-        if photo.remark is not None:
-            warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=3)
-        found, hidden = photo.camera, None
-        if mask is not None:
-            size = (found.camera.width, found.camera.height)
-            hidden = read_mask(Path(mask), photo.raster, size, mask_hides)
-        images = Images(photo.rgb, photo.depth, photo.alpha, hidden)
+        path, behind = Path(path), background_colour(background)
+        header, exif = read_header(path), read_exif(path)
+        raster = Raster(header.width, header.height, exif.orientation)
+        found = camera.find(path, raster, exif)
+        measured = None if depth is None else read_depth_image(Path(depth), depth_unit)
+        found = found.at_most(largest)
+        size = (found.camera.width, found.camera.height)
+        if size == raster.upright_size:
+            rgb, alpha = read_compact_image(path, behind)
+        else:
+            rgb, alpha = read_image(path, behind, exif.orientation.upright_size(*size))
+        metres = None
+        if measured is not None and depth is not None:
+            if remark := measured.remark(depth_unit is None):
+                warnings.warn(f"{depth}: {remark}", InputWarning, stacklevel=3)
+            metres = (
+                fit_depth(measured, raster, size, f"{depth}: depth")
+                if sensor is None
+                else sensor.registered(measured.metres, pinhole_of(found.camera, Path(depth)), Path(depth))
+            )
         return Frame.taken(
             path.stem,
             found.camera,
-            images,
+            exif.orientation.upright(rgb),
+            metres,
+            None if alpha is None else exif.orientation.upright(alpha),
+            None if mask is None else read_mask(Path(mask), raster, size, mask_hides),
             camera_source=found.description,
             focal_is_approximate=found.approximate,
-            orientation=photo.raster.orientation,
+            orientation=exif.orientation,
         )
 
     @staticmethod
-    def taken(name: str, camera: Camera, images: Images, **about: Any) -> Frame:
-        """Return the frame of upright images taken by ``camera``; those of a ``Lens`` are resampled to its
-        pinhole camera.
+    def taken(
+        name: str,
+        camera: Camera,
+        rgb: Shaped[Tensor, "h w 3"],
+        depth: Float[Tensor, "h w"] | None = None,
+        alpha: Float[Tensor, "h w"] | None = None,
+        hidden: Bool[Tensor, "h w"] | None = None,
+        **about: Any,
+    ) -> Frame:
+        """Return the frame of upright images taken by ``camera``.
 
-        ``about`` holds further attributes of the frame, as for its constructor.
+        Those of a ``Lens`` are resampled to its pinhole camera: colours are interpolated between pixels, depth
+        is that of the nearest one, and pixels that the lens did not see are hidden. ``about`` holds further
+        attributes of the frame, as for its constructor.
         """
         intrinsics = camera
         if isinstance(camera, Lens):
-            intrinsics, images = camera.pinhole, images.as_pinhole(camera)
-            about = {"camera_source": camera.sentence} | about | {"lens": camera}
-        hidden = images.hidden if images.hidden is not None and bool(images.hidden.any()) else None
-        return Frame(name, images.rgb, intrinsics, images.depth, images.alpha, hidden=hidden, **about)  # type: ignore[arg-type]
+            intrinsics, about = camera.pinhole, {"camera_source": camera.sentence} | about | {"lens": camera}
+            unseen = torch.from_numpy(camera.unseen())
+            if hidden is not None:
+                unseen |= torch.from_numpy(camera.resampled(hidden.byte().numpy(), nearest=True)) > 0
+            rgb, hidden = torch.from_numpy(camera.resampled(rgb.numpy())), unseen
+            if depth is not None:
+                depth = torch.from_numpy(camera.resampled(depth.numpy(), nearest=True))
+            if alpha is not None:
+                alpha = torch.from_numpy(camera.resampled(alpha.numpy()))
+        hidden = hidden if hidden is not None and bool(hidden.any()) else None
+        return Frame(name, rgb, intrinsics, depth, alpha, hidden=hidden, **about)  # type: ignore[arg-type]
 
     def with_hidden(self, hidden: Bool[Tensor, "h w"] | None) -> Frame:
         """Return the frame with more pixels hidden; the frame itself if ``hidden`` is None or false
@@ -198,7 +264,7 @@ class Frame:
         """
         if hidden is None or not bool(hidden.any()):
             return self
-        return self.with_images(hidden=hidden if self.hidden is None else hidden | self.hidden)
+        return self.replace(hidden=hidden if self.hidden is None else hidden | self.hidden)
 
     @staticmethod
     def from_numpy(
@@ -241,7 +307,11 @@ class Frame:
                 raise InputError(
                     "rgb has an alpha channel, and alpha is given;", where=where, expected="only one of them"
                 )
-            cover = _mask(alpha, (colour.shape[1], colour.shape[0]), where)
+            values = pixel_array(alpha, f"{where}: alpha")
+            if values.shape != (*colour.shape[:2], 1):
+                found, size = ("x".join(map(str, shape)) for shape in (values.shape, colour.shape[:2]))
+                raise InputError(f"alpha is {found}", where=where, expected=f"{size} as rgb (rows x columns)")
+            cover = values[..., 0]
         raster = Raster(colour.shape[1], colour.shape[0])
         intrinsics = raster.upright(camera)
         if intrinsics is None:
@@ -262,24 +332,22 @@ class Frame:
             unused = None
         return Frame(name, laid, intrinsics, metres, cover, hidden=unused)
 
+    def replace(self, **changes: Any) -> Frame:
+        """Return the frame with other attributes. Images that stay are neither converted nor checked again, as they
+        are by ``dataclasses.replace``.
+        """
+        other = object.__new__(Frame)
+        other.__dict__.update({name: self.__dict__[name] for name in self.__dataclass_fields__})
+        for name, value in changes.items():
+            if name not in self.__dataclass_fields__:
+                raise TypeError(f"a frame has no {name}")
+            object.__setattr__(other, name, value)
+        other._check(changes)
+        return other
+
     def to(self, device: torch.device | str) -> Frame:
         """Return the frame with its images on ``device``; the frame itself if they are already there."""
-        others = (self.depth, self.alpha, self.hidden)
-        depth, alpha, hidden = (None if image is None else image.to(device) for image in others)
-        rgb = self.held_rgb.to(device)
-        if all(a is b for a, b in zip((rgb, depth, alpha, hidden), (self.held_rgb, *others), strict=True)):
-            return self
-        return replace(self, rgb=rgb, depth=depth, alpha=alpha, hidden=hidden)
-
-    @property
-    def held_rgb(self) -> Shaped[Tensor, "h w channels"]:
-        """The colours as stored: bytes from 0 to 255, or floats in [0, 1]."""
-        held: Tensor = self.__dict__[HELD]
-        return held
-
-    def with_images(self, **images: Tensor | None) -> Frame:
-        """Return the frame with other depth, alpha or hidden pixels; colours stored as bytes stay bytes."""
-        return replace(self, rgb=self.held_rgb, **images)  # type: ignore[arg-type]
+        return moved(self, device)
 
     def at_most(self, largest: int) -> Frame:
         """Return the frame downscaled to ``largest`` pixels along its longer side; the frame itself if it is
@@ -293,37 +361,42 @@ class Frame:
             return self
         small = camera.at_most(largest)
         size = (small.width, small.height)
-        rgb = reduced(self.held_rgb.cpu(), *size)
         depth = None if self.depth is None else resampled(self.depth.cpu(), *size)
         alpha = None if self.alpha is None else reduced(self.alpha.cpu().float(), *size)
         hidden = None if self.hidden is None else reduced(self.hidden.cpu().float(), *size) > 0
-        return replace(
-            self, rgb=rgb if rgb.dtype == torch.uint8 else as_bytes(rgb), intrinsics=small, depth=depth,
-            alpha=alpha, hidden=hidden,
-        )  # fmt: skip
+        rgb = reduced(self.rgb_bytes.cpu(), *size)
+        return self.replace(rgb=rgb, intrinsics=small, depth=depth, alpha=alpha, hidden=hidden)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for copying: everything except the weak reference to the colours as floats."""
-        return {name: value for name, value in self.__dict__.items() if name != LAST}
+    @property
+    def rgb_bytes(self) -> Shaped[Tensor, "h w 3"]:
+        """The colours as they are stored, from 0 to 255."""
+        stored: Tensor = self.__dict__["rgb"]
+        return stored
+
+    def colours_at(self, rows: Int[Tensor, "*p"], columns: Int[Tensor, "*p"]) -> Float[Tensor, "*p 3"]:
+        """Return the colours in [0, 1] of some pixels."""
+        there = self.rgb_bytes.device
+        return as_floats(self.rgb_bytes[rows.to(there), columns.to(there)])
+
+    @cached_property
+    def measured_share(self) -> float:
+        """Fraction of the pixels at which depth was measured."""
+        return 0.0 if self.depth is None else float((self.depth > 0).float().mean())
 
     @property
     def has_depth(self) -> bool:
         """Whether any depth was measured."""
-        return self.depth is not None and bool((self.depth > 0).any())
+        return self.measured_share > 0
 
     @property
     def has_dense_depth(self) -> bool:
         """Whether depth was measured at more than a few points."""
-        return self.depth is not None and float((self.depth > 0).float().mean()) >= SPARSE
+        return self.measured_share >= SPARSE
 
 
-Frame.rgb = Colours()  # type: ignore[assignment]
-"""Set after the class was created: in its body, it would be taken for a default value."""
-
-
-def _check_image(where: str, what: str, image: object, camera: Intrinsics, channels: int | None) -> None:
-    """Raise ``InputError`` unless the image is a tensor of the camera's size with finite floats (booleans if
-    ``hidden``).
+def _check_image(where: str, what: str, image: object, camera: Intrinsics, is_new: bool) -> None:
+    """Raise ``InputError`` unless the image is a tensor of the camera's size and, if ``is_new``, has measured, finite
+    floats (bytes also for ``rgb``, booleans for ``hidden``).
     """
     if not isinstance(image, Tensor):
         raise InputError(
@@ -331,24 +404,25 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, chann
             where=where,
             expected="a tensor; Frame.from_numpy takes arrays",
         )
-    found, size = tuple(image.shape), (camera.height, camera.width)
-    if len(found) != (2 if channels is None else 3) or found[2:] != (() if channels is None else (channels,)):
-        expected = "(height, width)" if channels is None else f"(height, width, {channels})"
-        hint = "; Frame.from_numpy takes grey and RGBA" if what == "rgb" else ""
-        raise InputError(f"{what} has shape {found}", where=where, expected=f"{expected}{hint}")
-    if found[:2] != size:
-        raise InputError(
-            f"{what} is {found[1]}x{found[0]}, but its camera expects {size[1]}x{size[0]}", where=where
+    found, wanted = tuple(image.shape), (camera.height, camera.width, *((3,) if what == "rgb" else ()))
+    if len(found) != len(wanted) or found[2:] != wanted[2:]:
+        expected = (
+            "(height, width, 3); Frame.from_numpy takes grey and RGBA" if what == "rgb" else "(height, width)"
         )
+        raise InputError(f"{what} has shape {found}", where=where, expected=expected)
+    if found != wanted:
+        expects = f"{camera.width}x{camera.height}"
+        raise InputError(f"{what} is {found[1]}x{found[0]}, but its camera expects {expects}", where=where)
+    if not is_new:
+        return
     if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
         raise InputError(f"{what} is a sparse tensor or has no values", where=where, expected="a dense one")
-    if what == "hidden" or (what == "rgb" and image.dtype == torch.uint8):
+    if image.dtype == {"rgb": torch.uint8, "hidden": torch.bool}.get(what):
         return
-    if not image.is_floating_point():
-        scale = "bytes or floats in [0, 1]" if what == "rgb" else "floats"
-        raise InputError(
-            f"{what} has dtype {str(image.dtype).removeprefix('torch.')}", where=where, expected=scale
-        )
+    if what == "hidden" or not image.is_floating_point():
+        kinds = {"rgb": "bytes or floats in [0, 1]", "hidden": "booleans that leave something visible"}
+        dtype = str(image.dtype).removeprefix("torch.")
+        raise InputError(f"{what} has dtype {dtype}", where=where, expected=kinds.get(what, "floats"))
     if image.requires_grad:
         raise InputError(
             f"{what} requires a gradient", where=where, expected="measured values; detach() them"
@@ -365,30 +439,11 @@ def _is_finite(image: Tensor) -> bool:
     return image.device.type != "cpu" or math.isfinite(image.sum()) or bool(image.isfinite().all())
 
 
-def _require_rays(where: str, camera: Intrinsics) -> None:
-    if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
-        raise InputError(
-            f"distortion is {camera.distortion}, which maps no ray to some of its pixels;",
-            where=where,
-            expected="coefficients of a real lens",
-        )
-
-
 @lru_cache(maxsize=64)
 def _has_rays(camera: Intrinsics) -> bool:
     """Return whether the corners, the middles of the sides and the centre of the image have rays."""
     u, v = torch.linspace(0, camera.width, 3), torch.linspace(0, camera.height, 3)
     return bool(camera.unproject(torch.cartesian_prod(u.double(), v.double())).isfinite().all())
-
-
-def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Float[Tensor, "h w"]:
-    values = pixel_array(alpha, f"{where}: alpha")
-    if values.shape[2] != 1 or (values.shape[1], values.shape[0]) != size:
-        found = "x".join(map(str, values.shape))
-        raise InputError(
-            f"alpha is {found}", where=where, expected=f"{size[1]}x{size[0]} as rgb (rows x columns)"
-        )
-    return values[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,4 +467,4 @@ class View:
 
     def to(self, device: torch.device | str) -> View:
         """Return the view with its images and its pose on ``device``."""
-        return replace(self, frame=self.frame.to(device), T_ref_camera=self.T_ref_camera.to(device))
+        return moved(self, device)

@@ -6,6 +6,7 @@ ignored and everything brighter is used; segmentation masks often mark the regio
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections import defaultdict
 from collections.abc import Sequence
@@ -24,12 +25,10 @@ from bidnerf_core.io import IMAGE_SUFFIXES, decode, resampled
 HiddenColour = Literal["black", "white"]
 """The colour in masks of the pixels that are ignored."""
 INVERTED = "if it marks what should be used, the masks are inverted (--mask-hides, mask_hides in Python)"
-BRIGHT = 0.5
-"""Fraction of the largest value of the file's type above which a pixel counts as white."""
-MOSTLY = 0.5
-"""Fraction of hidden pixels, in most images, above which masks may be inverted."""
-PREFIXES, SUFFIXES = ("dynamic_mask_", "mask_"), ("_mask", ".mask", "-mask")
-"""Prefixes and suffixes that turn the name of a photo into the name of its mask."""
+HALF = 0.5
+"""Pixels of half the largest value of the file's type are white; masks that hide half of most images may be inverted."""
+AFFIXES = re.compile("^(dynamic_)?mask_|[_.-]mask$")
+"""What turns the name of a photo into the name of its mask."""
 
 
 class WhollyHidden(InputError):
@@ -60,8 +59,7 @@ def read_mask(
 
 def hides_everything(path: Path, hides: HiddenColour = "black") -> bool:
     """Return whether a mask leaves nothing of any image visible. Raises ``InputError`` if the file is not an image."""
-    white = _white(decode(path))
-    return bool(white.all() if hides == "white" else not white.any())
+    return bool((_white(decode(path)) == (hides == "white")).all())
 
 
 def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[Tensor, "h w"]:
@@ -69,20 +67,12 @@ def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[
     given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
     if own != UPRIGHT and same_aspect(own.upright_size(*given), raster.upright_size):
         return own.upright(stored)
-    is_upright = same_aspect(given, raster.upright_size)
-    if same_aspect(given, raster.size):
-        if is_upright and raster.orientation != UPRIGHT:
-            text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
-            warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
-        return raster.orientation.upright(stored)
-    if is_upright:
-        return stored
-    expected = "x".join(map(str, raster.upright_size))
-    raise InputError(
-        f"mask is {given[0]}x{given[1]}, but its image is {expected};",
-        where=path,
-        expected="the same aspect ratio",
-    )
+    if raster.orientation != UPRIGHT and all(
+        same_aspect(given, x) for x in (raster.size, raster.upright_size)
+    ):
+        text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
+        warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
+    return raster.turned(stored, "mask", path)
 
 
 def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
@@ -92,10 +82,8 @@ def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
         colours = alpha
     brightness: np.ndarray = colours.max(-1)
     full = float(np.iinfo(brightness.dtype).max) if brightness.dtype.kind in "ui" else 1.0
-    if float(brightness.max(initial=0)) < BRIGHT * full:
-        found: np.ndarray = brightness > 0
-        return found
-    found = brightness >= BRIGHT * full
+    is_dark = float(brightness.max(initial=0)) < HALF * full
+    found: np.ndarray = brightness > 0 if is_dark else brightness >= HALF * full
     return found
 
 
@@ -122,7 +110,9 @@ class MaskFolder:
             raise InputError("contains no images", where=self.path, expected="masks")
         self._by_name = defaultdict[str, list[Path]](list)
         for file in files:
-            parts = (*file.relative_to(self.path).parts[:-1], photo_of(file.name))
+            photo = PurePath(AFFIXES.sub("", file.stem))
+            stem = photo.stem if photo.suffix.lower() in IMAGE_SUFFIXES else photo.name
+            parts = (*file.relative_to(self.path).parts[:-1], stem)
             for depth in range(1, len(parts) + 1):
                 self._by_name["_".join(parts[-depth:])].append(file)
 
@@ -162,16 +152,6 @@ class MaskFolder:
         return None if file is None else read_mask(file, raster, size, self.hides)
 
 
-def photo_of(mask: str) -> str:
-    """Return the stem of the photo to which the file ``mask`` belongs."""
-    stem = PurePath(mask).stem
-    for prefix in PREFIXES:
-        stem = stem.removeprefix(prefix)
-    for suffix in SUFFIXES:
-        stem = stem.removesuffix(suffix)
-    return PurePath(stem).stem if PurePath(stem).suffix.lower() in IMAGE_SUFFIXES else stem
-
-
 def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
     """Return one sentence on how much of some images is hidden; None if nothing is.
 
@@ -183,6 +163,6 @@ def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
     mean, without = 100 * sum(shares) / len(shares), len(hidden) - len(shares)
     line = f"masks hide {mean:.3g} % of the pixels of {amount(len(shares), 'image')}"
     line += f"; {amount(without, 'image')} without hidden pixels" if without else ""
-    if float(np.median(shares)) > MOSTLY:
+    if float(np.median(shares)) > HALF:
         line += f"; {INVERTED}"
     return line

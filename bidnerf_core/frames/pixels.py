@@ -9,20 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Literal, Protocol, runtime_checkable
-from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Bool, Float, Int
 from kornia.color import rgb_to_grayscale
 from kornia.feature import gftt_response
 from kornia.geometry.subpix import nms2d
-from kornia.morphology import dilation
 from scipy.ndimage import distance_transform_edt
 from torch import Generator, Tensor
+from torch.nn.functional import max_pool2d
 
 from bidnerf_core.camera import exposure_times, poses_of_rows
 from bidnerf_core.fields import Observations
-from bidnerf_core.frames.colours import colours_at
 from bidnerf_core.frames.frame import Frame, View
 
 
@@ -59,7 +57,7 @@ def observe(
     They are on ``device``, by default that of the image. Nothing is copied if the image, the pose and ``pixels`` are there.
     """
     frame = view.frame
-    columns, rows = pixels.to(frame.held_rgb.device).unbind(-1)
+    columns, rows = pixels.unbind(-1)
     ray, length = frame.intrinsics.rays(pixels.double() + 0.5)
     depth = torch.zeros_like(length)
     if frame.depth is not None:
@@ -69,10 +67,11 @@ def observe(
         T = T @ poses_of_rows(exposure_times(pixels.to(ray) + 0.5, frame.intrinsics), view.motion)
     directions = T.rotate(ray)
     origins = T.translation.expand_as(directions)
-    there = frame.held_rgb.device if device is None else device
+    there = frame.rgb_bytes.device if device is None else device
     coloured = torch.full((len(length),), frame.has_colour, device=length.device)
-    rgb = colours_at(frame.held_rgb, rows, columns)
-    return Observations(origins, directions, rgb, depth * length, coloured).to(there, dtype)
+    return Observations(origins, directions, frame.colours_at(rows, columns), depth * length, coloured).to(
+        there, dtype
+    )
 
 
 def draw(
@@ -122,13 +121,13 @@ FAINTEST = 1e-5
 """Minimum corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
 BORDER = 3
 """Width, in pixels, of the margin that the corner detector needs; smaller images have no corners."""
-REACH, ROUNDS = 5, 3
-"""Interest regions are interest points dilated ROUNDS times with a square of REACH by REACH pixels."""
+REACH = 6
+"""Interest regions are the squares that reach this many pixels from an interest point to each side."""
 
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
     """Return corners (column, row) by Shi and Tomasi 1994, "Good features to track"; possibly none."""
-    if min(frame.held_rgb.shape[:2]) <= BORDER:
+    if min(frame.rgb_bytes.shape[:2]) <= BORDER:
         return torch.zeros((0, 2), dtype=torch.long)
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
     response = nms2d(gftt_response(grey), (5, 5))[0, 0]
@@ -139,35 +138,9 @@ def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
 def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
     """Return the interest points of a frame and the pixels around them, row by row."""
     columns, rows = interest_points(frame).unbind(-1)
-    mask = torch.zeros((1, 1, *frame.held_rgb.shape[:2]))
-    mask[0, 0, rows, columns] = 1
-    for _ in range(ROUNDS):
-        mask = dilation(mask, torch.ones(REACH, REACH))
-    return (mask[0, 0] > 0).nonzero().flip(-1)
-
-
-class Among:
-    """Draws uniformly among the pixels that ``choose`` finds in a frame, with replacement.
-
-    Each frame is searched once. If nothing is found, as in the image of a blank wall, pixels are drawn
-    uniformly: they still carry depth, and evidence of where there are no edges.
-    """
-
-    def __init__(self, choose: Callable[[Frame], Tensor]) -> None:
-        self._choose = choose
-        self._found: WeakKeyDictionary[Frame, Tensor] = WeakKeyDictionary()
-
-    def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
-        if frame not in self._found:
-            self._found[frame] = _seen(self._choose(frame), frame).to(generator.device)
-        found = self._found[frame]
-        if len(found) == 0:
-            return uniform(frame, count, generator)
-        return found[torch.randint(len(found), (count,), generator=generator, device=found.device)]
-
-
-among_visible = Among(all_pixels)
-"""Draws among all pixels that are not hidden."""
+    mask = torch.zeros((1, *frame.rgb_bytes.shape[:2]))
+    mask[0, rows, columns] = 1
+    return max_pool2d(mask, 2 * REACH + 1, stride=1, padding=REACH)[0].nonzero().flip(-1)
 
 
 def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
@@ -188,13 +161,30 @@ def continued(frame: Frame) -> Float[Tensor, "h w 3"]:
     return frame.rgb[tuple(nearest)]
 
 
-def _seen(pixels: Int[Tensor, "n 2"], frame: Frame) -> Int[Tensor, "k 2"]:
-    """Return the pixels that are not hidden."""
-    return pixels if frame.hidden is None else pixels[visible_at(frame, pixels)]
+def among(choose: Callable[[Frame], Int[Tensor, "n 2"]]) -> PixelDrawer:
+    """Return a drawer that draws uniformly among the visible pixels that ``choose`` finds in a frame, with replacement.
+
+    They are found once for each frame, with which they are kept. If there are none, as in the image of a blank wall,
+    pixels are drawn uniformly: they still carry depth, and evidence of where there are no edges.
+    """
+
+    def draw(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
+        found: Tensor | None = frame.__dict__.get(choose.__name__)
+        if found is None or found.device != generator.device:
+            found = choose(frame)
+            found = found[visible_at(frame, found)].to(generator.device)
+            frame.__dict__[choose.__name__] = found
+        if len(found) == 0:
+            return uniform(frame, count, generator)
+        return found[torch.randint(len(found), (count,), generator=generator, device=found.device)]
+
+    return draw
 
 
-def drawer(name: DrawerName) -> PixelDrawer:
-    """Return a pixel drawer by name; it caches the interest points of each frame."""
-    if name == "uniform":
-        return uniform
-    return Among(interest_points if name == "interest-points" else interest_regions)
+DRAWERS: dict[DrawerName, PixelDrawer] = {
+    "uniform": uniform,
+    "interest-points": among(interest_points),
+    "interest-regions": among(interest_regions),
+}
+"""The ways to draw pixels, by name."""
+among_visible = among(all_pixels)

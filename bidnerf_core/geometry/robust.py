@@ -24,39 +24,18 @@ RobustName = Literal["huber", "l2", "l1", "cauchy", "geman-mcclure"]
 
 MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
-
-
-def huber(residual: Float[Tensor, "*p"], delta: float) -> Float[Tensor, "*p"]:
-    """Return Huber's rho: ``r^2 / 2`` up to ``delta``, then linear with slope ``delta``."""
-    size = residual.abs()
-    return torch.where(size <= delta, 0.5 * size**2, delta * (size - 0.5 * delta))
-
-
-def l2(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``r^2 / 2``; the scale has no effect."""
-    return 0.5 * residual**2
-
-
-def l1(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``scale |r|``; its derivative at 0 is taken as 0."""
-    return scale * residual.abs()
-
-
-def cauchy(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``c^2 log(1 + (r/c)^2 / 2)``: the influence of a residual decreases as it grows large."""
-    return scale**2 * torch.log1p(0.5 * (residual / scale) ** 2)
-
-
-def geman_mcclure(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return ``2 c^2 r^2 / (r^2 + 4 c^2)``, which is bounded by ``2 c^2``: large residuals have almost no influence."""
-    squared = (residual / scale) ** 2
-    return scale**2 * 2 * squared / (squared + 4)
-
-
 LOSSES: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
-    "huber": huber, "l2": l2, "l1": l1, "cauchy": cauchy, "geman-mcclure": geman_mcclure,
-}  # fmt: skip
-
+    # up to c quadratic, then linear with the slope c
+    "huber": lambda r, c: torch.where(r.abs() <= c, 0.5 * r.abs() ** 2, c * (r.abs() - 0.5 * c)),
+    "l2": lambda r, c: 0.5 * r**2,
+    "l1": lambda r, c: c * r.abs(),  # its derivative at 0 is taken as 0
+    "cauchy": lambda r, c: (
+        c**2 * torch.log1p(0.5 * (r / c) ** 2)
+    ),  # large residuals have less and less influence
+    # bounded by 2 c^2: large residuals have almost none
+    "geman-mcclure": lambda r, c: 2 * c**2 * (r / c) ** 2 / ((r / c) ** 2 + 4),
+}
+"""``rho(r)`` of each loss at a scale c."""
 WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "huber": lambda r, c: c / r.abs().clamp(min=c),
     "l2": lambda r, c: torch.ones_like(r),
@@ -121,3 +100,39 @@ def chi_squared_quantile(probability: float, count: int) -> float:
     )
 
     return 2.0 * float(gammaincinv(count / 2, probability))
+
+
+@dataclass(frozen=True)
+class Independent:
+    """Upper bound on the independent measurements of each kind in one image, however many are sampled.
+
+    The errors of a map, a sensor and a lens are shared by large parts of an image. n measurements whose
+    errors have pairwise correlation r determine a mean as well as ``n / (1 + (n - 1) r)`` independent ones,
+    and never better than 1 / r; the denominator is the design effect (Kish, "Survey Sampling", 1965). The
+    table holds 1 / r.
+    """
+
+    points: float = 10.0  # measured depth against the surface
+    rays: float = 300.0  # rendered against measured colours, alongside landmarks
+    rays_alone: float = 10.0  # likewise, but alone, from a start that may be far off
+    blurred: float = 60.0  # pixels of a small image against a rendering blurred to match
+    # Points of a tracked frame alongside landmarks: hand-held sensors err more than the figure for points
+    # suggests.
+    tracked_points: float = 3.0
+
+
+USUAL = Independent()
+"""The figures used for all maps: those measured on a map's own images are too optimistic, since its field was
+fitted to them."""
+KEYPOINTS_PER_INDEPENDENT = 10.0
+"""Number of keypoints that count as one measurement if a map does not state its own: they are too few to
+approach 1 / r."""
+CORNERS_PER_INDEPENDENT = 4.0
+"""Number of corners tracked between frames that count as one measurement."""
+
+
+def independent(drawn: float, most: float) -> float:
+    """Return the effective number of independent measurements among ``drawn`` ones of a kind limited to
+    ``most``.
+    """
+    return drawn * most / (drawn + most - 1)

@@ -1,8 +1,15 @@
-"""Similarity transforms (rotation, translation and scale) between corresponding points."""
+"""Poses in other frames, units and conventions, and similarity transforms between corresponding points.
+
+Our covariances of poses are those of ``se3``: of a right update ``T exp(xi)`` with xi = (translation, rotation), both in the
+camera's own axes.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -10,6 +17,92 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
+
+LengthUnit = Literal["metres", "units"]
+"""``"units"`` if the length of the poses' unit is unknown, as after structure from motion."""
+CovarianceConvention = Literal["bidnerf", "gtsam", "ros"]
+"""Order and frame of the rows of a covariance.
+
+- ``"bidnerf"``: translation, then rotation, of a right update in the camera's axes (as Sophus has it).
+- ``"gtsam"``: rotation, then translation, of a right update in the camera's axes: the tangent of GTSAM's ``Pose3``.
+- ``"ros"``: ``geometry_msgs/PoseWithCovariance``: x, y, z, then the rotations about the fixed x, y and z axes of the world.
+"""
+RIGID_TO = 5e-3
+"""Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
+FARTHEST_CAMERA = 1e12
+"""Largest coordinate of a camera; squares of larger ones lose all precision."""
+
+
+def symbol(unit: LengthUnit) -> str:
+    """Return the symbol printed after a length: ``"m"`` or ``"units"``."""
+    return "m" if unit == "metres" else "units"
+
+
+def rigid_pose(matrix: Float[Tensor, "3 4"], where: object, what: str = "the rotation") -> SE3:
+    """Return the rigid transform that ``matrix`` represents up to rounding.
+
+    Raises ``InputError``, whose message begins with ``where``, if its rotation, called ``what``, is none.
+    """
+    given = SE3(matrix[:3, :3], matrix[:3, 3])
+    if not given.is_rigid(RIGID_TO):
+        off = (given.rotation.mT @ given.rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
+        fault = f"off orthonormal by {off:.2g}" if not off <= RIGID_TO else "a mirror image"
+        raise InputError(f"{what} is {fault}", where=where, expected="a rigid transform")
+    return given.normalized()
+
+
+def look_at(
+    eye: Sequence[float] | Float[Tensor, "3"],
+    target: Sequence[float] | Float[Tensor, "3"],
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> SE3:
+    """Return ``T_world_camera`` (float64) of a camera at ``eye`` that looks at ``target``, with ``up``
+    pointing upwards.
+    """
+    position = torch.as_tensor(eye, dtype=torch.float64)
+    forward = torch.as_tensor(target, dtype=torch.float64) - position
+    if not torch.linalg.vector_norm(forward) > 0:
+        raise InputError(f"the camera position {position.tolist()} equals its target", where="look_at")
+    forward = torch.nn.functional.normalize(forward, dim=0)
+    right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=torch.float64))
+    if torch.linalg.vector_norm(right) < 1e-6:  # straight up or down: any right will do
+        right = torch.linalg.cross(forward, forward.new_tensor([0.0, 1.0, 0.0]))
+    right = torch.nn.functional.normalize(right, dim=0)
+    return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1), position)
+
+
+def turned_about(
+    T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float
+) -> SE3:
+    """Return the camera's pose after a rotation by ``angle_deg`` about the axis ``up`` through ``middle``
+    (metres, world).
+    """
+    phi = math.radians(angle_deg) * torch.nn.functional.normalize(up, dim=0)
+    turn = SE3.exp(torch.cat([torch.zeros_like(phi), phi]))
+    moved = T_world_camera.translation - middle
+    return SE3(turn.rotation @ T_world_camera.rotation, turn.rotate(moved) + middle)
+
+
+def covariance_in(
+    covariance: Float[Tensor, "6 6"], T_world_camera: SE3, convention: CovarianceConvention
+) -> Float[Tensor, "6 6"]:
+    """Convert one of our covariances at ``T_world_camera`` to another convention (float64).
+
+    A right update by (rho, phi) moves the position by ``R rho`` in the world and premultiplies the rotation
+    by ``exp(R phi)``, to first order, so both blocks are rotated for ROS. Raises ``InputError`` for an
+    unknown convention.
+    """
+    if convention not in get_args(CovarianceConvention):
+        raise InputError(
+            f"convention is {convention!r}", expected=f"one of {', '.join(get_args(CovarianceConvention))}"
+        )
+    found = covariance.detach().cpu().double()
+    if convention == "gtsam":
+        return found.roll((3, 3), (0, 1))
+    if convention == "ros":
+        turn = torch.block_diag(*2 * [T_world_camera.rotation.detach().cpu().double()])
+        return turn @ found @ turn.mT
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +120,6 @@ class Similarity:
 
     def apply(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         return self.T_target_source.apply(self.scale * points)
-
-
-FARTHEST_CAMERA = 1e12
-"""Largest coordinate of a camera; squares of larger ones lose all precision."""
 
 
 def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:

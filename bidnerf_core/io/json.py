@@ -108,6 +108,28 @@ class Record:
             raise self.error(f"{what} is {_short(found)}", expected="a finite number")
         return float(found)
 
+    def homogeneous(self, key: str, rows: list[Any] | None) -> tuple[list[list[float]], float]:
+        """Return the first three of a matrix's 3 or 4 ``rows``, divided by the last entry w of a fourth row 0 0 0 w, and w (1
+        up to rounding). ``key`` is their key, for messages.
+        """
+        if rows is None:
+            raise self.error(f"no {key}", expected="a 4x4 matrix of a pose")
+        if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+            raise self.error(f"{key} is not 3x4 or 4x4", expected="a 4x4 matrix")
+        numbers = [[self.checked_number(x, f"an entry of {key}") for x in row] for row in rows]
+        last = numbers[3] if len(numbers) == 4 else [0.0, 0.0, 0.0, 1.0]
+        if not last[3] > 0 or max(map(abs, last[:3])) > 1e-6 * last[3]:
+            raise self.error(f"the last row of {key} is {last}", expected="[0, 0, 0, 1]")
+        scale = last[3] if abs(last[3] - 1) > 1e-6 else 1.0
+        return [[x / scale for x in row] for row in numbers[:3]], scale
+
+    def matrix(self, key: str, rows: list[Any] | None) -> list[list[float]]:
+        """Return the first three rows of a 3x4 or 4x4 matrix of finite numbers; a fourth row must be 0 0 0 1."""
+        found, scale = self.homogeneous(key, rows)
+        if scale != 1.0:
+            raise self.error(f"the last row of {key} is [0, 0, 0, {scale:g}]", expected="[0, 0, 0, 1]")
+        return found
+
 
 def read_record(path: Path, expected: str = "a JSON object") -> Record:
     """Read the JSON object in the file ``path``. Raises ``InputError``, with line and column if the JSON is malformed."""

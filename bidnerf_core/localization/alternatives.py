@@ -110,7 +110,7 @@ def pose_at(
     """Return the pose by landmarks at a rival of ``found``; None if too few match or the camera is corrected once more."""
     cameras = [view.frame.intrinsics for view in problem.views]
     seen = [
-        replace(view, frame=replace(view.frame, intrinsics=found.intrinsics_of(camera) or camera))
+        replace(view, frame=view.frame.replace(intrinsics=found.intrinsics_of(camera) or camera))
         for view, camera in zip(problem.views, cameras, strict=True)
     ]
     there = confirm(matcher, seen, rival.T_world_rig, rival=found.T_world_camera).pose

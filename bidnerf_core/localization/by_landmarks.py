@@ -122,7 +122,7 @@ def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> L
         return found
     here = at_pose(problem, found)
     views = tuple(
-        replace(view, frame=replace(view.frame, intrinsics=other.intrinsics(given.frame.intrinsics)))
+        replace(view, frame=view.frame.replace(intrinsics=other.intrinsics(given.frame.intrinsics)))
         for view, given in zip(here.views, problem.views, strict=True)
     )
     there = replace(here, views=views, start=found.T_world_camera.retract(posterior.shift(other)))

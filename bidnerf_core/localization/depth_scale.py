@@ -66,7 +66,7 @@ def at_pose(problem: Problem, found: LandmarkPose) -> Problem:
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
         camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
-        frame = replace(view.frame, depth=depth, intrinsics=camera)
+        frame = view.frame.replace(depth=depth, intrinsics=camera)
         views.append(replace(view, frame=frame, motion=found.motion))
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 

@@ -61,8 +61,8 @@ def nearest_piece(problem: Problem) -> Occluder | None:
         return None
     hidden = piece.to(depth.device)
     given = view.frame.hidden
-    frame = replace(
-        view.frame, depth=torch.where(hidden, 0, depth), hidden=hidden if given is None else hidden | given
+    frame = view.frame.replace(
+        depth=torch.where(hidden, 0, depth), hidden=hidden if given is None else hidden | given
     )
     pixels = piece.nonzero()
     some = pixels[torch.linspace(0, len(pixels) - 1, min(len(pixels), SIGHT_LINES)).long()]

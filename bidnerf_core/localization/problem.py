@@ -157,7 +157,7 @@ class Problem:
 
     def without_depth(self) -> Problem:
         """Return the problem without measured depth."""
-        views = tuple(replace(view, frame=replace(view.frame, depth=None)) for view in self.views)
+        views = tuple(replace(view, frame=view.frame.replace(depth=None)) for view in self.views)
         return replace(self, views=views, depth_rays=None)
 
 

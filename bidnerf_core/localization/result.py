@@ -111,7 +111,7 @@ class Localization:
 
     def frame_as_taken(self, frame: Frame) -> Frame:
         """Return the last image's frame with the intrinsics of the pose: the given or the corrected ones."""
-        return frame if self.intrinsics is None else replace(frame, intrinsics=self.intrinsics)
+        return frame if self.intrinsics is None else frame.replace(intrinsics=self.intrinsics)
 
     def plain(self) -> dict[str, Any]:
         """Convert the result to JSON values, with the keys of ``bidnerf localize --json``.

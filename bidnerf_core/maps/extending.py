@@ -155,8 +155,7 @@ def locate(
         elif any(_apart(found.T_world_camera, pose) < near for pose in stored):
             known.append(frame.name)
         else:
-            named = replace(
-                found.frame_as_taken(frame),
+            named = found.frame_as_taken(frame).replace(
                 name=_free(frame.name, {*cameras, *(v.frame.name for v in views)}),
             )
             views.append(View(named, found.T_world_camera))
@@ -363,7 +362,7 @@ def _in_field_unit(view: View, factor: float) -> View:
     pose = SE3(view.T_ref_camera.rotation, view.T_ref_camera.translation * factor)
     frame, seen = view.frame, view.landmarks
     if frame.depth is not None:
-        frame = replace(frame, depth=frame.depth * factor)
+        frame = frame.replace(depth=frame.depth * factor)
     if seen is not None:
         seen = replace(seen, distance=seen.distance * factor, deviation=seen.deviation * factor)
     return replace(view, frame=frame, T_ref_camera=pose, landmarks=seen)

@@ -262,7 +262,7 @@ def localize_each(
             raise InputError(
                 f"{found.method} diverged to a pose that is not finite; is the map valid?", where=query.name
             )
-        frame = replace(query.frame, name=query.name)
+        frame = query.frame.replace(name=query.name)
         return Answer.of(frame, number, found, truth=query.truth, file=query.file)
 
     return answer_each(queries, localize, answers, localizer.method, each, progress, cancel)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +89,7 @@ def place_each(
             )
         placement = maps(query.views[0].frame, seed)
         backend = getattr(getattr(maps.localizer(placement.map).scene, "info", None), "backend", "")
-        frame = replace(query.frame, name=query.name)
+        frame = query.frame.replace(name=query.name)
         return PlacedAnswer.placed(frame, number, placement, backend, query.file)
 
     answers = Placements() if answers is None else answers

@@ -6,7 +6,6 @@ import logging
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -81,7 +80,7 @@ def track(
     count = counter("tracking", "frames", progress, cancel)
     for number, timed in enumerate(_every(sequence, every)):
         if isinstance(timed, TimedFrame):
-            frame = timed.frame if depth else replace(timed.frame, depth=None)
+            frame = timed.frame if depth else timed.frame.replace(depth=None)
             answer = path.add(frame, tracker(frame, timed.time), timed.time, timed.truth, every * number)
             if each is not None:
                 each(timed.frame, answer)

@@ -189,7 +189,7 @@ class FaultContract:
         if not self._fault().needs_depth:
             return
         try:
-            self._fault().change(replace(_frame(), depth=None), self._fault().sizes[0], _generator())
+            self._fault().change(_frame().replace(depth=None), self._fault().sizes[0], _generator())
         except InputError:
             return
         require_that(

@@ -35,13 +35,13 @@ def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
     would see it.
     """
     seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
-    return tuple(v if coverage else replace(v, frame=replace(v.frame, alpha=None)) for v in seen)
+    return tuple(v if coverage else replace(v, frame=v.frame.replace(alpha=None)) for v in seen)
 
 
 @cache
 def rgb_views() -> tuple[View, ...]:
     """Return six views of the toy in front of white, without depth or alpha."""
-    return tuple(replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views(coverage=False))
+    return tuple(replace(v, frame=v.frame.replace(depth=None)) for v in rgbd_views(coverage=False))
 
 
 def exposed_views(log_gain: float) -> tuple[View, ...]:

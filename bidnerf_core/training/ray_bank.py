@@ -58,7 +58,7 @@ class RayBank:
         self.count = int(sizes.sum())
         self.has_alpha = any(frame.alpha is not None for frame in frames)
         self.has_depth = any(frame.has_depth for frame in frames)
-        self._rgb = ImagePixels.of([frame.held_rgb for frame in frames], 3)
+        self._rgb = ImagePixels.of([frame.rgb_bytes for frame in frames], 3)
         self._alpha = ImagePixels.of([frame.alpha for frame in frames], 1, default=1.0)
         self._depth = ImagePixels.of([frame.depth for frame in frames], 1)
         self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1)

@@ -208,7 +208,7 @@ def test_fisheye_calibrations(content: str, tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text(content)
     found = read_camera(tmp_path / "c.yaml", SIZE)
     assert isinstance(found, CentralLens)
-    assert (found.fx, found.cx, found.cy) == (500.0, 311.0, 240.75)
+    assert (found.stored.fx, found.stored.cx, found.stored.cy) == (500.0, 311.0, 240.75)
     assert found.coefficients[:2] == (0.1, -0.2)
 
 

@@ -129,8 +129,9 @@ def test_too_few_images_are_left_alone() -> None:
 def test_nothing_in_common_leaves_the_poses_alone() -> None:
     points = Points()
     views = [points.view(looking_in(0.1 * i)) for i in range(12)]
+    named = torch.tensor([12, 0, 0], dtype=torch.uint8)
     blank = [
-        replace(view, frame=replace(view.frame, rgb=torch.full_like(view.frame.rgb, 12.0))) for view in views
+        replace(view, frame=view.frame.replace(rgb=named.expand_as(view.frame.rgb_bytes))) for view in views
     ]
     points.seen.append(points.seen[0][torch.zeros(0, dtype=torch.long)])
     found = training_poses(tracked_views(blank, points), blank)

@@ -1,4 +1,4 @@
-"""Noise of depth and the steps of its values, estimated from single images, against images whose noise is known."""
+"""Noise of depth, estimated from single images, against images whose noise is known."""
 
 from __future__ import annotations
 
@@ -12,11 +12,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset
-
-# Inside: estimates of noise and steps are compared with the true values, of which users see a remark
-from bidnerf_core.depth import DepthNoise, depth_steps, estimated_depth_noise
-from bidnerf_core.depth.noise import DepthSteps
-from bidnerf_core.depth.sensors import KINECT
+from bidnerf_core.depth import DepthNoise, estimated_depth_noise, find_depth_sensor
 
 CAMERA = Intrinsics.from_hfov(60.0, 320, 240)
 LENS = Intrinsics(280.0, 280.0, 158.0, 121.0, 320, 240, (0.1, -0.05, 0.001, 0.002))
@@ -50,7 +46,7 @@ def test_relative_noise_is_found_on_slanted_walls(
         assert relative(found, z) == pytest.approx(share, rel=0.2)
 
 
-@pytest.mark.parametrize("quadratic", [KINECT.noise.quadratic, 0.005])
+@pytest.mark.parametrize("quadratic", [find_depth_sensor("kinect").noise.quadratic, 0.005])
 def test_noise_that_grows_with_the_square_of_the_distance_is_found(
     quadratic: float, generator: Generator
 ) -> None:
@@ -101,7 +97,6 @@ def test_depth_of_a_lower_resolution_than_its_image_has_the_noise_of_its_own_pix
     resampled = own[rows.long()][:, columns.long()]
     found = estimated_depth_noise(resampled, Intrinsics.from_hfov(60.0, *size))
     assert relative(found, 2.0) == pytest.approx(0.01, rel=0.2)
-    assert depth_steps(resampled) is None
 
 
 def test_images_with_little_depth_give_no_estimate() -> None:
@@ -113,39 +108,6 @@ def test_images_with_little_depth_give_no_estimate() -> None:
     depth = corridor()
     depth[::4] = 0
     assert estimated_depth_noise(depth, CAMERA) is None
-
-
-def test_whole_millimetres_are_constant_steps() -> None:
-    steps = depth_steps((corridor() * 1000).round() / 1000)
-    assert steps is not None
-    assert not steps.of_disparity
-    assert steps.step(1.0) == steps.step(4.0) == pytest.approx(0.001, rel=1e-3)
-
-
-def disparity_sensor(depth: Float[Tensor, "h w"], unit: float) -> Float[Tensor, "h w"]:
-    """Return depth from disparity in eighths of a pixel, with the focal length and the baseline of a Kinect; as stored."""
-    product = 8 * 580 * 0.075
-    return ((product / (product / depth).round()) / unit).round() * unit
-
-
-@pytest.mark.parametrize("unit", [0.001, 1 / 5000])
-def test_whole_disparities_are_steps_that_grow_with_the_square_of_the_distance(unit: float) -> None:
-    steps = depth_steps(disparity_sensor(corridor(), unit))
-    assert steps is not None
-    assert steps.of_disparity
-    assert steps.quadratic == pytest.approx(1 / (8 * 580 * 0.075), rel=0.15)
-
-
-def test_continuous_depth_has_no_steps(generator: Generator) -> None:
-    assert depth_steps(noisy(corridor(), lambda z: 0.01 * z, generator)) is None
-    assert depth_steps(torch.zeros((10, 10))) is None
-    assert depth_steps(torch.full((10, 10), 2.0)) is None
-
-
-def test_the_deviation_of_steps_is_that_of_rounding(generator: Generator) -> None:
-    values = 2 + torch.rand(100_000, generator=generator, dtype=torch.float64)
-    off = (values / 0.01).round() * 0.01 - values
-    assert DepthSteps(0.01, 0.0).deviation(2.5) == pytest.approx(float(off.std()), rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -171,7 +171,7 @@ def test_no_registration_where_there_is_none_to_do(recording: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"T_colour_depth": None}, "no T_colour_depth, expected the 4x4 pose"),
+        ({"T_colour_depth": None}, "no T_colour_depth, expected a 4x4 matrix"),
         ({"T_colour_depth": [[1, 2], [3, 4]]}, "T_colour_depth is not 3x4 or 4x4"),
         ({"T_colour_depth": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "rotation of T_colour_depth is off"),
         ({"w": None}, "no w and h, expected the size"),

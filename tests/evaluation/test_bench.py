@@ -31,11 +31,12 @@ from bidnerf_core.evaluation import (
     run_trials,
 )
 
-# Inside: shards and lines of results, of which a bench shows only the union
+# Inside: shards and lines of results, of which a bench shows only the union; the middle of a sequence
+from bidnerf_core.evaluation.arcs import arc, mean_up, seen_middle
 from bidnerf_core.evaluation.bench import shard_of
 from bidnerf_core.evaluation.json_lines import as_line
 from bidnerf_core.evaluation.workers import InThisProcess
-from bidnerf_core.geometry import arc, mean_up, seen_middle, turned_about
+from bidnerf_core.geometry import turned_about
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import METHODS
 from bidnerf_core.results import pose_error

@@ -71,7 +71,8 @@ def test_zero_residual_at_the_truth() -> None:
     field = GaussianBlobs.random()
     truth = orbit(4.0, 3, seed=1)[0]
     problem = single(field, BOUNDS, photograph(field, truth, depth=False), truth)
-    assert float(loss(problem, truth)) < 1e-12
+    rounded = 3 * 0.5 * (0.5 / 255) ** 2  # the most that rounding three channels to bytes can cost
+    assert float(loss(problem, truth)) < rounded
     assert float(loss(problem, perturb(truth, 0.2, 5.0, seed=0))) > 1e-4
 
 

@@ -9,11 +9,10 @@ import torch
 from scipy.ndimage import binary_dilation
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import DrawerName, Frame, drawer
+from bidnerf_core.frames import DRAWERS, DrawerName, Frame
 
 # Inside: where interest points lie, of which drawn pixels are a random sample
-from bidnerf_core.frames import pixels as interest
-from bidnerf_core.frames.pixels import Among, interest_points, interest_regions
+from bidnerf_core.frames.pixels import among, interest_points, interest_regions
 
 CAMERA = Intrinsics(40.0, 40.0, 32.0, 24.0, 64, 48)
 
@@ -72,21 +71,21 @@ def test_regions_are_the_points_dilated() -> None:
 def test_drawn_pixels_are_among_those_found_and_all_may_be_drawn(name: DrawerName) -> None:
     there = square()
     found = interest_points(there) if name == "interest-points" else interest_regions(there)
-    drawn = drawer(name)(there, 20 * len(found), torch.Generator().manual_seed(0))
+    drawn = DRAWERS[name](there, 20 * len(found), torch.Generator().manual_seed(0))
     assert drawn.shape == (20 * len(found), 2)
     assert {tuple(p) for p in drawn.tolist()} == {tuple(p) for p in found.tolist()}
 
 
 @pytest.mark.parametrize("name", get_args(DrawerName))
 def test_a_blank_wall_is_drawn_from_uniformly(name: DrawerName) -> None:
-    drawn = drawer(name)(blank(), 500, torch.Generator().manual_seed(0))
-    expected = drawer("uniform")(blank(), 500, torch.Generator().manual_seed(0))
+    drawn = DRAWERS[name](blank(), 500, torch.Generator().manual_seed(0))
+    expected = DRAWERS["uniform"](blank(), 500, torch.Generator().manual_seed(0))
     assert torch.equal(drawn, expected)
 
 
 @pytest.mark.parametrize("name", get_args(DrawerName))
 def test_the_generator_decides(name: DrawerName) -> None:
-    draw = drawer(name)
+    draw = DRAWERS[name]
     one, same, other = (draw(square(), 50, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
@@ -97,9 +96,9 @@ def test_a_frame_is_searched_once() -> None:
 
     def choose(f: Frame) -> torch.Tensor:
         searched.append(f)
-        return interest.interest_points(f)
+        return interest_points(f)
 
-    draw, first, second = Among(choose), square(), blank()
+    draw, first, second = among(choose), square(), blank()
     for _ in range(3):
         for f in (first, second):
             draw(f, 4, torch.Generator().manual_seed(0))
@@ -110,6 +109,6 @@ def test_a_tiny_image_is_no_fault() -> None:
     for size in (1, 2, 3):
         tiny = Frame("f", torch.rand(size, size, 3), Intrinsics(4.0, 4.0, 0.5, 0.5, size, size))
         for name in get_args(DrawerName):
-            drawn = drawer(name)(tiny, 7, torch.Generator().manual_seed(0))
+            drawn = DRAWERS[name](tiny, 7, torch.Generator().manual_seed(0))
             assert drawn.shape == (7, 2)
             assert bool(((drawn >= 0) & (drawn < size)).all())

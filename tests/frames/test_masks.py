@@ -22,7 +22,7 @@ from bidnerf_core.captures.photos import photo_measures
 from bidnerf_core.carving import FreeSpace
 from bidnerf_core.datasets import wholly_hidden, with_all
 from bidnerf_core.fields import RenderedImage
-from bidnerf_core.frames import DrawerName, MaskFolder, WhollyHidden, drawer, masks_sentence, read_mask
+from bidnerf_core.frames import DRAWERS, DrawerName, MaskFolder, WhollyHidden, masks_sentence, read_mask
 from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.costs.images import thumbnail
 from bidnerf_core.localization.costs.rendered import blurred
@@ -233,7 +233,7 @@ def hiding(view: View, content: torch.Tensor) -> View:
 
 
 def drawn(view: View, name: DrawerName) -> torch.Tensor:
-    pixels = drawer(name)(view.frame, 300, torch.Generator().manual_seed(0))
+    pixels = DRAWERS[name](view.frame, 300, torch.Generator().manual_seed(0))
     return view.frame.rgb[pixels[:, 1], pixels[:, 0]]
 
 

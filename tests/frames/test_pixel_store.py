@@ -27,9 +27,8 @@ from bidnerf_core.frames import (
     PixelStore,
     View,
     as_floats,
-    image_pixels,
     observe,
-    pixel_store,
+    storage,
 )
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import memory
@@ -57,10 +56,8 @@ def some_views(count: int, camera: Intrinsics = CAMERA) -> list[View]:
 def test_a_frame_of_bytes_is_one_of_floats_to_whoever_reads_it() -> None:
     held = torch.from_numpy(noise(16, 24))
     frame, floats = Frame("f", held, CAMERA), Frame("f", as_floats(held), CAMERA)
-    assert frame.held_rgb is held
+    assert frame.rgb_bytes is held
     assert torch.equal(frame.rgb, floats.rgb)
-    colours = frame.rgb
-    assert frame.rgb is colours, "while somebody holds the floats, they are not made again"
     pixels = torch.tensor([[0, 0], [23, 15], [7, 3]])
     view, other = (View(f, SE3.identity()) for f in (frame, floats))
     assert torch.equal(observe(view, pixels).rgb, observe(other, pixels).rgb)
@@ -71,8 +68,13 @@ def test_a_frame_of_bytes_is_one_of_floats_to_whoever_reads_it() -> None:
         frame.to("cpu"),
     ):
         assert torch.equal(same.rgb, floats.rgb)
-    hidden = frame.with_images(hidden=held[..., 0] > 200)
-    assert hidden.held_rgb.dtype == torch.uint8
+    assert floats.rgb_bytes.dtype == torch.uint8
+    hidden = frame.replace(hidden=held[..., 0] > 200)
+    assert hidden.rgb_bytes is held
+    with pytest.raises(TypeError, match="no brightness"):
+        frame.replace(brightness=1)
+    with pytest.raises(InputError, match="camera expects"):
+        frame.replace(intrinsics=replace(CAMERA, width=20))
 
 
 def test_reducing_a_frame_keeps_colours_rays_and_what_is_hidden() -> None:
@@ -97,12 +99,11 @@ def test_reducing_a_frame_keeps_colours_rays_and_what_is_hidden() -> None:
 def test_a_store_returns_what_is_put_into_it(
     expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pixel_store, "BLOCK", 9000)
+    monkeypatch.setattr(storage, "BLOCK", 9000)
     views = some_views(8)
     depth = torch.rand(16, 24)
-    frames = [views[0].frame.with_images(depth=depth, alpha=depth, hidden=depth > 0.5)]
-    frames += [replace(view.frame, rgb=view.frame.rgb) for view in views[1:]]  # floats of bytes
-    frames.append(Frame("odd", torch.rand(16, 24, 3), CAMERA))
+    frames = [views[0].frame.replace(depth=depth, alpha=depth, hidden=depth > 0.5)]
+    frames += [view.frame for view in views[1:]]
     store = PixelStore(expected, tmp_path)
     for frame in frames:
         kept = store.stored(frame)
@@ -110,7 +111,6 @@ def test_a_store_returns_what_is_put_into_it(
             a, b = getattr(frame, name), getattr(kept, name)
             assert (a is None) == (b is None)
             assert a is None or torch.equal(a, b)
-        assert kept.held_rgb.dtype == (torch.float32 if frame.name == "odd" else torch.uint8)
     assert list(tmp_path.iterdir()) == [], "files of a store have no names"
 
 
@@ -118,7 +118,7 @@ def test_a_full_disk_is_an_error_in_a_line(tmp_path: Path, monkeypatch: pytest.M
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(pixel_store, "_reserve", full)
+    monkeypatch.setattr(storage, "_reserve", full)
     with pytest.raises(
         InputError, match=rf"^{tmp_path}: no room for 5000 MB of images \(No space left on device\)"
     ):
@@ -127,7 +127,7 @@ def test_a_full_disk_is_an_error_in_a_line(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("most", [1, 64])
 def test_pixels_of_images_are_found_wherever_they_lie(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(image_pixels, "MOST_BLOCKS", most)
+    monkeypatch.setattr(storage, "MOST_BLOCKS", most)
     images: list[torch.Tensor | None] = [torch.from_numpy(noise(4, 5)), None, torch.rand(6, 3, 3)]
     images.append(torch.rand(8, 7, 3)[2:5, 1:4])  # a part of another image
     pixels = ImagePixels.of(images, 3, default=0.5)
@@ -229,6 +229,6 @@ def test_images_that_are_reduced_while_read_are_those_reduced_afterwards(
         (read,) = dataset.views("train")
     small = whole.frame.at_most(20)
     assert read.frame.intrinsics == small.intrinsics
-    assert read.frame.held_rgb.dtype == small.held_rgb.dtype == torch.uint8
+    assert read.frame.rgb_bytes.dtype == small.rgb_bytes.dtype == torch.uint8
     torch.testing.assert_close(read.frame.rgb, small.rgb, atol=4 / 255, rtol=0)
     assert (read.frame.alpha is None) == (small.alpha is None)

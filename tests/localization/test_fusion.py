@@ -133,7 +133,7 @@ def test_points_and_rays_together_are_as_certain_as_either_or_more() -> None:
 def test_a_term_counts_in_the_answer_as_in_its_covariance() -> None:
     """The prior is off, and the truth fits the rays: the more rays are independent, the nearer the answer and the surer."""
     errors, deviations = [], []
-    for count in (0.01, 1.0, 100.0):
+    for count in (0.0001, 0.01, 1.0):  # with more, the rounding of colours decides
         found = fused_pose(rays(count), 8)
         errors.append(translation_error(found))
         deviations.append(position_deviation(found.covariance))

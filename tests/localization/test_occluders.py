@@ -12,7 +12,7 @@ import torch
 
 import baked
 from bidnerf_core.evaluation import faulty
-from bidnerf_core.frames import Frame, View, drawer
+from bidnerf_core.frames import DRAWERS, Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization
 
@@ -144,7 +144,7 @@ def test_hidden_pixels_are_not_drawn(name: str) -> None:
     hidden = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     hidden[:, : SIZE // 2] = True
     frame = replace(view.frame, hidden=hidden)
-    pixels = drawer(name)(frame, 500, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+    pixels = DRAWERS[name](frame, 500, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
     assert len(pixels) == 500
     assert int(pixels[:, 0].min()) >= SIZE // 2
     assert frame.to("cpu").hidden is hidden

@@ -13,7 +13,6 @@ from bidnerf_core.mapping import Keypoints, quantized
 
 PINHOLE = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300)
 SIZE = 0.04  # metres: of what a keypoint describes
-MIRRORED = 0.5
 
 
 @dataclass
@@ -45,7 +44,7 @@ class Points:
         """An image whose first pixel names the keypoints in it; with depth at them, times ``depth``.
 
         The rows of a camera with a ``motion`` are exposed one after another. The view does not tell.
-        The right half adds ``MIRRORED``, which is what the first pixel has in a mirror.
+        The right half is blue, which is what the first pixel is in a mirror.
         """
         generator = torch.Generator().manual_seed(seed)
         local = T_world_camera.inverse().apply(self.positions)
@@ -64,15 +63,16 @@ class Points:
         focal = (intrinsics.fx * intrinsics.fy) ** 0.5
         sizes = SIZE * focal / local[inside, 2]
         self.seen.append(Keypoints(pixels.float(), sizes.float(), self.descriptors[shown]))
-        image = torch.full((intrinsics.height, intrinsics.width, 3), float(len(self.seen) - 1))
-        image[:, intrinsics.width // 2 :] += MIRRORED
+        image = torch.zeros((intrinsics.height, intrinsics.width, 3), dtype=torch.uint8)
+        image[..., 1], image[..., 0] = divmod(len(self.seen) - 1, 256)
+        image[:, intrinsics.width // 2 :, 2] = 255
         measured = None if depth is None else self._depth(intrinsics, pixels, local[inside, 2] * depth)
         return View(Frame("f", image, intrinsics, measured), T_ref_camera or T_world_camera)
 
     def __call__(self, rgb: Tensor) -> Keypoints:
-        first = float(rgb[0, 0, 0])
-        keypoints = self.seen[int(first)]
-        if first % 1 != MIRRORED:
+        low, high, blue = (255 * rgb[0, 0]).round().long().tolist()
+        keypoints = self.seen[256 * high + low]
+        if not blue:
             return keypoints
         across, down = keypoints.pixels.unbind(-1)
         return replace(keypoints, pixels=torch.stack([rgb.shape[1] - across, down], dim=-1))

@@ -205,7 +205,8 @@ def test_a_mistake_of_a_method_is_named(
 
 
 def in_place(frame: Frame, size: float, generator: Generator) -> Frame:
-    frame.rgb.mul_(size)
+    assert frame.depth is not None
+    frame.depth.mul_(size)
     return frame
 
 

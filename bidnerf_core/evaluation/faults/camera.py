@@ -19,7 +19,7 @@ from bidnerf_core.frames import Frame
 def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
     """Multiply the stated focal lengths by ``factor``; the image is unchanged."""
     camera = frame.intrinsics
-    return replace(frame, intrinsics=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
+    return frame.replace(intrinsics=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
 
 
 def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
@@ -28,12 +28,12 @@ def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
         return frame
     camera = frame.intrinsics
     stated = Intrinsics.from_focal(math.sqrt(camera.fx * camera.fy), camera.width, camera.height)
-    return replace(frame, intrinsics=stated, focal_is_approximate=True)
+    return frame.replace(intrinsics=stated, focal_is_approximate=True)
 
 
 def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
     """Multiply the stated horizontal focal length by ``factor``, as if only the image's height had been resized."""
-    return replace(frame, intrinsics=replace(frame.intrinsics, fx=frame.intrinsics.fx * factor))
+    return frame.replace(intrinsics=replace(frame.intrinsics, fx=frame.intrinsics.fx * factor))
 
 
 def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
@@ -69,7 +69,7 @@ def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> 
     """Move the stated principal point by ``pixels`` in a random direction; the image is unchanged."""
     camera, (across, down) = frame.intrinsics, random_direction(generator)
     wrong = replace(camera, cx=camera.cx + pixels * across, cy=camera.cy + pixels * down)
-    return replace(frame, intrinsics=wrong)
+    return frame.replace(intrinsics=wrong)
 
 
 def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
@@ -100,7 +100,7 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
         return turned
     # Along a row's ray (x, y, 1), a point's depth is its z in the frame's camera divided by the ray's z in
     # that camera.
-    return replace(turned, depth=(nearest(frame.depth, pixels.nan_to_num(-1.0)) / seen[..., 2]).float())
+    return turned.replace(depth=(nearest(frame.depth, pixels.nan_to_num(-1.0)) / seen[..., 2]).float())
 
 
 def _rays(camera: Intrinsics) -> Float[Tensor, "h w 3"]:

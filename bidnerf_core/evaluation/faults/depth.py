@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
@@ -20,7 +18,7 @@ PLANE_TOLERANCE = 0.01
 
 def scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
     """Multiply the depth by ``factor``."""
-    return replace(frame, depth=depth_of(frame) * factor)
+    return frame.replace(depth=depth_of(frame) * factor)
 
 
 def offset(frame: Frame, metres: float, generator: Generator) -> Frame:
@@ -67,7 +65,7 @@ def misregistered(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Shift the depth by ``pixels`` relative to the colour image, in a random direction."""
     depth = depth_of(frame)
     move = depth.new_tensor(random_direction(generator)) * pixels
-    return replace(frame, depth=nearest(depth, frame.intrinsics.pixel_centres() - move))
+    return frame.replace(depth=nearest(depth, frame.intrinsics.pixel_centres() - move))
 
 
 def square_window(frame: Frame, pixels: float, generator: Generator) -> Frame:
@@ -127,9 +125,9 @@ def _normal(depth: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
 def _remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
     """Return the frame with new depth where there was a measurement; values of 0 and below count as not measured."""
     valid = (depth_of(frame) > 0) & (depth > 0)
-    return replace(frame, depth=torch.where(valid, depth, torch.zeros_like(depth)))
+    return frame.replace(depth=torch.where(valid, depth, torch.zeros_like(depth)))
 
 
 def _kept(frame: Frame, kept: Bool[Tensor, "h w"]) -> Frame:
     depth = depth_of(frame)
-    return replace(frame, depth=torch.where(kept, depth, torch.zeros_like(depth)))
+    return frame.replace(depth=torch.where(kept, depth, torch.zeros_like(depth)))

@@ -131,10 +131,10 @@ def _pasted(
     """Return the frame with new colours, depth and alpha (1 by default) inside ``mask``."""
     pasted = replace(frame, rgb=torch.where(mask[..., None], rgb, frame.rgb))
     if frame.depth is not None and depth is not None:
-        pasted = replace(pasted, depth=torch.where(mask, depth.to(frame.depth), frame.depth))
+        pasted = pasted.replace(depth=torch.where(mask, depth.to(frame.depth), frame.depth))
     if frame.alpha is not None:
         cover = torch.ones_like(frame.alpha) if alpha is None else alpha
-        pasted = replace(pasted, alpha=torch.where(mask, cover, frame.alpha))
+        pasted = pasted.replace(alpha=torch.where(mask, cover, frame.alpha))
     return pasted
 
 

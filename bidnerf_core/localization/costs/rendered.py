@@ -24,7 +24,7 @@ from bidnerf_core.fields import (
     Rays,
     Resampled,
 )
-from bidnerf_core.frames import DrawerName, View, continued, draw, drawer
+from bidnerf_core.frames import DRAWERS, DrawerName, View, continued, draw
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.exposure import EXPOSURE_ROUNDS, Exposure, clipped, robust_exposure
@@ -80,7 +80,7 @@ def draw_weighted_rays(
     Colours are averaged over squares of ``blur`` x ``blur`` pixels; 1 leaves them unchanged.
     """
     views = [blurred(view, blur) for view in problem.views] if blur > 1 else problem.views
-    seen = draw(views, counts.pixels, drawer(pixels), generator, device=problem.device)
+    seen = draw(views, counts.pixels, DRAWERS[pixels], generator, device=problem.device)
     observed, weights = seen.flattened(), objective.weights(seen).flatten(0, 1)
     if problem.depth_rays is None or not objective.uses_depth or counts.depth_rays == 0:
         return WeightedRays(observed, weights)
@@ -92,7 +92,7 @@ def draw_weighted_rays(
 def blurred(view: View, size: int) -> View:
     """Return the view with colours averaged over squares of ``size`` pixels and interpolated between; depth is unchanged."""
     frame = view.frame
-    height, width = frame.held_rgb.shape[:2]
+    height, width = frame.rgb_bytes.shape[:2]
     size = min(size, height, width)
     small = avg_pool2d(continued(frame).permute(2, 0, 1)[None], size, ceil_mode=True, count_include_pad=False)
     # Enlarged to whole squares, then cropped to the image, so that squares stay in place.

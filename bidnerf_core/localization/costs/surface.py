@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations
-from bidnerf_core.frames import View, colours_at, observe, visible_at
+from bidnerf_core.frames import View, observe, visible_at
 from bidnerf_core.geometry import SE3, inlier_weight, skew
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.solvers.pivots import Pivot
@@ -268,7 +268,7 @@ def _cloud_of_rays(
         seen = ((pixels >= 0) & (pixels < size)).all(-1)  # false for NaN, behind the camera
         seen[seen.clone()] = visible_at(view.frame, pixels[seen])
         columns, rows = pixels[seen].long().unbind(-1)
-        rgb[seen] = colours_at(view.frame.held_rgb.cpu(), rows, columns).to(rgb)
+        rgb[seen] = view.frame.colours_at(rows, columns).to(rgb)
         coloured |= seen
     return PointCloud(some.points, rgb, some.origins, coloured)
 

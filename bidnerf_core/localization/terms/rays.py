@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d, interpolate, normalize
 from bidnerf_core.camera import exposure_times
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations, RadianceField, Rendering, SceneBounds, device_of, render
-from bidnerf_core.frames import Frame, View, colours_at, continued
+from bidnerf_core.frames import Frame, View, continued
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.descend import Normal
 from bidnerf_core.localization.states import MOTION, Sights, States, rays_by_camera, rays_through
@@ -90,7 +90,7 @@ class Rays:
             depth = torch.zeros(n) if frame.depth is None else frame.depth.cpu()[row, column]
             depth = torch.where(depth.isfinite(), depth.clamp(min=0), 0).double() * flat.norm(dim=-1)
             rgb = (
-                colours_at(frame.held_rgb.cpu(), row, column)
+                frame.colours_at(row, column).cpu()
                 if blur == 1
                 else averaged(frame, blur)[row, column]
             )
@@ -285,7 +285,7 @@ class Rays:
 
 def averaged(frame: Frame, size: int) -> Float[Tensor, "h w 3"]:
     """Return the colours averaged over squares of ``size`` pixels and interpolated between them; hidden pixels are filled in."""
-    height, width = frame.held_rgb.shape[:2]
+    height, width = frame.rgb_bytes.shape[:2]
     size = min(size, height, width)
     rgb = continued(frame).cpu().float().permute(2, 0, 1)[None]
     small = avg_pool2d(rgb, size, ceil_mode=True, count_include_pad=False)

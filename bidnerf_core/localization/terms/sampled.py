@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
 from bidnerf_core.fields import Objective, Observations, Rays, masked_mean, render, widened
-from bidnerf_core.frames import Frame, PixelDrawer, draw, drawer
+from bidnerf_core.frames import DRAWERS, Frame, draw
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import DescentSettings, ReachSettings, rendered_depth_scale
@@ -31,12 +31,10 @@ class SampledLoss:
     rays: DescentSettings
     reach: ReachSettings
     generator: Generator
-    _drawer: PixelDrawer = field(init=False)
     _batches: list[Observations] | None = field(default=None, init=False)
     _candidates: int = field(default=1, init=False)
 
     def __post_init__(self) -> None:
-        self._drawer = drawer(self.rays.pixels)
         if self.reach.candidates > 1 and _shows_background(self.problem):
             self._candidates = self.reach.candidates
 
@@ -71,7 +69,7 @@ class SampledLoss:
         """Draw pixels (views, pixels per view) and any depth rays (1, rays)."""
         problem, device = self.problem, self.problem.device
         many = self.rays.rays * self._candidates
-        pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
+        pixels = draw(problem.views, many, DRAWERS[self.rays.pixels], self.generator, device=device)
         if self._candidates > 1:
             count = max(1, self.rays.rays // len(problem.views))
             order = self._rank(pixels, T_world_last).sort(dim=-1, descending=True, stable=True).indices

@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.camera import exposure_times
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations
-from bidnerf_core.frames import View, colours_at
+from bidnerf_core.frames import View
 from bidnerf_core.geometry import inlier_weight
 from bidnerf_core.localization.descend import Normal
 from bidnerf_core.localization.states import DEPTH, MOTION, Sights, States, rays_by_camera, rays_through
@@ -75,7 +75,7 @@ class Surface:
             times = exposure_times(pixels, camera) if len(views) == 1 else torch.zeros_like(z)
             T = view.T_ref_camera.to("cpu", torch.float64)
             R, t = T.rotation.expand(n, 3, 3), T.translation.expand(n, 3)
-            rgb = colours_at(frame.held_rgb.cpu(), row, column).float()
+            rgb = frame.colours_at(row, column).cpu().float()
             coloured = torch.full((n,), float(frame.has_colour))
             flat = camera.unproject(pixels)[:, :2]
             parts.append((flat, times, R, t, z, torch.zeros((n, 3)).double(), rgb, coloured))

@@ -255,7 +255,7 @@ def by_colour(
     scene: SceneMap, frame: Frame, state: TrackerState, predicted: Motion, config: ByColourConfig
 ) -> Measurement:
     """Return the pose by the colours of rendered rays alone, which is far slower than the other measurements."""
-    problem = rig(scene, [View(replace(frame, depth=None), SE3.identity())], predicted.T_world_camera)
+    problem = rig(scene, [View(frame.replace(depth=None), SE3.identity())], predicted.T_world_camera)
     T, none = predicted.T_world_camera, torch.zeros(0, dtype=torch.float64)
     start = SearchResult(T[None], torch.zeros(1, dtype=torch.float64), math.inf, T[None], none)
     answer = refine_by_colour(problem, start, config, Generator().manual_seed(state.frames))

@@ -47,7 +47,7 @@ class CorrectedCamera:
 
     def corrected(self, frame: Frame) -> Frame:
         """Return the frame with corrected intrinsics."""
-        return replace(frame, intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
+        return frame.replace(intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
 
     def stated_in(self, answer: Localization, frame: Frame) -> Localization:
         """Return the answer for a frame with the intrinsics that replace the frame's own, if any."""

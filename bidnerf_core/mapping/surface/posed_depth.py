@@ -13,7 +13,7 @@ from torch.nn.functional import grid_sample
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import RadianceField, RenderedImage, SceneBounds, render_image
-from bidnerf_core.frames import View, colours_at
+from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 
 WITNESSES = 8
@@ -90,7 +90,7 @@ def measured_image(view: View, pixels: float) -> PosedDepthImage:
     columns, rows = (small.pixel_centres() * scale).long().unbind(-1)
     depth = torch.zeros(rows.shape) if frame.depth is None else frame.depth.cpu()[rows, columns]
     depth = torch.where(depth.isfinite() & (depth > 0), depth, 0)
-    image = RenderedImage(colours_at(frame.held_rgb.cpu(), rows, columns), depth, (depth > 0).to(depth))
+    image = RenderedImage(frame.colours_at(rows, columns).cpu(), depth, (depth > 0).to(depth))
     T = view.T_ref_camera.to("cpu", torch.float64)
     return PosedDepthImage(small, T, image, mean_focal(frame.intrinsics), True)
 

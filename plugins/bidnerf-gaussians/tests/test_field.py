@@ -96,7 +96,7 @@ def test_in_known_shapes_the_same_is_seen(
     expected = render(field, along)
     points = rays(50, 5).at(torch.full((50, 1), 3.0))[:, 0]
     density = field.query(points, along.directions[:50])
-    monkeypatch.setattr(import_module("bidnerf_core.fields.met_pieces"), "may_wait", lambda device: False)
+    monkeypatch.setattr(import_module("bidnerf_core.fields.pieces"), "may_wait", lambda device: False)
     with without_waiting():
         found = render(field, along)
         again = field.query(points, along.directions[:50])
@@ -109,7 +109,7 @@ def test_many_boxes_are_tested_in_parts(
 ) -> None:
     field, along = field_of(some(300)), rays()
     expected = field.hits(along)
-    monkeypatch.setattr("bidnerf_core.fields.box_tree.MOST_PAIRS", 400)
+    monkeypatch.setattr("bidnerf_core.fields.pieces.MOST_PAIRS", 400)
     found = field.hits(along)
     assert torch.equal(found.alpha, expected.alpha)
 

@@ -106,7 +106,7 @@ class ScanField(nn.Module):
 
     @property
     def boxes(self) -> list[Float[Tensor, "6 _ 8"]]:
-        """The boxes of the tree, the lowest level first, see ``box_tree``."""
+        """The boxes of the tree, the lowest level first, see ``pieces``."""
         return [getattr(self, f"boxes_{number}") for number in range(len(level_sizes(len(self.corner))))]
 
     @property

@@ -41,12 +41,13 @@ from bidnerf_core.datasets import (
     Splits,
     hold_out,
     largest_side,
+    pose_of_rows,
     read_rgbd,
 )
 from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, fit_depth
-from bidnerf_core.geometry import SE3, LengthUnit, pose_of_rows
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import Background, Record, decode, read_file, read_record, reduced
 
 LARGEST_SIDE = 640

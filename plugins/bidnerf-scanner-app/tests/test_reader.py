@@ -122,7 +122,7 @@ def moved(view: View, right: float, down: float) -> View:
     """Return the view with its principal point shifted (pixels)."""
     camera = view.frame.intrinsics
     camera = replace(camera, cx=camera.cx + right, cy=camera.cy + down)
-    return replace(view, frame=replace(view.frame, intrinsics=camera))
+    return replace(view, frame=view.frame.replace(intrinsics=camera))
 
 
 def test_photos_are_reduced_with_their_camera(scan: Path) -> None:

@@ -9,19 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.geometry.se3 import SE3
-
-
-def turned_about(
-    T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float
-) -> SE3:
-    """Return the camera's pose after a rotation by ``angle_deg`` about the axis ``up`` through ``middle``
-    (metres, world).
-    """
-    phi = math.radians(angle_deg) * torch.nn.functional.normalize(up, dim=0)
-    turn = SE3.exp(torch.cat([torch.zeros_like(phi), phi]))
-    moved = T_world_camera.translation - middle
-    return SE3(turn.rotation @ T_world_camera.rotation, turn.rotate(moved) + middle)
+from bidnerf_core.geometry import SE3, turned_about
 
 
 def seen_middle(poses: Sequence[SE3]) -> Float[Tensor, "3"]:

@@ -1,0 +1,63 @@
+"""Camera poses as rows of numbers, converted to our conventions: ``T_world_camera`` with OpenCV axes.
+
+NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import RIGID_TO, SE3, rigid_pose
+from bidnerf_core.io import Record, read_rows
+
+LARGEST_POSE = 4096
+"""Largest size of a file with one pose, in bytes."""
+
+
+def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, float]:
+    """Return ``T_world_camera`` (OpenCV axes, float64) from a matrix (3x4 or 4x4, OpenGL axes), and the scale removed from it.
+
+    A rotation that is orthonormal up to rounding is orthonormalized. A homogeneous matrix whose last entry is
+    not 1 is divided by it, and a rotation of uniform scale is normalized; the position of the camera is that
+    of the matrix. The scale is 1 if neither applies. Raises ``InputError`` for any other matrix.
+    """
+    rows, scale = record.homogeneous(key, record.items(key))
+    matrix = torch.tensor(rows, dtype=torch.float64)
+    size = float(torch.linalg.det(matrix[:, :3]).abs()) ** (1 / 3)
+    if size > 0 and abs(size - 1) > RIGID_TO / 2:
+        matrix = torch.cat([matrix[:, :3] / size, matrix[:, 3:]], dim=1)
+        scale *= size
+    return _from_opengl(record, key, matrix.tolist()), scale
+
+
+def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
+    """Convert the rows (3x4 or 4x4, OpenGL axes) of a rigid transform to ``T_world_camera`` (OpenCV axes,
+    float64).
+
+    ``key`` is the key of ``rows`` in ``record``, for messages. Raises ``InputError`` for any other matrix.
+    """
+    return _from_opengl(record, key, record.matrix(key, rows))
+
+
+def _from_opengl(record: Record, key: str, rows: list[list[float]]) -> SE3:
+    """Convert a pose from OpenGL to OpenCV axes: y up becomes y down, z backward becomes z forward."""
+    matrix = torch.tensor(rows, dtype=torch.float64) * torch.tensor([1.0, -1.0, -1.0, 1.0])
+    return rigid_pose(matrix, record.where, f"the rotation of {key}")
+
+
+def read_pose_matrix(path: Path) -> SE3:
+    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
+
+    Raises ``InputError``, which names the offending line.
+    """
+    expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
+    rows = [row.numbers(count=4) for row in read_rows(path, "a file of a pose", expected, LARGEST_POSE)]
+    if len(rows) != 4:
+        raise InputError(f"has {len(rows)} rows", where=path, expected=expected)
+    if max(abs(x - y) for x, y in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+        raise InputError(f"the last row is {rows[3]}", where=path, expected=expected)
+    return rigid_pose(torch.tensor(rows[:3], dtype=torch.float64), path)

@@ -1,0 +1,133 @@
+"""The images of many frames: stored in a few large blocks of memory or, if there are many, in a mapped file, and
+read at pixels of many images at once.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import Frame, as_floats
+
+BLOCK = 2**28
+"""Bytes per block, unless an image is larger. With few blocks it is cheap to draw pixels from all images at once."""
+IN_MEMORY = 2**28
+"""Bytes of images held in memory; more are held in a file, whose pages the system may drop when it needs memory."""
+ALIGNMENT = 16
+MOST_BLOCKS = 64
+"""Number of separate blocks of memory above which images are copied into one."""
+
+
+class PixelStore:
+    """Holds the images of frames one after another.
+
+    ``expected`` is the number of bytes that will be stored. If it exceeds ``IN_MEMORY``, they go to nameless
+    files in ``folder`` (by default, the system's folder for temporary files) that vanish with the process.
+    """
+
+    def __init__(self, expected: int, folder: Path | None = None) -> None:
+        self._mapped, self._folder, self._expected = expected > IN_MEMORY, folder, expected
+        self._block, self._used = torch.empty(0, dtype=torch.uint8), 0
+
+    def stored(self, frame: Frame) -> Frame:
+        """Return the frame with its images in the store."""
+        images = {
+            name: None if image is None else self.copied(image if name == "hidden" else image.float())
+            for name, image in (("depth", frame.depth), ("alpha", frame.alpha), ("hidden", frame.hidden))
+        }
+        return frame.replace(rgb=self.copied(frame.rgb_bytes), **images)
+
+    def copied(self, image: Shaped[Tensor, "*n"]) -> Shaped[Tensor, "*n"]:
+        """Return an image with its values in the store."""
+        size = image.numel() * image.element_size()
+        start = -(-self._used // ALIGNMENT) * ALIGNMENT
+        if start + size > len(self._block):
+            self._block, start = self._new_block(size), 0
+        self._used = start + size
+        found = self._block[start : start + size].view(image.dtype).view(image.shape)
+        return found.copy_(image)
+
+    def _new_block(self, least: int) -> Tensor:
+        size = max(least, min(BLOCK, self._expected + ALIGNMENT))
+        if not self._mapped:
+            return torch.empty(size, dtype=torch.uint8)
+        try:
+            with tempfile.TemporaryFile(dir=self._folder) as file:
+                _reserve(file.fileno(), size)
+                return torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(size,)))
+        except OSError as error:
+            place = self._folder or tempfile.gettempdir()
+            raise InputError(
+                f"no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}), free that"
+                " much, or read them smaller (--largest, largest=)",
+                where=place,
+            ) from error
+
+
+def _reserve(file: int, size: int) -> None:
+    """Allocate disk space for a file: writing to a mapped page for which the disk has no room would end the process."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.truncate(file, size)
+
+
+def bytes_of(frame: Frame) -> int:
+    """Return the number of bytes that a store needs for the images of a frame."""
+    images = ((frame.rgb_bytes, 1), (frame.depth, 4), (frame.alpha, 4), (frame.hidden, 1))
+    return sum(image.numel() * size for image, size in images if image is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePixels:
+    """The pixels of images with the same number of channels; pixels of an image are numbered row by row."""
+
+    blocks: Sequence[Shaped[Tensor, "_"]]  # each flat; of one type within a block
+    block: Int[Tensor, "v"]  # index of the block that holds each image; -1 if there is no image
+    start: Int[Tensor, "v"]  # index of its first value in that block
+    channels: int
+    default: float = 0.0  # the value of missing images
+
+    @staticmethod
+    def of(images: Sequence[Tensor | None], channels: int, default: float = 0.0) -> ImagePixels:
+        """Build this from ``images``; None has the value ``default`` everywhere. Images that share few blocks
+        of memory are not copied.
+        """
+        present = {
+            i: image.detach().cpu().contiguous() for i, image in enumerate(images) if image is not None
+        }
+        if len({_block(image) for image in present.values()}) > MOST_BLOCKS:
+            store = PixelStore(sum(image.nbytes + ALIGNMENT for image in present.values()))
+            present = {i: store.copied(image) for i, image in present.items()}
+        blocks = {_block(image): image for image in present.values()}
+        numbers = {key: number for number, key in enumerate(blocks)}
+        block, start = torch.tensor([[-1], [0]]).repeat(1, len(images))
+        for i, image in present.items():
+            block[i], start[i] = numbers[_block(image)], image.storage_offset()
+        flat = [torch.empty(0, dtype=image.dtype).set_(image.untyped_storage()) for image in blocks.values()]
+        return ImagePixels(flat, block, start, channels, default)
+
+    def at(self, image: Int[Tensor, "p"], pixel: Int[Tensor, "p"]) -> Float[Tensor, "p c"]:
+        """Return the values of pixels, each from the image with that index; bytes become floats in [0, 1]."""
+        block = self.block[image]
+        first = self.start[image] + pixel * self.channels
+        index = first[:, None] + torch.arange(self.channels)
+        values = torch.full(index.shape, self.default)
+        for number in block.unique().tolist():
+            if number >= 0:
+                own = block == number
+                values[own] = as_floats(self.blocks[number][index[own]]).float()
+        return values
+
+
+def _block(image: Tensor) -> tuple[int, torch.dtype]:
+    return image.untyped_storage().data_ptr(), image.dtype
