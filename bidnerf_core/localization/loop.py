@@ -25,6 +25,7 @@ from bidnerf_core.localization.states import Sights, States, project
 from bidnerf_core.localization.terms.landmarks import Landmarks, point_variance
 from bidnerf_core.localization.terms.rays import FIELD_ERRORS, RAYS, Rays
 from bidnerf_core.localization.terms.surface import Surface
+from bidnerf_core.mapping import GIVEN, Calibration
 
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which no mirror image is tried."""
@@ -337,6 +338,10 @@ class Loop:
             if p > 0.01:
                 extra["rows"][f"{m}:{given.names[r]}"] = round(p, 3)
         extra["nuis"] = [round(x, 4) for x in state.nuisances[0].tolist()]
+        by_stated = not bool(given.mean[int(state.row), :6].any())
+        if not by_stated or given.names[int(state.row)].split()[0] not in ("exact", "right", "inexact"):
+            taken = state.nuisances if by_stated else given.mean[state.row]
+            extra["camera"] = Calibration(*taken[0, :5].tolist())
         extra["blur"] = self._blur(before, term)
         return found.pose(), verdict, covariance, evidence, extra
 
@@ -367,9 +372,11 @@ def localized(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         )
     else:
         T, verdict, covariance, evidence, extra = answer
+    calibration, stated = extra.get("camera", GIVEN), problem.views[-1].frame.intrinsics
     found = Localization(
         T, verdict.outcome, verdict.reason, 1, time.perf_counter() - began, 0.0, "auto", SE3.stack([T]),
-        torch.zeros(1), covariance, confidence=verdict.confidence, diagnostics=evidence,
+        torch.zeros(1), covariance, calibration.focal_factor, verdict.confidence, evidence,
+        None if calibration == GIVEN else calibration.applied(stated),
     )  # fmt: skip
     object.__setattr__(found, "extra", extra)
     return found
