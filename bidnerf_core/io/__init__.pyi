@@ -40,6 +40,7 @@ from .json import parse_record as parse_record
 from .json import read_json as read_json
 from .json import read_record as read_record
 from .json import to_plain as to_plain
+from .json import with_tensors as with_tensors
 from .memory import available_memory as available_memory
 from .ply import PlyHeader as PlyHeader
 from .ply import read_ply as read_ply

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torch import Tensor
+
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.files import read_file
 
@@ -150,22 +152,45 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def to_plain(value: Any, where: str = "") -> Any:
+def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = None) -> Any:
     """Convert dataclasses to dicts and tuples to lists. Raises ``InputError`` for values that strict JSON
     cannot represent.
+
+    Tensors are moved to ``tensors``, if given, under the names of their fields, such as ``motion.noise``;
+    ``with_tensors`` puts them back.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [f.name for f in dataclasses.fields(value) if f.init]
-        return {name: to_plain(getattr(value, name), _inside(where, name)) for name in fields}
+        return {name: to_plain(getattr(value, name), _inside(where, name), tensors) for name in fields}
     if isinstance(value, dict):
-        return {_key(key, where): to_plain(item, _inside(where, key)) for key, item in value.items()}
+        return {
+            _key(key, where): to_plain(item, _inside(where, key), tensors) for key, item in value.items()
+        }
     if isinstance(value, tuple | list):
-        return [to_plain(item, f"{where}[{place}]") for place, item in enumerate(value)]
+        return [to_plain(item, f"{where}[{place}]", tensors) for place, item in enumerate(value)]
+    if isinstance(value, Tensor) and tensors is not None:
+        tensors[where] = value
+        return {"tensor": where}
     if isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"{where or 'value'} is {value}", expected="a finite number")
     if value is None or type(value) in (bool, int, float, str):
         return value
     raise InputError(f"{where or 'value'} is a {type(value).__name__}", expected="a JSON-serializable value")
+
+
+def with_tensors(plain: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
+    """Return what ``to_plain`` returned with the tensors that it moved; ``from_plain`` checks their shapes.
+
+    Raises ``InputError`` for a missing tensor.
+    """
+    if not isinstance(plain, dict):
+        return plain
+    name = plain.get("tensor")
+    if len(plain) > 1 or not isinstance(name, str):
+        return {key: with_tensors(item, tensors, where) for key, item in plain.items()}
+    if name not in tensors:
+        raise InputError(f"no tensor {name!r}", where=where)
+    return tensors[name]
 
 
 def from_plain(kind: type[_T], value: Any, where: str) -> _T:
@@ -220,7 +245,7 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 def converted(kind: Any, value: Any, where: str) -> Any:
     """Convert ``value``, as read from JSON, to the type ``kind``. Errors begin with ``where``."""
     origin, arguments, is_dataclass = _form(kind)
-    if kind is Any:
+    if kind is Any or (isinstance(value, Tensor) and isinstance(value, kind)):
         return value
     if origin is typing.Literal and any(type(value) is type(known) and value == known for known in arguments):
         return value
@@ -283,7 +308,7 @@ def _name(kind: Any) -> str:
 
 def _shown(value: Any) -> str:
     """Return a value as text on one line, truncated if it is long."""
-    text = repr(value)
+    text = f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 

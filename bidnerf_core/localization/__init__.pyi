@@ -93,4 +93,4 @@ from .support import Support as Support
 from .support import SurfaceDiagnostics as SurfaceDiagnostics
 from .support import SurfaceThresholds as SurfaceThresholds
 from .terms.sampled import SampledLoss as SampledLoss
-from .tracker import Tracker as Tracker
+from .tracking.tracker import Tracker as Tracker

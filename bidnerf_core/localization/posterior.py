@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -100,19 +101,23 @@ class Posterior:
         """Return the probability that the pose is within ``tolerance`` (relative to ``distance``) and ``angle`` (radians), and
         right under an explanation that is ``credible``.
         """
-        draws = torch.distributions.Normal(0.0, 1.0).icdf(
-            torch.quasirandom.SobolEngine(6, scramble=True, seed=0).draw(DRAWS).double().clamp(1e-6, 1 - 1e-6)
-        )
         covariance = self.covariance + shared
         sane = covariance.isfinite().all(-1).all(-1)
         factor, info = torch.linalg.cholesky_ex(
             torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
         )
-        off = (self.update - self.mean)[:, None] + draws @ factor.mT
+        off = (self.update - self.mean)[:, None] + normal_draws() @ factor.mT
         inside = (off[..., :3].norm(dim=-1) <= tolerance * distance) & (off[..., 3:].norm(dim=-1) <= angle)
         return float(
             (self.probability * inside.double().mean(-1) * (sane & (info == 0) & credible)).sum()
         )  # host
+
+
+@lru_cache(maxsize=1)
+def normal_draws() -> Float[Tensor, "d 6"]:
+    """Return draws of a standard normal distribution that cover it evenly (Sobol)."""
+    even = torch.quasirandom.SobolEngine(6, scramble=True, seed=0).draw(DRAWS).double()
+    return torch.distributions.Normal(0.0, 1.0).icdf(even.clamp(1e-6, 1 - 1e-6))
 
 
 def robust_covariance(

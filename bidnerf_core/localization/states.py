@@ -7,6 +7,7 @@ nuisances below. All in float64.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -53,7 +54,7 @@ class States:
     def __getitem__(self, index: Tensor | slice) -> States:
         return States(self.T[index], *(getattr(self, name)[index] for name in PARTS))
 
-    @property
+    @cached_property
     def nuisances(self) -> Float[Tensor, "h N"]:
         return self.mean + self.deviation * self.z
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -16,7 +17,6 @@ from torch import Tensor
 
 from bidnerf_core.localization.descend import Normal
 from bidnerf_core.localization.states import Projections, Sights, States, jacobian, project
-from bidnerf_core.mapping import LandmarkMap
 
 MAD = 1.4826
 """Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
@@ -145,8 +145,17 @@ class Landmarks:
         return squared, off, deviation
 
 
+@runtime_checkable
+class UncertainPoints(Protocol):
+    """World points (n) with the errors of their positions, as in a ``LandmarkMap``."""
+
+    positions: Float[Tensor, "n 3"]
+    deviations: Float[Tensor, "n 2"]
+    directions: Float[Tensor, "n 3"]
+
+
 def point_variance(
-    landmarks: LandmarkMap, index: Int[Tensor, "m"], states: States, focal: Float[Tensor, "m"]
+    landmarks: UncertainPoints, index: Int[Tensor, "m"], states: States, focal: Float[Tensor, "m"]
 ) -> Float[Tensor, "m"]:
     """Return the variance (square pixels) of landmarks' projections at the first state, averaged over both axes."""
     points, towards = landmarks.positions[index].double(), landmarks.directions[index].double()

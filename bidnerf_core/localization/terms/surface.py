@@ -24,6 +24,8 @@ POINTS = 500
 """Number of points that are compared."""
 INDEPENDENT = 10.0
 """Largest number of independent measurements among depths against the surface."""
+DENSE = 20
+"""Ratio of measured to compared points above which they are drawn with replacement, which takes far less time."""
 LEAST = 50
 """Least number of measured points from which a shape can be recognized."""
 DISC = 1.5
@@ -54,6 +56,7 @@ class Surface:
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     noise: float  # metres
     colour_weight: float = 0.0  # of colours, relative to distances
+    independent: float = INDEPENDENT  # number of independent measurements among the points
 
     @staticmethod
     def of(
@@ -68,7 +71,11 @@ class Surface:
             if frame.hidden is not None and len(row):
                 shown = ~frame.hidden.cpu()[row, column]
                 row, column = row[shown], column[shown]
-            drawn = torch.randperm(len(row), generator=generator)[: -(-count // len(views))]
+            most = -(-count // len(views))
+            if len(row) > DENSE * most:  # hardly any is drawn twice
+                drawn = torch.randint(len(row), (most,), generator=generator)
+            else:
+                drawn = torch.randperm(len(row), generator=generator)[:most]
             row, column = row[drawn], column[drawn]
             pixels = torch.stack([column, row], -1).double() + 0.5
             camera, z, n = frame.intrinsics, depth[row, column].double(), len(row)
@@ -130,7 +137,7 @@ class Surface:
         r, squared, normal, index, along, local, rays = self._offsets(here)
         # Geman-McClure: points of an occluder have almost no influence
         inlier = inlier_weight(squared, 2 * self.noise)
-        share = INDEPENDENT / len(self)
+        share = self.independent / len(self)
         cost = share * 2 * (1 - inlier).sum(-1)
         weight = share * inlier.square() / self.noise**2
         R = here.T.rotation
