@@ -44,7 +44,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     loop = None
     if problem.matcher is not None and config.landmarks:
-        loop = Loop(problem, problem.matcher, config.fused_rays, seed)
+        loop = Loop(problem.views, problem.matcher, problem, config.fused_rays, seed)
     answer = None if loop is None else loop()
     found = None if answer is None else localization(problem, answer, began)
     if found is None or not (found.converged or found.outcome in FINAL):

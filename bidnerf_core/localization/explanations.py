@@ -6,13 +6,14 @@ An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.landmarks.map_camera import map_cameras
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.states import N, States
 from bidnerf_core.mapping import LandmarkMap
@@ -72,8 +73,16 @@ ODDS_OF_MAP, ODDS_OF_OTHER = 0.5, 0.05
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
 """Differences of two good calibrations of one camera."""
 SIMILAR = (0.16, 0.06, 0.06, 0.2, 0.02, 0.01)
+MAX_CAMERAS = 9
+"""Maximum number of a map's cameras of one size, evenly chosen by focal length, that are compared with the stated one."""
+MAX_RESIDUAL = 0.002
+"""Root mean square difference, as a fraction of the image's width, above which a correction does not describe a camera."""
+GRID = 7
+"""Number of rows and columns of pixels at which cameras are compared."""
 TRUST_AS_MAP = 0.1
 """Factor of the probability of other than the stated intrinsics if those are the intrinsics of the map's images."""
+MOVING = " moving"
+"""Ending of the names of explanations in motion."""
 SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
 """Prior probability of a motion during the readout, and the same if the map's images move."""
 SIMILAR_TO_OTHERS = ("exact", "inexact", "map")
@@ -115,10 +124,10 @@ class Explanations:
 
         With another focal length or principal point, the camera is moved along its axis and turned so that it sees about the same.
         """
-        names = [name for name in self.names if name not in SIMILAR_TO_OTHERS and "moving" not in name]
-        row = torch.tensor(
-            [self.names.index(name) for name in [*names, *(n for n in self.names if n == "right moving")]]
-        )
+        kinds = [i for i, name in enumerate(self.names) if name.removesuffix(MOVING) not in SIMILAR_TO_OTHERS]
+        still = [i for i in kinds if not self.names[i].endswith(MOVING)]
+        moving = [i for i in kinds if i not in still]
+        row = torch.tensor(still + moving[:1])
         k, mean, deviation = len(row), self.mean[row], self.deviation[row]
         z = torch.zeros((k, N), dtype=torch.float64)
         # A deviation of 0 holds a nuisance at its mean.
@@ -143,7 +152,7 @@ class Explanations:
         return States(free.T[index], z, *parts, free.noise[index], free.mode[index], row)
 
 
-def explanations(query: Query, landmarks: LandmarkMap, distance: float, depth_scale: float) -> Explanations:
+def explanations(query: Query, landmarks: LandmarkMap, distance: float, depth_scale: float, moving: bool = True) -> Explanations:
     """Return all explanations of the images; ``distance`` (metres) is that of the scene, for the prior of a motion, and
     ``depth_scale`` the relative deviation of measured depth.
 
@@ -169,13 +178,13 @@ def explanations(query: Query, landmarks: LandmarkMap, distance: float, depth_sc
                     )
     else:
         rows.append(("exact", [0.0] * 6, (0.0,) * 6, 1.0, True))
-    single = len(query.images) == 1
-    moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving) if single else 0.0
+    single = moving and len(query.images) == 1  # views of a rig may be from different times
+    share_moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving) if single else 0.0
     names, means, deviations, shares, credible = [], [], [], [], []
-    for moves, share in ((False, 1 - moving), (True, moving))[: 2 if single else 1]:
+    for moves, share in ((False, 1 - share_moving), (True, share_moving))[: 2 if single else 1]:
         motion = [MOVE * distance] * 3 + [TURN] * 3 if moves else [0.0] * 6
         for name, mean, deviation, odds, good in rows:
-            names.append(name + (" moving" if moves else ""))
+            names.append(name + (MOVING if moves else ""))
             means.append([*mean, *[0.0] * 7])
             deviations.append([*deviation, *motion, depth_scale])
             shares.append(odds * share)
@@ -188,8 +197,60 @@ def explanations(query: Query, landmarks: LandmarkMap, distance: float, depth_sc
 
 
 def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:
-    """Return the corrections of the stated camera that make it one of those of the map's images."""
+    """Return the corrections of the stated camera that make it one of those of the map's images; empty for images of several cameras.
+
+    Among the map's cameras with images of one shape, one that agrees with the stated intrinsics is chosen or, if there is none, the one
+    with the median focal length. A camera with only landscape images is turned to either side for a portrait image. An image of a
+    shape that the map does not have is compared with the map's images resized to it and, if its focal length is approximate,
+    with their centre crops.
+    """
     if not query.has_one_camera:
         return []
-    found = map_cameras(query.camera, landmarks.cameras, crops=query.approximate)
-    return [torch.cat([camera.correction, camera.correction.new_zeros(1)]) for camera in found]
+    stated, found = query.camera, list[Float[Tensor, "6"]]()
+    size = stated.width, stated.height
+    groups = cameras_at_size(landmarks.cameras, *size)
+    if not groups:
+        groups = stretched_cameras(landmarks.cameras, *size)
+        groups += centre_crop_cameras(landmarks.cameras, *size) if query.approximate else ()
+    nearly = torch.tensor(NEARLY, dtype=torch.float64)
+    for group in groups:
+        cameras = sorted(group, key=lambda camera: camera.fx)
+        chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS)).round().int().unique().tolist()
+        known = [correction_between(stated, cameras[i]) for i in chosen]
+        known = [correction for correction in known if correction is not None]
+        if known:
+            agreeing = [correction for correction in known if bool((correction.abs() <= 2 * nearly).all())]
+            found.append((agreeing or [known[(len(known) - 1) // 2]])[0])
+    return found
+
+
+@lru_cache(maxsize=256)
+def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"] | None:
+    """Return the correction of ``given`` intrinsics, in the order of ``NUISANCES``, that best matches ``true`` ones.
+
+    It minimizes the squared differences in pixels. None if these remain large.
+    """
+    true = true.resized(given.width, given.height)
+    u, v = (torch.linspace(0, size, GRID, dtype=torch.float64) for size in (given.width, given.height))
+    pixels = torch.stack(torch.meshgrid(u, v, indexing="ij"), dim=-1).reshape(-1, 2)
+    stated, real = (camera.unproject(pixels)[:, :2] for camera in (given, true))
+    steps = torch.eye(2, dtype=torch.float64)
+    # Derivative of points on the plane z = 1 with respect to the given camera's pixels; its inverse converts differences
+    # between such points to pixels.
+    slope = torch.stack([given.unproject(pixels + step)[:, :2] - stated for step in steps], dim=-1)
+    bend = real * real.square().sum(-1, keepdim=True)
+    # stated = factors real + shift + factors radial bend
+    ratio = real.new_tensor([given.fy * true.fx / (given.fx * true.fy), 1.0])
+    bend = bend * (ratio / ratio.prod().sqrt())
+    rows = torch.stack(
+        [*(real * step for step in steps), *(step.expand_as(real) for step in steps), bend], dim=-1
+    )
+    rows, target = torch.linalg.solve(slope, rows), torch.linalg.solve(slope, stated[..., None])
+    # The default driver pivots, and its last bits differ from call to call.
+    solved = torch.linalg.lstsq(rows.reshape(-1, 5), target.reshape(-1, 1), driver="gels").solution
+    left = (rows @ solved - target)[..., 0].norm(dim=-1)
+    across, down, shift_u, shift_v, bent = solved[:, 0]
+    if not bool(left.square().mean().sqrt() <= MAX_RESIDUAL * given.width) or min(across, down) <= 0:
+        return None
+    factor = (across * down).sqrt()
+    return torch.stack([factor.log(), shift_u, shift_v, bent / factor, (across / down).log(), 0 * bent])

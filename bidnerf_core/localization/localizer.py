@@ -20,7 +20,7 @@ from bidnerf_core.fields import Observations, device_of, render
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER
-from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import (
     USUAL_METHOD,
     Method,

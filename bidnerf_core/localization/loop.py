@@ -21,7 +21,7 @@ from bidnerf_core.localization.descend import (
     total,
 )
 from bidnerf_core.localization.explanations import Explanations, Seed, explanations
-from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, log10_nfa
 from bidnerf_core.localization.posterior import Posterior
 from bidnerf_core.localization.problem import Problem
@@ -33,7 +33,7 @@ from bidnerf_core.localization.states import Sights, States, project
 from bidnerf_core.localization.terms.landmarks import Landmarks, point_variance
 from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.mapping import Features, LandmarkMap
 
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which no mirror image is tried."""
@@ -114,13 +114,20 @@ class Answer:
 class Loop:
     """Localizes the images of one problem in a map by landmarks, measured depth and rendered colours."""
 
-    def __init__(self, problem: Problem, matcher: LandmarkMatcher, rays: int = 0, seed: int = 0) -> None:
-        """Detect keypoints; ``rays`` is the number that may be rendered, 0 for none."""
-        self.problem, self.matcher, self.seed = problem, matcher, seed
+    def __init__(
+        self, views: Sequence[View], matcher: LandmarkMatcher, problem: Problem | None = None, rays: int = 0, seed: int = 0,
+        features: Features | None = None, moving: bool = True,
+    ) -> None:  # fmt: skip
+        """Detect keypoints of ``views``, whose poses are relative to the last one.
+
+        Without a ``problem``, only landmarks are used. ``rays`` is the number that may be rendered, 0 for none. ``features`` detects
+        the keypoints, by default the map's detector. ``moving`` is whether the camera may have moved during the readout.
+        """
+        self.matcher, self.problem, self.seed, self.moving = matcher, problem, seed, moving
         self.landmarks: LandmarkMap = matcher.landmarks
-        self.query = Query.of(problem.views, matcher.features)
-        is_sharp = problem.colour_noise is None or problem.colour_noise <= SHARPEST
-        self.rays = rays if is_sharp else 0
+        self.query = Query.of(views, features or matcher.features)
+        noise = None if problem is None else problem.colour_noise
+        self.rays = rays if problem is not None and (noise is None or noise <= SHARPEST) else 0
         self._nearest: dict[int, Nearest] = {}
 
     @torch.no_grad()
@@ -144,8 +151,8 @@ class Loop:
 
     def answer(self, seed: Seed, nearest: Nearest, nfa: float, searched: bool = True) -> Answer | None:
         """Refine a seed under all explanations of the images, fuse all measurements, and judge the result."""
-        width = DEPTH_WIDTH * self.problem.sensor.scale
-        given = explanations(self.query, self.landmarks, seed.distance, width)
+        scale = 0.0 if self.problem is None else DEPTH_WIDTH * self.problem.sensor.scale
+        given = explanations(self.query, self.landmarks, seed.distance, scale, self.moving)
         modes, states = self._modes(nearest, seed, given, nfa, searched)
         if not modes:
             return None
@@ -174,8 +181,7 @@ class Loop:
             yield found[0], nearest, found[1]
             if found[1] < CONVINCING:
                 break
-        if self.problem.start is not None:
-            T = self.problem.start
+        if self.problem is not None and (T := self.problem.start) is not None:
             yield Seed("start", T, torch.zeros(6, dtype=torch.float64), self._distance(T)), nearest, 0.0
 
     def _distance(self, T_world_rig: SE3) -> float:
@@ -299,7 +305,7 @@ class Loop:
         best, quadratic = self._settled(best, landmarks, given)
         found = self._posterior(quadratic, landmarks, given)
         points, fused = None, list[str]()
-        if problem.surface is not None and problem.has_depth:
+        if problem is not None and problem.surface is not None and problem.has_depth:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
         if points is not None and found.mode == 0:
             points = points.fitted_noise(found.states[found.best : found.best + 1])
@@ -309,7 +315,12 @@ class Loop:
             quadratic = self._linearized(best, terms, given)
             found = self._posterior(quadratic, landmarks, given)
         before = found  # rays about one camera's pose must not decide between cameras
-        if self.rays and found.mode == 0 and self._blur(found, landmarks) > RAYS_BEYOND:
+        if (
+            problem is not None
+            and self.rays
+            and found.mode == 0
+            and self._blur(found, landmarks) > RAYS_BEYOND
+        ):
             here = found.states[found.best : found.best + 1]
             rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed).fitted(here)
             fused.append("rendering")
@@ -349,7 +360,7 @@ class Loop:
         systematic: Tensor | float = 0.0,
     ) -> Posterior:
         states = given.about(quadratic.here)
-        if (start := self.problem.start) is not None:
+        if self.problem is not None and (start := self.problem.start) is not None:
             # Of two places that look the same, the one nearer to the start is the likelier.
             update = (start.inverse() @ quadratic.here.T).log()
             away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)

@@ -18,7 +18,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, levels
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, LengthUnit
-from bidnerf_core.localization.landmarks.matching import LandmarkMatcher
+from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 
 _Item = TypeVar("_Item")

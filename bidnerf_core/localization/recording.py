@@ -17,7 +17,6 @@ from bidnerf_core.geometry import SE3
 
 if TYPE_CHECKING:
     from bidnerf_core.localization.loop import Answer
-    from bidnerf_core.localization.landmarks.pose import LandmarkPose
 
 MOST_POSES = 400
 """Maximum number of poses kept per step, the best ones."""
@@ -34,22 +33,11 @@ class RecordedStep:
     compared: bool = True  # whether they are scored rivals, instead of a step towards one pose
 
 
-@dataclass(frozen=True, eq=False)
-class ComparedExplanation:
-    """An alternative explanation of the images, and its comparison with the pose that was found."""
-
-    reason: str
-    log_odds: float  # of the found pose against it
-    T: SE3 | None  # its pose T_world_camera; None for a mirror image
-
-
 @dataclass(eq=False)
 class SearchRecord:
-    """The steps of a search, the poses by landmarks, and the compared explanations, in order."""
+    """The steps of a search and the answers by landmarks, in order."""
 
     steps: list[RecordedStep] = field(default_factory=list)
-    landmarks: list[LandmarkPose] = field(default_factory=list)
-    explanations: list[ComparedExplanation] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
 
     def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:

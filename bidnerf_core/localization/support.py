@@ -17,12 +17,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.landmarks.chance import odds
+from bidnerf_core.localization.accept import ACCEPTED
 from bidnerf_core.localization.pivot import Pivot
 from bidnerf_core.localization.result import Outcome, Verdict
 
-ACCEPTED = 0.8
-"""Minimum confidence of an accepted pose."""
 DISPLACEMENT = 0.1
 """Displacement of rivals: a fraction of the distance to the scene, and an angle about it in radians.
 
@@ -38,6 +36,12 @@ NO_RIVAL = 1000.0
 """Log odds against a rival that does not exist; finite, since records contain finite numbers."""
 LEAST_EXPLAINED = 0.5
 """Minimum fraction of an image's contrast that an accepted pose explains."""
+
+
+def odds(log_odds: float) -> float:
+    """Return the odds of given logarithm, limited to what floating-point numbers can hold."""
+    return math.exp(max(-500.0, min(500.0, log_odds)))
+
 
 Costs = Callable[[SE3], Float[Tensor, "h n"]]
 """Returns each of n measurements' part of the cost, from each of h poses."""

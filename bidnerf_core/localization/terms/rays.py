@@ -89,11 +89,7 @@ class Rays:
             flat, T, n = camera.unproject(pixels), view.T_ref_camera.to("cpu", torch.float64), len(pixels)
             depth = torch.zeros(n) if frame.depth is None else frame.depth.cpu()[row, column]
             depth = torch.where(depth.isfinite(), depth.clamp(min=0), 0).double() * flat.norm(dim=-1)
-            rgb = (
-                frame.colours_at(row, column).cpu()
-                if blur == 1
-                else averaged(frame, blur)[row, column]
-            )
+            rgb = frame.colours_at(row, column).cpu() if blur == 1 else averaged(frame, blur)[row, column]
             R, t = T.rotation.expand(n, 3, 3), T.translation.expand(n, 3)
             coloured = torch.full((n,), float(frame.has_colour)).double()
             parts.append((flat[:, :2], times, R, t, rgb.double(), coloured, depth))

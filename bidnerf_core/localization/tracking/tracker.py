@@ -28,7 +28,6 @@ from bidnerf_core.localization.matching import log10_nfa
 from bidnerf_core.localization.posterior import LEAST_DOUBT, Posterior
 from bidnerf_core.localization.problem import SceneMap, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.risk import within_risk
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig, TrackerConfig
 from bidnerf_core.localization.states import DEPTH, MOTION, N, P, States
 from bidnerf_core.localization.terms.landmarks import Landmarks

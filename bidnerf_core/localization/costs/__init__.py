@@ -1,1 +1,0 @@
-"""Cost terms: how well poses explain the measurements."""

@@ -1,1 +1,0 @@
-"""Solvers that minimize any cost of poses."""
