@@ -17,9 +17,11 @@ from bidnerf_core.captures.report import PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, mirror_image, propose
+from bidnerf_core.localization import MIRROR, Answer, LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import ImageKeypoints, LandmarkConfig, TrackedKeypoints, TrackedViews
 
+TELLING = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
+"""Outcomes of a localization that determine the pose, or which poses look the same."""
 SUSPECT = 0.5
 """A photo is suspect if the fraction of its keypoints that are landmarks is below this multiple of the median
 of its group."""
@@ -112,7 +114,7 @@ def relocated(
     numbers: Sequence[int],
     config: LandmarkConfig,
 ) -> dict[int, Relocation]:
-    """Localize the suspects with landmarks built without them, as they are and then mirrored.
+    """Localize the suspects with landmarks built without them.
 
     Of several poses that explain a photo, as in a building with identical rooms, the one nearest to the given
     pose is taken.
@@ -126,22 +128,18 @@ def relocated(
     answers: dict[int, Relocation] = {}
     for number in numbers:
         features = tracked.detector_of(views[number], number)
-        for mirrored in (False, True):
-            view = views[number]
-            if mirrored:
-                view = replace(view, frame=mirror_image(view.frame))
-            found = propose(matcher, [View(view.frame, SE3.identity())], features, seek_rivals=True)
-            if found is not None and landmark_verdict(found).accepted:
-                answers[number] = _compared(found, views[number], mirrored)
-                break
+        found = Loop([View(views[number].frame, SE3.identity())], matcher, features=features)()
+        if found is not None and found.verdict.outcome in TELLING:
+            answers[number] = _compared(found, views[number])
     return answers
 
 
-def _compared(found: LandmarkPose, view: View, mirrored: bool) -> Relocation:
-    T = view.T_ref_camera.to("cpu", torch.float64)
-    poses = [found.T_world_camera, *(rival.T_world_rig for rival in found.rivals)]
+def _compared(found: Answer, view: View) -> Relocation:
+    T, mirrored = view.T_ref_camera.to("cpu", torch.float64), found.verdict.outcome is Outcome.MIRRORED
+    places = [found.posterior.place(g) for g, mode in enumerate(found.modes) if mode.name != MIRROR]
+    poses = [found.T_world_rig] if mirrored else [found.T_world_rig, *places]
     update = min(((T.inverse() @ pose).log() for pose in poses), key=lambda each: float(each[:3].norm()))
-    deviations = float((update @ torch.linalg.solve(found.full_covariance, update)).clamp(min=0).sqrt())
+    deviations = float((update @ torch.linalg.solve(found.covariance, update)).clamp(min=0).sqrt())
     return Relocation(update, deviations, image_motion(update, view, found.distance), mirrored)
 
 

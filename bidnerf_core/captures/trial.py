@@ -17,7 +17,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, chi_squared_quantile
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, landmark_verdict, propose
+from bidnerf_core.localization import HEAVY_TAILS, Answer, LandmarkMatcher, Loop
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     USUAL_FEATURES,
@@ -44,13 +44,13 @@ CORRELATIONS = (1.0, 300.0)
 
 @dataclass(frozen=True, eq=False)
 class _Answer:
-    found: LandmarkPose
+    found: Answer
     update: Float[Tensor, "6"]  # right update from the given pose to the one found
 
     @property
     def matches(self) -> int:
         """The number of correspondences used to refine the pose."""
-        return len(self.found.correspondences)
+        return len(self.found.mode.matches)
 
 
 def build_tried_landmarks(
@@ -118,9 +118,9 @@ def _answers(
         view = View(views[number].frame, SE3.identity())
         # Poses found without a motion are compared with such poses.
         features, moving = tracked.detector_of(view, number), views[number].motion is not None
-        found = propose(matcher, [view], features, moving=moving)
-        if found is not None and landmark_verdict(found).accepted:
-            answers.append(_Answer(found, (T.inverse() @ found.T_world_camera).log()))
+        found = Loop([view], matcher, features=features, moving=moving)()
+        if found is not None and found.verdict.accepted:
+            answers.append(_Answer(found, (T.inverse() @ found.T_world_rig).log()))
     return answers
 
 
@@ -137,7 +137,7 @@ def _trial(answers: Sequence[_Answer], images: int) -> HeldOutTrial:
 def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
     """Return the ``correlation`` for which the errors are as large as the covariances of the fits predict."""
     updates = torch.stack([answer.update for answer in answers])
-    covariances = torch.stack([answer.found.covariance for answer in answers])
+    covariances = torch.stack([answer.found.covariance / HEAVY_TAILS for answer in answers])
     expected = chi_squared_quantile(QUANTILE, 6)
     low, high = CORRELATIONS
     for _ in range(30):  # bisection, geometrically
@@ -165,9 +165,10 @@ def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> 
 
     The part explained by the uncertainty of each fit is subtracted.
     """
-    posteriors = [answer.found.guided.posterior for answer in answers if answer.found.guided is not None]
-    apparent = torch.stack([posterior.apparent[:4] for posterior in posteriors])
-    noise = torch.stack([posterior.deviations[:4] for posterior in posteriors])
+    widest = [
+        found.posterior.camera_of(found.explanations.widest) for found in (each.found for each in answers)
+    ]
+    apparent, noise = (torch.stack([camera[part][:4] for camera in widest]) for part in (0, 1))
     explained = _factors(answers, landmarks)[:, None] * noise.square()
     low, high = torch.full((4,), 1e-5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
     for _ in range(30):

@@ -163,9 +163,7 @@ def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = No
         fields = [f.name for f in dataclasses.fields(value) if f.init]
         return {name: to_plain(getattr(value, name), _inside(where, name), tensors) for name in fields}
     if isinstance(value, dict):
-        return {
-            _key(key, where): to_plain(item, _inside(where, key), tensors) for key, item in value.items()
-        }
+        return {_key(key, where): to_plain(item, _inside(where, key), tensors) for key, item in value.items()}
     if isinstance(value, tuple | list):
         return [to_plain(item, f"{where}[{place}]", tensors) for place, item in enumerate(value)]
     if isinstance(value, Tensor) and tensors is not None:

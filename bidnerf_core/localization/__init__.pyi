@@ -7,6 +7,7 @@ from .accept import features as features
 from .adam import AdamSteps as AdamSteps
 from .adam import captured as captured
 from .advice import ADVICE as ADVICE
+from .auto import localization_of as localization_of
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
 from .explanations import MOVING as MOVING
@@ -14,6 +15,8 @@ from .localizer import Localizer as Localizer
 from .localizer import Start as Start
 from .localizer import checked_map as checked_map
 from .localizer import start_pose as start_pose
+from .loop import HEAVY_TAILS as HEAVY_TAILS
+from .loop import MIRROR as MIRROR
 from .loop import Answer as Answer
 from .loop import Loop as Loop
 from .matching import LandmarkMatcher as LandmarkMatcher

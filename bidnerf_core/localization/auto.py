@@ -46,7 +46,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     if problem.matcher is not None and config.landmarks:
         loop = Loop(problem.views, problem.matcher, problem, config.fused_rays, seed)
     answer = None if loop is None else loop()
-    found = None if answer is None else localization(problem, answer, began)
+    found = None if answer is None else localization_of(problem, answer, began)
     if found is None or not (found.converged or found.outcome in FINAL):
         found = _on_surface(problem, config, seed, loop, found, began)
     found = replace(found, seconds=time.perf_counter() - began)
@@ -86,7 +86,7 @@ def _on_surface(
             found = replace(found, reason=f"{found.reason}, {hidden}")
         there = None if loop is None else loop.at(found.T_world_camera)
         if there is not None and there.verdict.accepted:
-            refined = localization(problem, there, began)
+            refined = localization_of(problem, there, began)
             return replace(refined, reason=f"found on the surface; {refined.reason}")
         if there is not None and found.converged and there.contradicted:
             why = f"{there.evidence.inliers} landmarks match, {there.evidence.by_chance:.0f} by chance"
@@ -110,7 +110,7 @@ def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
     return found.rejected(Verdict(Outcome.IMPRECISE, why))
 
 
-def localization(problem: Problem, answer: Answer, began: float) -> Localization:
+def localization_of(problem: Problem, answer: Answer, began: float) -> Localization:
     """Convert an answer of the loop."""
     T, noise = answer.T_world_rig, float(answer.posterior.states.noise[answer.posterior.best])
     poses = [T] if problem.start is None else [problem.start, T]

@@ -115,6 +115,11 @@ class Explanations:
         return len(self.names)
 
     @property
+    def widest(self) -> int:
+        """The number of the explanation at rest that leaves the camera most freedom."""
+        return int((self.deviation[:, :6].sum(-1) - self.deviation[:, 6:12].sum(-1)).argmax())
+
+    @property
     def prior_of_all(self) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
         """Mean and deviation of a prior that fixes nothing which any explanation frees."""
         return torch.zeros(N, dtype=torch.float64), self.deviation.amax(0)
@@ -152,7 +157,9 @@ class Explanations:
         return States(free.T[index], z, *parts, free.noise[index], free.mode[index], row)
 
 
-def explanations(query: Query, landmarks: LandmarkMap, distance: float, depth_scale: float, moving: bool = True) -> Explanations:
+def explanations(
+    query: Query, landmarks: LandmarkMap, distance: float, depth_scale: float, moving: bool = True
+) -> Explanations:
     """Return all explanations of the images; ``distance`` (metres) is that of the scene, for the prior of a motion, and
     ``depth_scale`` the relative deviation of measured depth.
 
@@ -215,7 +222,13 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
     nearly = torch.tensor(NEARLY, dtype=torch.float64)
     for group in groups:
         cameras = sorted(group, key=lambda camera: camera.fx)
-        chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS)).round().int().unique().tolist()
+        chosen = (
+            torch.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS))
+            .round()
+            .int()
+            .unique()
+            .tolist()
+        )
         known = [correction_between(stated, cameras[i]) for i in chosen]
         known = [correction for correction in known if correction is not None]
         if known:

@@ -21,8 +21,14 @@ from bidnerf_core.localization.descend import (
     total,
 )
 from bidnerf_core.localization.explanations import Explanations, Seed, explanations
-from bidnerf_core.localization.matching import LandmarkMatcher
-from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, log10_nfa
+from bidnerf_core.localization.matching import (
+    STRONGEST,
+    LandmarkMatcher,
+    Matches,
+    Nearest,
+    Projected,
+    log10_nfa,
+)
 from bidnerf_core.localization.posterior import Posterior
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
@@ -35,6 +41,8 @@ from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import Features, LandmarkMap
 
+MIRROR = "mirror image"
+"""Name of the mode of an image whose mirror image fits."""
 UNMISTAKABLE = -150.0
 """Log10 of the number of false alarms below which no mirror image is tried."""
 DEPTH_WIDTH = 2.0
@@ -291,7 +299,7 @@ class Loop:
             rivals.append(("another place", query, others))
         if nfa > UNMISTAKABLE and self.landmarks.features == "sift" and len(query.images) == 1:
             mirrored = query.mirrored
-            rivals.append(("mirror image", mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
+            rivals.append((MIRROR, mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
         for name, there, found in rivals:
             other = consensus(there, self.landmarks, found, best[0].nuisances[0, :6], name)
             if other is not None:
@@ -411,7 +419,7 @@ class Loop:
             colour_inliers=None if near is None or alike is None else float((near * alike).mean()),
         )  # fmt: skip
         verdict = accept(evidence)
-        if mode.name == "mirror image":
+        if mode.name == MIRROR:
             verdict = Verdict(
                 Outcome.MIRRORED, f"the mirror image has {count} landmark inliers", verdict.confidence
             )

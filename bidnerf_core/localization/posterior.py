@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.descend import Normal, Quadratic, log_evidence, unit_of
-from bidnerf_core.localization.states import P, States
+from bidnerf_core.localization.states import CAMERA, P, States
 from bidnerf_core.localization.terms.landmarks import Landmarks
 
 BY_SHARE = 10.0
@@ -82,6 +82,18 @@ class Posterior:
 
     def pose(self) -> SE3:
         return self.states.T[self.best].retract(self.mean)
+
+    def place(self, mode: int) -> SE3:
+        """Return the most probable pose of a mode."""
+        own = torch.where(self.states.mode == mode, self.probability, -1.0)
+        return self.states.T[int(own.argmax())]
+
+    def camera_of(self, row: int) -> tuple[Float[Tensor, "6"], Float[Tensor, "6"]]:
+        """Return the correction of the stated camera under an explanation of the best mode, and its standard deviations."""
+        index = int(((self.states.mode == self.mode) & (self.states.row == row)).nonzero()[0, 0])
+        deviation = self.states.deviation[index, CAMERA]
+        variance = torch.linalg.inv_ex(self.normal.hessian[index]).inverse.diagonal()[6:][CAMERA]
+        return self.states.nuisances[index, CAMERA], deviation * variance.clamp(min=0).sqrt()
 
     def mixture(self) -> Float[Tensor, "6 6"]:
         """Return the covariance of the pose over the most probable mode."""

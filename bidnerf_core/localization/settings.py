@@ -18,8 +18,8 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.frames import DrawerName
 from bidnerf_core.geometry import Robust, RobustName
-from bidnerf_core.localization.pivot import PivotName
 from bidnerf_core.localization.accept import least_confidence
+from bidnerf_core.localization.pivot import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 RENDERED_DEPTH_SHARE = 0.038

@@ -23,9 +23,9 @@ from bidnerf_core.localization import (
     USUAL_METHOD,
     Localization,
     Localizer,
+    Loop,
     Outcome,
-    answer_by_landmarks,
-    localization_by_landmarks,
+    localization_of,
     origin_of,
     unit_of,
 )
@@ -184,14 +184,13 @@ class MapCollection:
             if not localizer.matches_landmarks or localizer.matcher is None:
                 return localizer(frame, seed=seed)
             began, problem = time.perf_counter(), localizer.problem(frame)
-            answer = answer_by_landmarks(
-                problem, problem.matcher or localizer.matcher, localizer.shared.rays, seed
-            )
+            matcher = problem.matcher or localizer.matcher
+            answer = Loop(problem.views, matcher, problem, localizer.shared.rays, seed)()
         except InputError as error:  # such as a map without a surface
             return _unrecognised(str(error), self.method)
         if answer is None:
             return _unrecognised("hardly any landmark of the map is in the image", self.method)
-        found = replace(localization_by_landmarks(problem, answer, began), unit=unit_of(localizer.scene))
+        found = replace(localization_of(problem, answer, began), unit=unit_of(localizer.scene))
         return found.translated(origin_of(localizer.scene))
 
     def _index(self, progress: ProgressCallback | None, cancel: Cancel | None) -> None:

@@ -14,7 +14,6 @@ from PIL import Image
 from torch import Generator, Tensor
 
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization import KERNEL_REACH
 
 
 def exposure(frame: Frame, factor: float, generator: Generator) -> Frame:
@@ -31,7 +30,7 @@ def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Blur the colours with a Gaussian whose standard deviation is ``pixels``. Depth stays sharp."""
     if pixels == 0:
         return frame
-    size = 2 * max(1, round(KERNEL_REACH * pixels)) + 1
+    size = 2 * max(1, round(3 * pixels)) + 1
     smallest = min(frame.rgb.shape[:2])
     size = min(
         size, smallest - 1 + smallest % 2

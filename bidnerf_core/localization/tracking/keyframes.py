@@ -18,8 +18,7 @@ from bidnerf_core.camera import Intrinsics, exposure_times
 from bidnerf_core.depth import DepthNoise
 from bidnerf_core.frames import Frame, View, visible_at
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.matching import LandmarkMatcher
-from bidnerf_core.localization.matching import OBLIQUE, Matches, Nearest, Projected
+from bidnerf_core.localization.matching import OBLIQUE, LandmarkMatcher, Matches, Nearest, Projected
 from bidnerf_core.localization.propose import consensus
 from bidnerf_core.localization.query import THRESHOLD, Query
 from bidnerf_core.localization.states import Sights, States

@@ -18,11 +18,11 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, USUAL, skew, update_between
 from bidnerf_core.localization.accept import Evidence, accept
+from bidnerf_core.localization.auto import auto, within_risk
 from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.descend import Normal, Quadratic, Term, descend, log_evidence, total
 from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, TURN
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
-from bidnerf_core.localization.auto import auto, within_risk
 from bidnerf_core.localization.loop import ANGLE, TOLERANCE
 from bidnerf_core.localization.matching import log10_nfa
 from bidnerf_core.localization.posterior import LEAST_DOUBT, Posterior
