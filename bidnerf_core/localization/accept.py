@@ -31,6 +31,7 @@ class Evidence:
     noise_ratio: float  # keypoints' noise relative to that of the map's images
     other_place: float  # probability of another place or of a mirrored image
     credible: float  # probability of the explanations of the camera under which a pose counts as right
+    replaced: float  # probability that neither the stated camera nor the map's is even approximately right
     precision: float  # standard deviation of the position relative to the scene's distance
     mass: float  # probability that the pose is within the tolerance, and its camera credible
     searched: bool  # whether landmarks found the pose, or only confirm one found by other means
@@ -96,7 +97,7 @@ def features(found: Evidence) -> dict[str, float]:
         "spread": found.spread,
         "precision": math.log10(min(max(found.precision, 1e-4), 1.0)),
         "mass": -math.log10(max(1 - found.mass, 1e-4)),
-        "incredible": math.log10(max(1 - found.credible, 1e-6)),
+        "replaced": found.replaced,
         "confirmed_only": 0.0 if found.searched else 1.0,
         # Without measured points, the surface neither supports nor contradicts a pose.
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,

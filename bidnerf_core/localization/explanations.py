@@ -81,6 +81,8 @@ GRID = 7
 """Number of rows and columns of pixels at which cameras are compared."""
 TRUST_AS_MAP = 0.1
 """Factor of the probability of other than the stated intrinsics if those are the intrinsics of the map's images."""
+USUAL = ("exact", "right", "inexact", "nominal", "map", "map, about")
+"""Explanations by which the stated camera or one of the map's is at least approximately right."""
 MOVING = " moving"
 """Ending of the names of explanations in motion."""
 SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
@@ -113,6 +115,11 @@ class Explanations:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def usual(self) -> Bool[Tensor, "k"]:
+        """Mask of those by which the stated camera or one of the map's is at least approximately right."""
+        return torch.tensor([name.removesuffix(MOVING) in USUAL for name in self.names])
 
     @property
     def widest(self) -> int:

@@ -20,7 +20,7 @@ from bidnerf_core.localization.descend import (
     prior,
     total,
 )
-from bidnerf_core.localization.explanations import Explanations, Seed, explanations
+from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Seed, explanations
 from bidnerf_core.localization.matching import (
     STRONGEST,
     LandmarkMatcher,
@@ -114,7 +114,7 @@ class Answer:
     @property
     def camera(self) -> Float[Tensor, "6"] | None:
         """The correction of the stated camera, or None if that is at least approximately right."""
-        if self.explanation.removesuffix(" moving") in ("exact", "right", "inexact"):
+        if self.explanation.removesuffix(MOVING) in USUAL[:3]:
             return None
         return self.posterior.states.nuisances[self.posterior.best, :6]
 
@@ -413,7 +413,7 @@ class Loop:
             spread=len(cells.unique()) / CELLS**2 / len(query.images),
             noise_ratio=float(state.noise) / self.landmarks.noise,
             other_place=float(found.probability[found.states.mode != found.mode].sum()),
-            credible=float(found.probability[credible].sum()), precision=position / distance,
+            credible=float(found.probability[credible].sum()), replaced=float(found.probability[~given.usual[found.states.row]].sum()), precision=position / distance,
             mass=min(x.mass(distance, shared, TOLERANCE, ANGLE, credible) for x in (found, before)), searched=searched,
             on_surface=None if near is None else float(near.mean()),
             colour_inliers=None if near is None or alike is None else float((near * alike).mean()),

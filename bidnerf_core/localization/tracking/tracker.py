@@ -536,7 +536,7 @@ class Tracker:
             log10_nfa=nfa, inliers=count, by_chance=chance, recall=recall, spread=kept.spread(fit.camera),
             noise_ratio=state.noise / self._landmarks.noise, precision=_position_deviation(covariance) / fit.distance,
             mass=fused.mass(fit.distance, 0 * covariance, TOLERANCE, ANGLE, one > 0),
-            other_place=0.0, credible=1.0, searched=True,
+            other_place=0.0, credible=1.0, replaced=0.0, searched=True,
         )  # fmt: skip
         verdict = accept(evidence)
         if verdict.accepted and not fit.is_recognised and not fit.is_accurate:
