@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
+
+# Inside: the derivatives of single rays are compared with differences; a solver only shows their sum
+from bidnerf_core.localization.costs.linearization import linearize
 from torch import Tensor
 
 from bidnerf_core.fields import (
@@ -21,9 +24,6 @@ from bidnerf_core.fields import (
     render,
 )
 from bidnerf_core.geometry import SE3
-
-# Inside: the derivatives of single rays are compared with differences; a solver only shows their sum
-from bidnerf_core.localization.costs.linearization import linearize
 from bidnerf_core.testing import check_hits
 
 SOFT = 0.01  # metres: standard deviation of the density about a sheet

@@ -13,6 +13,10 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from bidnerf_core.localization.acceptance import is_blank
+from bidnerf_core.localization.costs.images import thumbnail
+from bidnerf_core.localization.costs.rendered import blurred
+from bidnerf_core.localization.landmarks.correspondences import query_images
 
 from bidnerf_core import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence, train
 from bidnerf_core.camera import Orientation, Raster
@@ -23,10 +27,6 @@ from bidnerf_core.carving import FreeSpace
 from bidnerf_core.datasets import wholly_hidden, with_all
 from bidnerf_core.fields import RenderedImage
 from bidnerf_core.frames import DRAWERS, DrawerName, MaskFolder, WhollyHidden, masks_sentence, read_mask
-from bidnerf_core.localization.acceptance import is_blank
-from bidnerf_core.localization.costs.images import thumbnail
-from bidnerf_core.localization.costs.rendered import blurred
-from bidnerf_core.localization.landmarks.correspondences import query_images
 from bidnerf_core.mapping import SIFT, tracked_views
 from bidnerf_core.maps import rendering_scores
 from bidnerf_core.scenes import demo_object
