@@ -93,7 +93,7 @@ def test_a_frame_is_as_taken_with_the_intrinsics_of_the_answer() -> None:
     assert FOUND.frame_as_taken(frame) is frame
     taken = replace(FOUND, intrinsics=corrected).frame_as_taken(frame)
     assert taken.intrinsics == corrected
-    assert taken.rgb is frame.rgb
+    assert taken.rgb_bytes is frame.rgb_bytes
     assert FOUND.plain()["intrinsics"] is None
     stored = replace(FOUND, intrinsics=corrected).plain()["intrinsics"]
     assert from_plain(Intrinsics, json.loads(json.dumps(stored)), "") == corrected
