@@ -34,7 +34,7 @@ import lzma
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,7 @@ from bidnerf_core.evaluation import VERSIONS, RowStore, faulty, provenance, rand
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import write_file
+from bidnerf_core.localization import Evidence
 
 SEED = 0
 FRAMES = 24
@@ -221,7 +222,15 @@ def spread(names: Sequence[str], count: int) -> list[str]:
 # Questions, and answers to them.
 
 UNKNOWN = dict.fromkeys(
-    ("translation", "rotation_deg", "normalized_error_squared", "pose", "covariance", "confidence")
+    (
+        "translation",
+        "rotation_deg",
+        "normalized_error_squared",
+        "pose",
+        "covariance",
+        "confidence",
+        "evidence",
+    )
 )
 """What is not known of an image that could not be localized at all."""
 
@@ -251,6 +260,7 @@ class Question:
         if errors[0]["translation"] is not None:
             errors = [some | {"translation": some["translation"] / self.unit} for some in errors]
             errors.sort(key=lambda some: some["translation"])
+        evidence = asdict(found.diagnostics) if isinstance(found.diagnostics, Evidence) else None
         pose, covariance = found.T_world_camera.matrix()[:3], found.covariance
         upper = None if covariance is None else covariance[tuple(torch.triu_indices(6, 6))]
         return errors[0] | {
@@ -259,7 +269,7 @@ class Question:
             "covariance": None if upper is None or not bool(upper.isfinite().all())
             else [float(str(value)) for value in upper.float().numpy()],
             "converged": found.converged, "outcome": str(found.outcome), "reason": found.reason,
-            "confidence": found.confidence, "cpu_seconds": seconds,
+            "confidence": found.confidence, "cpu_seconds": seconds, "evidence": evidence,
         }  # fmt: skip
 
 

@@ -1,9 +1,9 @@
 r"""Learn the confidence of method ``auto`` in poses by landmarks from answers to images with and without faults, and test it on others.
 
-    python benchmarks/faults.py MAP:DATA ... --tuning-frames --name NAME
-    python benchmarks/confidence.py benchmarks/results/NAME.rows.jsonl [...] [--write]
+    python benchmarks/answers.py MAP [MAP ...] --out ROWS.jsonl
+    python benchmarks/confidence.py ROWS.jsonl [...] [--write]
 
-Each row of ``benchmarks/faults.py`` with a pose by landmarks is an example, unless the query's mirror image ruled it out; it is
+Each row of ``benchmarks/answers.py`` with a pose by landmarks is an example, unless the query's mirror image ruled it out; it is
 right within 5 degrees and 0.05 units. A logistic regression with a small ridge penalty is fitted. Its quality is measured by
 leaving out one scene at a time: the model is fitted to the other scenes and tested on the one left out (expected calibration error in ten bins, wrong answers among the accepted, right
 ones among the rejected). A harder test also leaves out one half of the faults, so that the model is tested on kinds of failure
@@ -26,17 +26,17 @@ from scipy.special import expit
 import bidnerf_core
 from bidnerf_core.localization import (
     ACCEPTED,
-    LandmarkDiagnostics,
+    Evidence,
     LogisticModel,
     Outcome,
-    landmark_features,
+    features,
 )
 
-STORED = Path(bidnerf_core.__file__).parent / "localization" / "confidence.json"
+STORED = Path(bidnerf_core.__file__).parent / "localization" / "acceptance.json"
 RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
-GOOD = ("inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers")
-BAD = ("noise_ratio", "precision", "miscalibration")
+GOOD = ("inliers", "above_chance", "recall", "spread", "mass", "on_surface", "colour_inliers")
+BAD = ("noise_ratio", "precision", "replaced")
 """Features whose larger values can only raise (GOOD) or only lower (BAD) the confidence: examples are too few to show each."""
 BINS = 10
 WITHOUT_CONFIDENCE = (Outcome.MIRRORED, Outcome.AMBIGUOUS)
@@ -61,17 +61,17 @@ def examples(paths: Sequence[Path]) -> list[Example]:
     for path in paths:
         for text in path.read_text().splitlines():
             row = json.loads(text)
-            row = row.get("row", row)
-            if "inliers" in (row.get("diagnostics") or {}) and row["outcome"] not in WITHOUT_CONFIDENCE:
-                found.append(example(row))
+            key, row = json.loads(row["key"]), row["row"]
+            if row.get("evidence") is not None and row["outcome"] not in WITHOUT_CONFIDENCE:
+                found.append(example(key, row))
     return found
 
 
-def example(row: dict[str, Any]) -> Example:
-    said, error = row["diagnostics"], row["translation"]
+def example(key: Sequence[str], row: dict[str, Any]) -> Example:
+    scene, _, condition, _ = key
+    error = row["translation"]
     right = error is not None and error < 0.05 and row["rotation_deg"] < 5
-    features = landmark_features(LandmarkDiagnostics(**said))
-    return Example(features, right, row["scene"], row["fault"])
+    return Example(features(Evidence(**row["evidence"])), right, scene, condition)
 
 
 def fitted(given: Sequence[Example], ridge: float = RIDGE) -> LogisticModel:
@@ -95,7 +95,7 @@ def fitted(given: Sequence[Example], ridge: float = RIDGE) -> LogisticModel:
     start = np.zeros(len(names) + 1)
     best = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[*bounds, (None, None)]).x
     weights = best[:-1] / deviation
-    return LogisticModel(names, tuple(weights.tolist()), float(best[-1] - weights @ mean))
+    return LogisticModel(dict(zip(names, weights.tolist(), strict=True)), float(best[-1] - weights @ mean))
 
 
 def folds(given: Sequence[Example], by_fault: bool) -> list[tuple[list[Example], list[Example]]]:
@@ -178,12 +178,12 @@ def main() -> None:
     }
     for name, found in results.items():
         print(f"tested on {name}: {line(found.get('all', found))}")
-    for name, weight in zip(model.features, model.weights, strict=True):
+    for name, weight in model.weights.items():
         print(f"  {name:22} {weight:+.2f}")
-    stored = {"features": model.features, "weights": model.weights, "bias": model.bias}
     record = _lab.record(given.name, {"examples": len(everything), "held_out": {"landmarks": results}})
     if given.write:
-        text = json.dumps({"source": record.name, "models": {"landmarks": stored}}, indent=1)
+        stored = json.loads(STORED.read_text()) | {"source": record.name, "landmarks": vars(model)}
+        text = json.dumps(stored, indent=1)
         STORED.write_text(text + "\n")
         print(STORED)
 

@@ -43,7 +43,7 @@ from bidnerf_core import SE3, Frame, View
 from bidnerf_core.captures import build_tried_landmarks
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.evaluation import RowStore
-from bidnerf_core.localization import LandmarkMatcher, landmark_verdict, propose
+from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import Features, find_features
 from bidnerf_core.results import normalized_error_squared, pose_error
 
@@ -86,16 +86,16 @@ def detector(name: str) -> Features:
 def localized(landmarks: LandmarkMatcher, features: Features, query: View) -> Row:
     """Localize one frame by landmarks alone, and return its errors, whether its pose is accepted, and the CPU time."""
     began = time.process_time()
-    found = propose(landmarks, [View(query.frame, SE3.identity())], features)
+    found = Loop([View(query.frame, SE3.identity())], landmarks, features=features)()
     row: Row = {"cpu_seconds": time.process_time() - began, "converged": False, "matches": 0}
     row |= dict.fromkeys(("translation", "rotation_deg", "normalized_error_squared"))
     if found is None:
         return row
-    error = pose_error(found.T_world_camera, query.T_ref_camera)
-    squared = normalized_error_squared(found.T_world_camera, query.T_ref_camera, found.stated_covariance)
+    error = pose_error(found.T_world_rig, query.T_ref_camera)
+    squared = normalized_error_squared(found.T_world_rig, query.T_ref_camera, found.covariance)
     return row | {
-        "converged": landmark_verdict(found).accepted,
-        "matches": len(found.correspondences),
+        "converged": found.verdict.accepted,
+        "matches": len(found.mode.matches),
         "translation": float(error.translation),
         "rotation_deg": float(error.rotation_deg),
         "normalized_error_squared": float(squared),

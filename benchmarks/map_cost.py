@@ -34,7 +34,7 @@ from bidnerf_core import SE3, View, load_map
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import forget_peak_memory, peak_memory_bytes
-from bidnerf_core.localization import LandmarkMatcher, landmark_verdict, propose
+from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import LandmarkMap, build_landmarks, concatenated
 from bidnerf_core.results import pose_error, success_rate
 
@@ -129,17 +129,17 @@ def searched(scene: LandmarkMap, sizes: Sequence[int], views: Sequence[View]) ->
         })  # fmt: skip
     seconds: list[list[float]] = [[] for _ in sizes]
     right = [0] * len(sizes)
-    propose(
-        matchers[0], [View(without_depth(views[0]).frame, SE3.identity())]
-    )  # the first query loads libraries
+    Loop(
+        [View(without_depth(views[0]).frame, SE3.identity())], matchers[0]
+    )()  # the first query loads libraries
     for view in views:
         query = View(without_depth(view).frame, SE3.identity())
         for number, matcher in enumerate(matchers):
             began = time.process_time()
-            found = propose(matcher, [query], seek_rivals=True)
+            found = Loop([query], matcher)()
             seconds[number].append(time.process_time() - began)
-            if found is not None and landmark_verdict(found).accepted:
-                error = pose_error(found.T_world_camera, view.T_ref_camera)
+            if found is not None and found.verdict.accepted:
+                error = pose_error(found.T_world_rig, view.T_ref_camera)
                 right[number] += bool(error.translation < 0.05 and error.rotation_deg < 5)
     for row, taken, count in zip(rows, seconds, right, strict=True):
         row["right"] = asdict(success_rate(count, len(views)))

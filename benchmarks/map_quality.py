@@ -39,7 +39,7 @@ from bidnerf_core.fields import RadianceField, SceneBounds, device_of, levels, r
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain
-from bidnerf_core.localization import LandmarkMatcher, confirm
+from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.maps import Map, load_map
 from bidnerf_core.training import fitted_colours
 
@@ -132,11 +132,11 @@ def at_landmark_poses(stored: Map, views: list[View]) -> dict[str, Any] | None:
     matcher, placed, given, updates = LandmarkMatcher(stored.landmarks), [], [], []
     for view in views:
         T = view.T_ref_camera.to("cpu", torch.float64)
-        found = confirm(matcher, [View(view.frame, SE3.identity())], T).pose
-        if found is not None and found.inliers >= LEAST_LANDMARKS:
+        found = Loop([View(view.frame, SE3.identity())], matcher).at(T)
+        if found is not None and found.evidence.inliers >= LEAST_LANDMARKS:
             given.append(view)
-            placed.append(View(view.frame, found.T_world_camera, motion=found.motion))
-            updates.append((T.inverse() @ found.T_world_camera).log())
+            placed.append(View(view.frame, found.T_world_rig, motion=found.motion))
+            updates.append((T.inverse() @ found.T_world_rig).log())
     if not placed:
         return None
     translation, rotation = (

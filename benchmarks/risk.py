@@ -1,8 +1,8 @@
 r"""Calibrate the confidence that method ``auto`` requires for a tolerated risk, and test it on other answers.
 
-    python benchmarks/risk.py benchmarks/results/NAME.rows.jsonl [...] [--write]
+    python benchmarks/risk.py ROWS.jsonl [...] [--write]
 
-The risk is the share of wrong answers among the accepted ones. The rows are those of ``benchmarks/faults.py`` on frames that
+The risk is the share of wrong answers among the accepted ones. The rows are those of ``benchmarks/answers.py`` on frames that
 the confidence was not fitted to; answers that are accepted without a tolerated risk are the examples. For each risk, the least
 confidence is sought whose upper confidence bound of the share of wrong answers (Clopper and Pearson 1934) is at most the risk.
 The thresholds are tested in a fixed order, so that all tests together err with probability ``ERROR`` at most (Learn then Test,
@@ -73,8 +73,10 @@ def examples(paths: Iterable[Path]) -> tuple[list[Row], int]:
     rows = {}
     for path in paths:
         for text in path.read_text().splitlines():
-            row = json.loads(text)["row"]
-            rows[row["scene"], row["mode"], row["fault"], row["frame"]] = row
+            stored = json.loads(text)
+            if (key := json.loads(stored["key"]))[0] != "about":
+                names = dict(zip(("scene", "mode", "fault", "frame"), key, strict=True))
+                rows[tuple(key)] = stored["row"] | names | {"diagnostics": stored["row"].get("evidence")}
     accepted = [row for row in rows.values() if row["converged"]]
     known = [row for row in accepted if row.get("confidence") is not None]
     return known, len(accepted) - len(known)

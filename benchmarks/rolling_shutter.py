@@ -22,25 +22,27 @@ from torch import Generator
 from bidnerf_core import View
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import rolling_shutter
-from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import MOVING, LandmarkMatcher, Loop
+from bidnerf_core.localization import Answer as Found
 from bidnerf_core.results import pose_error, success_rate, within
 
 WAYS = {"with motion": True, "taken as still": False}
-Answer = tuple[LandmarkPose, View, float]
+Answer = tuple[Found, View, float]
 """The pose found, the view, and the CPU seconds taken."""
 
 
 def summary(answers: Sequence[Answer], tried: int) -> dict[str, Any]:
     """Return the statistics of answers."""
-    errors = [pose_error(found.T_world_camera, view.T_ref_camera) for found, view, _ in answers]
-    inside = sum(bool(within(f.T_world_camera, v.T_ref_camera, f.full_covariance)) for f, v, _ in answers)
+    errors = [pose_error(found.T_world_rig, view.T_ref_camera) for found, view, _ in answers]
+    inside = sum(bool(within(f.T_world_rig, v.T_ref_camera, f.covariance)) for f, v, _ in answers)
     return {
         "tried": tried,
         "found": len(answers),
         "median_translation": median(float(error.translation) for error in errors),
         "median_rotation_deg": median(float(error.rotation_deg) for error in errors),
         "inside_95": asdict(success_rate(inside, len(answers))),
-        "show_a_motion": sum(found.has_motion for found, _, _ in answers),
+        "show_a_motion": sum(found.explanation.endswith(MOVING) for found, _, _ in answers),
         "median_cpu_seconds": median(seconds for _, _, seconds in answers),
     }
 
@@ -54,7 +56,9 @@ def compared(matcher: LandmarkMatcher, views: Sequence[View], degrees: float) ->
             shown = rolling_shutter(shown, degrees, Generator().manual_seed(number))
         for way in in_turn(list(WAYS), number):
             began = time.process_time()
-            found = propose(matcher, [replace(view, frame=shown)], moving=WAYS[way])
+            found = Loop(
+                [replace(view, T_ref_camera=SE3.identity(), frame=shown)], matcher, moving=WAYS[way]
+            )()
             if found is not None:
                 answers[way].append((found, view, time.process_time() - began))
     return {way: summary(found, len(views)) for way, found in answers.items() if found}

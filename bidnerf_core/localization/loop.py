@@ -35,7 +35,7 @@ from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_c
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.states import Sights, States, project
+from bidnerf_core.localization.states import MOTION, Sights, States, project
 from bidnerf_core.localization.terms.landmarks import Landmarks, point_variance
 from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
 from bidnerf_core.localization.terms.surface import Surface
@@ -110,6 +110,11 @@ class Answer:
     def explanation(self) -> str:
         """The name of the most probable explanation."""
         return self.explanations.names[int(self.posterior.states.row[self.posterior.best])]
+
+    @property
+    def motion(self) -> Float[Tensor, "6"]:
+        """The motion during the readout, from the first row to the last."""
+        return self.posterior.states.nuisances[self.posterior.best, MOTION]
 
     @property
     def camera(self) -> Float[Tensor, "6"] | None:

@@ -9,7 +9,7 @@ import torch
 
 from bidnerf_core import InputError, Localization
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import Method, Outcome, Problem, propose
+from bidnerf_core.localization import Loop, Method, Outcome, Problem
 from bidnerf_core.settings import Settings
 
 
@@ -25,18 +25,19 @@ def solve(problem: Problem, config: LandmarksAloneConfig, seed: int) -> Localiza
     if problem.matcher is None:
         raise InputError("method 'landmarks-alone' needs a map with landmarks, which 'bidnerf bake' builds")
     began = time.perf_counter()
-    found = propose(problem.matcher, problem.views, seed=seed)
-    agreeing = 0 if found is None else found.agreeing
+    found = Loop(problem.views, problem.matcher, seed=seed)()
+    agreeing = 0 if found is None else found.evidence.inliers
+    T = SE3.identity() if found is None else found.T_world_rig
     accepted = found is not None and agreeing >= config.least_inliers
     return Localization(
-        T_world_camera=SE3.identity() if found is None else found.T_world_camera,
+        T_world_camera=T,
         outcome=Outcome.CONVERGED if accepted else Outcome.TOO_FEW_MATCHES,
         reason=f"{agreeing} landmark inliers, {config.least_inliers} are needed",
         steps=0,
         seconds=time.perf_counter() - began,
-        loss=0.0 if found is None else float(found.residuals.square().mean()),
+        loss=0.0 if found is None else found.evidence.noise_ratio,
         method="landmarks-alone",
-        poses=SE3.stack([SE3.identity() if found is None else found.T_world_camera]),
+        poses=SE3.stack([T]),
         losses=torch.zeros(0, dtype=torch.float64),
     )
 
