@@ -101,11 +101,9 @@ def _on_surface(
 
 def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
     """Reject a pose on the surface by a camera whose focal length is approximate, as only landmarks separate that from distance."""
-    if not (
-        found.converged and problem.focal_is_approximate and any(v.frame.has_depth for v in problem.views)
-    ):
-        if not (found.converged and problem.focal_is_approximate and problem.depth_rays is None):
-            return found
+    by_rays = problem.depth_rays is not None and not any(view.frame.has_depth for view in problem.views)
+    if not found.converged or not problem.focal_is_approximate or by_rays:
+        return found
     why = "the focal length is approximate, and only landmarks can separate it from the distance"
     return found.rejected(Verdict(Outcome.IMPRECISE, why))
 

@@ -317,7 +317,7 @@ class Loop:
         problem, terms = self.problem, list[Term]([landmarks])
         best, quadratic = self._settled(best, landmarks, given)
         found = self._posterior(quadratic, landmarks, given)
-        points, fused = None, list[str]()
+        points, fused, rendered = None, list[str](), None
         if problem is not None and problem.surface is not None and problem.has_depth:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
         if points is not None and found.mode == 0:
@@ -345,7 +345,10 @@ class Loop:
             systematic = torch.zeros_like(quadratic.hessian)
             systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
             found = self._posterior(quadratic, landmarks, given, systematic)
-        return self._judged(found, before, modes, landmarks, points, given, searched, tuple(fused))
+            if problem.colour_noise:
+                here = found.states[found.best : found.best + 1]
+                rendered = float(rays.colour_noise(here)[0]) / problem.colour_noise
+        return self._judged(found, before, modes, landmarks, points, given, searched, tuple(fused), rendered)
 
     def _settled(self, best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic]:
         """Return the most probable state of each mode (g), and the model about it by which it is the most probable."""
@@ -391,7 +394,7 @@ class Loop:
 
     def _judged(
         self, found: Posterior, before: Posterior, modes: list[Mode], term: Landmarks, points: Surface | None,
-        given: Explanations, searched: bool, fused: tuple[str, ...],
+        given: Explanations, searched: bool, fused: tuple[str, ...], rendered: float | None,
     ) -> Answer:  # fmt: skip
         mode, state = modes[found.mode], found.states[found.best : found.best + 1]
         query = mode.query
@@ -422,6 +425,7 @@ class Loop:
             mass=min(x.mass(distance, shared, TOLERANCE, ANGLE, credible) for x in (found, before)), searched=searched,
             on_surface=None if near is None else float(near.mean()),
             colour_inliers=None if near is None or alike is None else float((near * alike).mean()),
+            rendered_noise=rendered,
         )  # fmt: skip
         verdict = accept(evidence)
         if mode.name == MIRROR:
