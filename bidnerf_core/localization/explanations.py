@@ -18,51 +18,29 @@ from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.states import N, States
 from bidnerf_core.mapping import LandmarkMap
 
-# Standard deviations of: log focal, principal point, k1, log aspect, skew; the prior probability; whether a pose under it counts
-# as right.
+# fmt: off
 STATED = (
-    (
-        "exact",
-        0.0005,
-        0.0005,
-        0.0005,
-        0.0005,
-        0.0,
-        0.40,
-        True,
-    ),  # of this very camera, as for the map's own images
+    # log focal, centre, k1, log aspect, skew, probability, whether a pose under it counts as right
+    ("exact", 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.40, True),  # of this very camera, as for the map's own images
     ("right", 0.005, 0.005, 0.005, 0.001, 0.0, 0.25, True),  # well calibrated
-    (
-        "inexact",
-        0.01,
-        0.01,
-        0.01,
-        0.001,
-        0.0,
-        0.27,
-        True,
-    ),  # of another unit of the model, or at another focus
+    ("inexact", 0.01, 0.01, 0.01, 0.001, 0.0, 0.27, True),  # of another unit of the model, or at another focus
     ("wrong", 0.1, 0.02, 0.05, 0.001, 0.0, 0.05, True),
     ("cropped", 0.01, 0.1, 0.01, 0.001, 0.0, 0.02, True),
     ("bent", 0.01, 0.01, 0.3, 0.001, 0.0, 0.01, True),  # the lens was not stated
     ("resized", 0.3, 0.15, 0.05, 0.001, 0.0, 0.003, False),
-    (
-        "unlike",
-        0.3,
-        0.3,
-        0.1,
-        0.1,
-        0.1,
-        0.001,
-        False,
-    ),  # warped: a photo of a picture, a stretched or sheared image
+    ("unlike", 0.3, 0.3, 0.1, 0.1, 0.1, 0.001, False),  # a photo of a picture, a stretched or a sheared image
 )
+"""What may be true of a stated camera: standard deviations of its corrections (see ``NUISANCES``), and prior probabilities.
+
+The more an explanation frees, the rarer it is, and a pose is not trusted if only a camera that explains any warp of the image fits.
+"""
 APPROXIMATE = (
     ("nominal", 0.2, 0.01, 0.03, 0.001, 0.0, 0.96, True),
     ("cropped", 0.2, 0.1, 0.03, 0.001, 0.0, 0.03, True),
     ("unlike", 0.3, 0.3, 0.1, 0.1, 0.1, 0.01, False),
 )
 """The same for a focal length that is stated to be approximate."""
+# fmt: on
 OF_MAP = (
     ("map", 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.6),
     ("map, about", 0.005, 0.005, 0.005, 0.001, 0.0, 0.4),
