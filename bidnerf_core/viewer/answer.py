@@ -350,9 +350,9 @@ def _runner_up(
         if given_up := earlier(found, answer):
             return _rendered(scene, answer.T_world_rig.to("cpu"), given_up, frame, quick)
         for mode, T, probability in probable_poses(answer):
-            name = answer.modes[mode].name
-            if mode != answer.posterior.mode and name != MIRROR_IMAGE:
-                return replace(_rendered(scene, T, name, frame, quick), probability=probability)
+            if mode != answer.posterior.mode and answer.modes[mode].name != MIRROR_IMAGE:
+                shown = _rendered(scene, T, "the next most probable pose by landmarks", frame, quick)
+                return replace(shown, probability=probability)
     T = found.T_world_camera.to("cpu", torch.float64)
     x, y, z = scene.bounds.centre
     reach = APART * float((T.translation - torch.tensor([x, y, z], dtype=torch.float64)).norm())

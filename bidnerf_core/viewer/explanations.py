@@ -54,7 +54,7 @@ class ShownExplanation:
 
 @dataclass(frozen=True)
 class Contest:
-    """A comparison of explanations: a question, its possible answers without the improbable ones, and a remark."""
+    """A comparison of explanations: a question, its answers with their probabilities, and a remark."""
 
     question: str
     answers: tuple[ShownExplanation, ...]
