@@ -61,6 +61,7 @@ from .settings import TrackerConfig as TrackerConfig
 from .settings import objective_of as objective_of
 from .states import NUISANCES as NUISANCES
 from .states import States as States
+from .states import project as project
 from .support import DISPLACEMENT as DISPLACEMENT
 from .support import LEAST_EXPLAINED as LEAST_EXPLAINED
 from .support import NO_RIVAL as NO_RIVAL
@@ -69,5 +70,6 @@ from .support import Support as Support
 from .support import SurfaceDiagnostics as SurfaceDiagnostics
 from .support import SurfaceThresholds as SurfaceThresholds
 from .support import odds as odds
+from .terms.images import surface_renderer as surface_renderer
 from .terms.sampled import SampledLoss as SampledLoss
 from .tracking.tracker import Tracker as Tracker

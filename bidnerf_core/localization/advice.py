@@ -53,7 +53,7 @@ ADVICE = {
         "Check that the start is camera to world with OpenCV axes and lies within the scene, then lower `--learning-rate`.",
     ),
     Outcome.MISCALIBRATED: Advice(
-        "The image contradicts the given intrinsics, or does not distinguish them from those of the map's camera.",
+        "The image contradicts the given intrinsics.",
         "Give the right camera (`--camera`), or mark the focal length as approximate.",
     ),
     Outcome.MIRRORED: Advice(

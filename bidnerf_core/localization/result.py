@@ -33,9 +33,7 @@ class Outcome(StrEnum):
     NOT_SETTLED = "not settled"  # newly drawn rays still give a large step
     HIGH_LOSS = "high loss"  # a descent ended above the convergence threshold
     DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
-    MISCALIBRATED = (
-        "miscalibrated"  # the image contradicts the given intrinsics, or the map's may be right instead
-    )
+    MISCALIBRATED = "miscalibrated"  # the image contradicts the given intrinsics
     MIRRORED = "mirrored"  # the mirror image fits the map better than the image
     IMPRECISE = "imprecise"  # the pose is too uncertain, relative to the distance to the scene
     UNCERTAIN = "uncertain"  # the diagnostics together make a wrong pose too likely

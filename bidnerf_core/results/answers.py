@@ -20,8 +20,8 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, symbol
 from bidnerf_core.io import write_file
 from bidnerf_core.localization import (
-    LandmarkDiagnostics,
-    LandmarkThresholds,
+    BOUNDS,
+    Evidence,
     Localization,
     Localizer,
     Outcome,
@@ -216,8 +216,8 @@ def _shows_scene(found: Localization) -> bool:
     by chance.
     """
     evidence = found.diagnostics
-    if found.outcome is Outcome.AMBIGUOUS and isinstance(evidence, LandmarkDiagnostics):
-        return evidence.inliers >= LandmarkThresholds().above_chance * evidence.chance
+    if found.outcome is Outcome.AMBIGUOUS and isinstance(evidence, Evidence):
+        return all(evidence.above_chance >= each.limit for each in BOUNDS if each.measure == "above_chance")
     return found.outcome in RECOGNISED
 
 

@@ -19,16 +19,26 @@ from bidnerf_core.io import reduced, resampled
 from bidnerf_core.localization import (
     ADVICE,
     METHODS,
-    LandmarkPose,
+    Answer,
     Localization,
     SceneMap,
     SearchRecord,
     origin_of,
-    probability_of,
+    project,
 )
 from bidnerf_core.registry import PluginError
 from bidnerf_core.results import pose_error
-from bidnerf_core.viewer.explanations import APART, HERE, TURNED_DEG, Contest, contests, earlier, told
+from bidnerf_core.viewer.explanations import (
+    APART,
+    HERE,
+    MIRROR_IMAGE,
+    TURNED_DEG,
+    Contest,
+    contests,
+    earlier,
+    last_answer,
+    probable_poses,
+)
 from bidnerf_core.viewer.figures import Figure, acceptance_figures
 from bidnerf_core.viewer.packing import Packed, Picture, drawing, packed, photograph
 from bidnerf_core.viewer.rendering import quick_image
@@ -154,6 +164,7 @@ def shown_answer(
     error = None if truth is None or not finite else pose_error(T, truth, found.unit)
     advice = ADVICE.get(found.outcome)
     other = None if record is None or not finite else _runner_up(scene, found, record, frame, quick)
+    answer = last_answer(record)
     return ShownAnswer(
         name=name,
         outcome=str(found.outcome),
@@ -178,8 +189,8 @@ def shown_answer(
         depth=depth,
         steps=_steps(found, record),
         path=_path(found.poses),
-        matches=None if frame is None or record is None or not finite else _matches(frame, found, record),
-        figures=acceptance_figures(found, record, scene.colour_noise),
+        matches=None if frame is None or answer is None or not finite else _matches(scene, found, answer),
+        figures=acceptance_figures(found, record),
         contests=contests(found, record),
         runner_up=other,
     )
@@ -255,11 +266,18 @@ def _steps(found: Localization, record: SearchRecord | None) -> tuple[ShownStep,
         shown += _descent(found)
     if not bool(last.matrix().isfinite().all()):
         return tuple(shown)
-    for other in [] if record is None else told(found, record):
-        if other.T is not None:
-            T, scores = SE3.stack([last, other.T.to("cpu", torch.float64)]), torch.tensor([0.0, other.log_odds])  # fmt: skip
-            best = scores.argsort()
-            shown.append(ShownStep(other.reason, _poses(T[best]), _numbers(scores[best]), 2))
+    answer = last_answer(record)
+    if answer is not None and len(answer.modes) > 1:
+        _, poses, probabilities = zip(*probable_poses(answer), strict=True)
+        scores = -torch.tensor(probabilities, dtype=torch.float64).log()
+        shown.append(
+            ShownStep(
+                "the pose and others that explain the image",
+                _poses(SE3.stack(list(poses))),
+                _numbers(scores),
+                len(poses),
+            )
+        )
     return (*shown, ShownStep(HERE, _poses(last[None]), (0.0,), 1, shown[-1].loss if shown else None))
 
 
@@ -290,63 +308,51 @@ def _path(poses: SE3) -> tuple[tuple[float, float, float], ...]:
     return tuple((x, y, z) for x, y, z in places.tolist())
 
 
-def _matches(frame: Frame, found: Localization, record: SearchRecord) -> ShownMatches | None:
-    """Return the matches of the last pose that was checked by landmarks: those used in its refinement, and those rejected."""
-    if not record.landmarks:
+def _matches(scene: SceneMap, found: Localization, answer: Answer) -> ShownMatches | None:
+    """Return the matches in the last image at the last pose by landmarks: those by projection, then others by descriptors."""
+    if scene.landmarks is None:
         return None
-    pose = record.landmarks[-1]
-    pixels, landmarks, agree, by_appearance = _matched(pose)
-    every = max(1, math.ceil(len(pixels) / MOST_MATCHES))
-    size = torch.tensor([frame.intrinsics.width, frame.intrinsics.height], dtype=torch.float64)
-    camera = pose.intrinsics_of(frame.intrinsics) or frame.intrinsics
-    there = pose.T_world_camera.inverse().apply(landmarks)
-    seen = camera.project(there)
-    seen = torch.where(there[:, 2:] > 0, seen, torch.nan)
+    mode, best = answer.mode, answer.posterior.best
+    query, matches, state = mode.query, mode.matches, answer.posterior.states[best : best + 1]
+    agree = answer.landmarks.residuals(state)[0][0, : len(matches)] <= 9
+    refused = mode.by_descriptors[~torch.isin(mode.by_descriptors.keypoint, matches.keypoint)]
+    keypoint = torch.cat([matches.keypoint, refused.keypoint])
+    landmark = torch.cat([matches.landmark, refused.landmark])
+    agree = torch.cat([agree, torch.zeros(len(refused), dtype=torch.bool)])
+    is_last = query.view[keypoint] == len(query.images) - 1
+    by_descriptors = int(is_last[len(matches) :].sum())
+    keypoint, landmark, agree = keypoint[is_last], landmark[is_last], agree[is_last]
+    seen = project(state, scene.landmarks.positions[landmark].double()[None], query.sights[keypoint])
+    there = query.camera.project(torch.cat([seen.image[0], torch.ones(len(keypoint), 1)], dim=-1))
+    there = torch.where(seen.front[0, :, None], there, torch.nan)
+    size = torch.tensor([query.camera.width, query.camera.height], dtype=torch.float64)
+    shares = [query.keypoints.pixels[keypoint] / size, there / size]
+    if mode.name == MIRROR_IMAGE:  # drawn on the image as it is
+        shares = [torch.stack([1 - share[:, 0], share[:, 1]], dim=-1) for share in shares]
+    every = max(1, math.ceil(len(keypoint) / MOST_MATCHES))
     return ShownMatches(
-        packed((pixels / size)[::every].numpy()),
-        packed((seen / size)[::every].numpy()),
+        packed(shares[0][::every].numpy()),
+        packed(shares[1][::every].numpy()),
         packed(agree[::every].to(torch.uint8).numpy()),
         int(agree.sum()),
         int((~agree).sum()),
-        by_appearance,
-        earlier(found, pose),
-    )
-
-
-def _matched(pose: LandmarkPose) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3"], Tensor, int]:
-    """Return keypoints (pixels), landmarks (metres, world), whether they are inliers, and the number of rejected matches.
-
-    The rejected matches, which are by descriptors alone, follow the guided ones.
-    """
-    last = pose.correspondences.view == pose.correspondences.view.max()
-    agree = (torch.linalg.vector_norm(pose.normalized_residuals, dim=-1) <= 3)[last]
-    pixels = pose.pixels[last].double()
-    if pose.guided is None:
-        return pixels, torch.zeros((len(pixels), 3), dtype=torch.float64), agree, 0
-    guided, query = pose.guided, pose.guided.query
-    positions = query.landmarks.positions.double()
-    landmarks = positions[pose.correspondences.landmark[last]]
-    by_looks = guided.matches[guided.matches.view == len(query.images) - 1]
-    kept = torch.isin(by_looks.keypoint, pose.correspondences.keypoint[last])
-    refused = by_looks[~kept]
-    return (
-        torch.cat([pixels, query.pixels(refused).double()]),
-        torch.cat([landmarks, positions[refused.landmark]]),
-        torch.cat([agree, torch.zeros(len(refused), dtype=torch.bool)]),
-        len(refused),
+        by_descriptors,
+        earlier(found, answer),
     )
 
 
 def _runner_up(
     scene: SceneMap, found: Localization, record: SearchRecord, frame: Frame | None, quick: bool
 ) -> RunnerUp | None:
-    """Return the most probable alternative explanation with a pose, else the best different pose of the last search."""
-    rivals = [other for other in told(found, record) if other.T is not None]
-    if rivals:
-        best = min(rivals, key=lambda other: other.log_odds)
-        assert best.T is not None
-        shown = _rendered(scene, best.T, best.reason, frame, quick)
-        return replace(shown, probability=probability_of(-best.log_odds))
+    """Return the most probable other place, or else an earlier pose by landmarks, or the best different pose of the search."""
+    answer = last_answer(record)
+    if answer is not None:
+        if given_up := earlier(found, answer):
+            return _rendered(scene, answer.T_world_rig.to("cpu"), given_up, frame, quick)
+        for mode, T, probability in probable_poses(answer):
+            if mode != answer.posterior.mode and answer.modes[mode].name != MIRROR_IMAGE:
+                shown = _rendered(scene, T, "the next most probable pose by landmarks", frame, quick)
+                return replace(shown, probability=probability)
     T = found.T_world_camera.to("cpu", torch.float64)
     x, y, z = scene.bounds.centre
     reach = APART * float((T.translation - torch.tensor([x, y, z], dtype=torch.float64)).norm())

@@ -2,53 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.localization import (
-    DECISIVE,
     DISPLACEMENT,
+    MOVING,
     NO_RIVAL,
-    ComparedExplanation,
+    Answer,
     DescentDiagnostics,
-    Explanation,
-    LandmarkPose,
     Localization,
-    Motion,
-    Posterior,
     SearchRecord,
-    Stated,
     Support,
     SurfaceDiagnostics,
-    Whose,
     odds,
-    probability_of,
 )
 from bidnerf_core.results import pose_error
 from bidnerf_core.viewer.scene import rows_of
 
 LEAST_SHOWN = 0.001
 """Minimum probability of an explanation that is listed."""
-CAMERA_NAMES: dict[str, str] = {
-    Stated.EXACT: "given camera",
-    Stated.INEXACT: "given camera (slightly off)",
-    Stated.WRONG: "another camera",
-    Stated.APPROXIMATE: "given camera (approximate)",
-    Stated.CROPPED: "a cropped image",
+CAMERAS = {
+    "exact": "given camera",
+    "right": "given camera (well calibrated)",
+    "inexact": "given camera (slightly off)",
+    "wrong": "given camera (badly calibrated)",
+    "cropped": "a cropped image",
+    "bent": "given camera with another lens distortion",
+    "resized": "a cropped and resized image",
+    "unlike": "a warped image, such as a photo of a picture",
+    "nominal": "given camera (approximate)",
+    "map": "the camera of the map's images",
+    "map, about": "the camera of the map's images (slightly off)",
 }
-MOTIONS = {
-    Motion.STILL: "",
-    Motion.MOVING: ", with rolling shutter",
-}
+"""Descriptions of the explanations of the camera."""
+MIRROR_IMAGE = "mirror image"
+"""Name of the mode that explains the mirrored image."""
 HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
 APART, TURNED_DEG = 0.1, 10.0
 """Distance (fraction of that to the scene) and angle beyond which two poses are different answers."""
-
-
-KEPT = (
-    f"The search keeps the pose that it found first unless another is {probability_of(DECISIVE):.1%} likely."
-)
 
 
 @dataclass(frozen=True)
@@ -62,7 +54,7 @@ class ShownExplanation:
 
 @dataclass(frozen=True)
 class Contest:
-    """A comparison of explanations: a question, its possible answers without the improbable ones, and a remark."""
+    """A comparison of explanations: a question, its answers with their probabilities, and a remark."""
 
     question: str
     answers: tuple[ShownExplanation, ...]
@@ -70,101 +62,90 @@ class Contest:
     of_pose: bool = True  # whether it compares poses, else cameras
 
 
+def last_answer(record: SearchRecord | None) -> Answer | None:
+    """Return the last pose by landmarks of a search; None if there was none."""
+    return None if record is None or not record.answers else record.answers[-1]
+
+
 def contests(found: Localization, record: SearchRecord | None) -> tuple[Contest, ...]:
-    """Return all comparisons: the pose with another one or a mirror image, with its rivals, and between possible cameras."""
-    shown = list[Contest]()
-    if record is not None:
-        shown += [_against(found, other) for other in told(found, record)]
-    support = support_of(found)
+    """Return all comparisons: the pose with those of other places and of the mirror image, with its rivals, and of cameras."""
+    shown, answer, support = list[Contest](), last_answer(record), support_of(found)
+    if answer is not None and len(answer.modes) > 1:
+        shown.append(_of_modes(found, answer))
     if support is not None:
         shown.append(_of_support(support))
-    if record is not None and record.landmarks and record.landmarks[-1].guided is not None:
-        shown.append(_of_camera(record.landmarks[-1].guided.posterior, earlier(found, record.landmarks[-1])))
+    if answer is not None:
+        shown.append(_of_cameras(found, answer))
     return tuple(shown)
 
 
-def told(found: Localization, record: SearchRecord) -> list[ComparedExplanation]:
-    """Return the recorded comparisons of the pose found, except those of a rejected pose with a less probable mirror image.
-
-    If the other pose of a comparison was taken instead, the pose that it replaced is the other one.
-    """
-    return [
-        _from_found(found, each, record)
-        for each in record.explanations
-        if found.converged or each.T is not None or each.log_odds < DECISIVE
-    ]
-
-
-def _from_found(found: Localization, each: ComparedExplanation, record: SearchRecord) -> ComparedExplanation:
-    if each.T is None or not record.landmarks or is_elsewhere(found, each.T, record.landmarks[-1].distance):
-        return each
-    return replace(each, log_odds=-each.log_odds, T=record.landmarks[-1].T_world_camera)
-
-
-def is_elsewhere(found: Localization, T_world_camera: SE3, distance: float) -> bool:
-    """Return whether a pose is another answer than the pose found, for a scene at a ``distance`` in the unit of the map."""
-    off = pose_error(T_world_camera.to("cpu"), found.T_world_camera.to("cpu"))
-    return not (float(off.translation) <= APART * distance and float(off.rotation_deg) <= TURNED_DEG)
-
-
-def earlier(found: Localization, pose: LandmarkPose) -> str:
-    """Return ``EARLIER`` if a pose by landmarks is another answer than the pose found, else an empty text."""
-    return EARLIER if is_elsewhere(found, pose.T_world_camera, pose.distance) else ""
+def earlier(found: Localization, answer: Answer) -> str:
+    """Return ``EARLIER`` if a pose by landmarks is another one than the pose found, else an empty text."""
+    off = pose_error(answer.T_world_rig.to("cpu"), found.T_world_camera.to("cpu"))
+    near = float(off.translation) <= APART * answer.distance and float(off.rotation_deg) <= TURNED_DEG
+    return "" if near else EARLIER
 
 
 def support_of(found: Localization) -> Support | None:
     """Return how well measurements distinguish a pose from its rivals; None if it was not compared with any."""
-    said = found.diagnostics
-    if isinstance(said, SurfaceDiagnostics | DescentDiagnostics):
-        return said.support
-    return said if isinstance(said, Support) else None
+    measured = found.diagnostics
+    if isinstance(measured, SurfaceDiagnostics | DescentDiagnostics):
+        return measured.support
+    return measured if isinstance(measured, Support) else None
 
 
-def _against(found: Localization, other: ComparedExplanation) -> Contest:
-    p = probability_of(other.log_odds)
-    if other.T is None:
-        rival, question = ShownExplanation("its mirror image", 1 - p), "Pose or mirror image?"
-    else:
-        apart = float((other.T.translation - found.T_world_camera.to("cpu", other.T.translation.dtype).translation).norm())  # fmt: skip
-        name = f"a pose {apart:.3g} {symbol(found.unit)} away"
-        rival, question = ShownExplanation(name, 1 - p, rows_of(other.T)), "This pose or another?"
-    keeps = other.T is not None and p < 0.5 and not found.converged
-    return Contest(question, (ShownExplanation(HERE, p), rival), KEPT if keeps else other.reason)
+def probable_poses(answer: Answer) -> list[tuple[int, SE3, float]]:
+    """Return the number, the most probable pose and the probability of each mode, the most probable mode first."""
+    posterior, found = answer.posterior, list[tuple[int, SE3, float]]()
+    for mode in range(len(answer.modes)):
+        own = posterior.probability * (posterior.states.mode == mode)
+        T = posterior.states.T[int(own.argmax())].to("cpu")
+        found.append((mode, posterior.pose().to("cpu") if mode == posterior.mode else T, float(own.sum())))
+    return sorted(found, key=lambda each: -each[2])
 
 
-def _of_camera(posterior: Posterior, place: str) -> Contest:
-    answers = sorted(
-        (
-            ShownExplanation(_name(each), p)
-            for each, p in zip(posterior.explanations, posterior.probabilities, strict=True)
-            if p >= LEAST_SHOWN
-        ),
-        key=lambda shown: -shown.probability,
+def _of_modes(found: Localization, answer: Answer) -> Contest:
+    shown, here = list[ShownExplanation](), answer.T_world_rig.to("cpu")
+    for mode, T, probability in probable_poses(answer):
+        name = earlier(found, answer) or HERE
+        if mode != answer.posterior.mode:
+            name = f"a pose {float((T.translation - here.translation).norm()):.3g} {symbol(found.unit)} away"
+        if answer.modes[mode].name == MIRROR_IMAGE:
+            name = "the mirror image"
+        shown.append(
+            ShownExplanation(name, probability, rows_of(T) if mode != answer.posterior.mode else None)
+        )
+    mirrored = sum(mode.name == MIRROR_IMAGE for mode in answer.modes)
+    questions = ("This pose or another?", "Pose or mirror image?", "This pose, another, or the mirror image?")
+    return Contest(questions[mirrored + (mirrored and len(answer.modes) > 2)], tuple(shown))
+
+
+def _of_cameras(found: Localization, answer: Answer) -> Contest:
+    posterior, names = answer.posterior, answer.explanations.names
+    own = posterior.probability * (posterior.states.mode == posterior.mode)
+    shown = dict[str, float]()
+    for row, probability in zip(posterior.states.row.tolist(), (own / own.sum()).tolist(), strict=True):
+        camera = names[row].removesuffix(MOVING)
+        moving = ", with rolling shutter" if names[row].endswith(MOVING) else ""
+        name = CAMERAS.get(camera, camera) + moving
+        shown[name] = shown.get(name, 0.0) + probability
+    likeliest = sorted(shown.items(), key=lambda each: -each[1])
+    answers = tuple(ShownExplanation(name, p) for name, p in likeliest if p >= LEAST_SHOWN)
+    weighed_at = earlier(found, answer)
+    return Contest(
+        "Whose camera took it?", answers, f"Weighed at {weighed_at}." if weighed_at else "", of_pose=False
     )
-    remark = f"Weighed at {place}." if place else ""
-    return Contest("Whose camera took it?", tuple(answers), remark, of_pose=False)
 
 
-def _name(each: Explanation) -> str:
-    name = each.hypothesis.name
-    is_maps = each.hypothesis.whose is Whose.MAP
-    return ("the camera of the map's images" if is_maps else CAMERA_NAMES.get(name, name)) + MOTIONS[
-        each.motion
-    ]
-
-
-def _of_support(said: Support) -> Contest:
+def _of_support(support: Support) -> Contest:
     rivals = [
-        (f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene", said.displaced),
-        ("another pose of the search", said.other),
-        ("an image of a single colour", said.plain),
+        (f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene", support.displaced),
+        ("another pose of the search", support.other),
+        ("an image of a single colour", support.plain),
     ]
     weights = [(name, odds(-against)) for name, against in rivals if against < NO_RIVAL]
     total = 1 + sum(weight for _, weight in weights)
     answers = (ShownExplanation(HERE, 1 / total), *(ShownExplanation(name, w / total) for name, w in weights))
-    return Contest("What fits the image best?", answers, "".join(_worse_than_moved(said)))
-
-
-def _worse_than_moved(said: Support) -> Iterator[str]:
-    if said.displaced < min(0.0, said.other, said.plain):
-        yield "The image fits better when the pose is moved: it is not even a local optimum."
+    moved = support.displaced < min(0.0, support.other, support.plain)
+    remark = "The image fits better when the pose is moved: it is not even a local optimum." if moved else ""
+    return Contest("What fits the image best?", answers, remark)

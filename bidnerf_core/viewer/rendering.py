@@ -9,7 +9,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import render_image
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import SceneMap, SurfaceRenderer
+from bidnerf_core.localization import SceneMap, surface_renderer
 
 PIXELS_AT_A_TIME = 4096
 """Number of pixels between two checks whether a rendering is still wanted, see ``stopped_by``."""
@@ -33,5 +33,5 @@ def quick_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     T = T_world_camera.to(dtype=torch.float32, device=surface.device)
     directions = T.rotate(rays.to(surface.device))
     origins = T.translation.expand_as(directions).contiguous()
-    seen = SurfaceRenderer(surface, scene.bounds.background)(origins, directions)
-    return seen.rgb.cpu().clamp(0, 1).reshape(camera.height, camera.width, 3)
+    rgb, _, _ = surface_renderer(surface, scene.bounds.background)(origins, directions)
+    return rgb.cpu().clamp(0, 1).reshape(camera.height, camera.width, 3)

@@ -29,7 +29,7 @@ from bombs import png_of
 from photo_room import CAMERA
 from viewer_client import Client, serving
 
-LONG = {"bid": {"max_steps": 100_000}, "bid-lm": {"fine_steps": 100_000, "stop_step": 0.0}}
+LONG = {"bid": {"max_steps": 100_000}, "bid-lm": {"fine_steps": 100_000}}
 """Methods, by Adam and by Newton's steps, with settings that make them take hours."""
 
 TOKEN = "a-token-of-enough-characters"

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.geometry import look_at
-from bidnerf_core.localization import LandmarkMatcher, propose
+from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import (
     SIFT,
     build_landmarks,
@@ -126,9 +126,9 @@ def test_an_image_is_found_in_a_map_of_others() -> None:
     landmarks = build_landmarks([view(number) for number in range(8)], "xfeat")
     assert landmarks.features == "xfeat"
     query = view(9)
-    found = propose(LandmarkMatcher(landmarks), [View(query.frame, SE3.identity())])
+    found = Loop([View(query.frame, SE3.identity())], LandmarkMatcher(landmarks))()
     assert found is not None
-    error = pose_error(found.T_world_camera, query.T_ref_camera)
+    error = pose_error(found.T_world_rig, query.T_ref_camera)
     assert float(error.translation) < 0.06  # at a distance of 2.7
     assert float(error.rotation_deg) < 1
 
