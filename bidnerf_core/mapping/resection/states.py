@@ -45,8 +45,8 @@ class States:
     deviation: Float[Tensor, "h N"]
     log_prior: Float[Tensor, "h"]
     noise: Float[Tensor, "h"]  # pixels: standard deviation of a keypoint along each axis
-    mode: Int[Tensor, "h"]  # number of the matches (see ``terms.landmarks``) that belong to the hypothesis
-    row: Int[Tensor, "h"]  # number of the explanation (see ``explanations``)
+    mode: Int[Tensor, "h"]  # number of the matches (see ``Landmarks``) that belong to the hypothesis
+    row: Int[Tensor, "h"]  # number of the prior, as the caller counts them
 
     def __len__(self) -> int:
         return len(self.z)
