@@ -23,8 +23,8 @@ from bidnerf_core.mapping import (
     TrackedViews,
     adjusted,
     noise,
+    pinhole,
     pose_updates,
-    projected,
 )
 
 ROUNDS = 3
@@ -63,7 +63,7 @@ def adjusted_poses(
     given = tracked.T_world_camera
     seen, points = tracked.triangulated(config)
     before = max(LEAST_NOISE, noise(seen.sightings, points))
-    deviations = _deviations(seen, points, before)
+    deviations = _deviations(seen, points)
     if deviations is None:
         return None
     motion = STILL
@@ -104,11 +104,9 @@ def _found(
     return AdjustedPoses(tracked, pixels, PoseConsistency(before, after))
 
 
-def _deviations(
-    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], pixel_noise: float
-) -> tuple[float, float] | None:
+def _deviations(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> tuple[float, float] | None:
     """Return the standard deviations of the given poses (metres, radians) along and about each axis."""
-    updates = list(pose_updates(seen, points, pixel_noise).values())
+    updates = list(pose_updates(seen, points).values())
     if len(updates) < ENOUGH_IMAGES:
         return None
     values = torch.stack(updates)
@@ -126,10 +124,7 @@ def _motion(
     """Return the median shift (pixels) of each image's points between its given and its found pose."""
     shown, image = points[seen.point], seen.image
     focal = seen.sightings.focal[:, None]
-    places = [
-        torch.from_numpy(projected(T[image].inverse().apply(shown).numpy()).flat) * focal
-        for T in (given, found)
-    ]
+    places = [pinhole(T[image].inverse().apply(shown))[0] * focal for T in (given, found)]
     away = torch.linalg.vector_norm(places[1] - places[0], dim=-1)
     medians = torch.zeros(len(seen.images), dtype=torch.float64)
     for number in image.unique().tolist():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,10 +11,8 @@ from bidnerf_core.mapping import (
     ENOUGH_IMAGES,
     LEAST_VISIBLE_POINTS,
     TrackedKeypoints,
-    log_motion_evidence,
-    noise,
-    observed_at_rest,
-    resect,
+    log_evidence,
+    resections,
 )
 
 MOST_IMAGES = 60
@@ -37,15 +33,10 @@ def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlat
     if len(numbers) < ENOUGH_IMAGES:
         return STILL
     prior = MotionPrior.usual(float(sightings.in_camera(points)[:, 2].median()))
-    pixel_noise, total = noise(sightings, points), 0.0
-    for number in numbers[:: -(-len(numbers) // MOST_IMAGES)].tolist():
-        own = (image == number).nonzero()[:, 0]
-        T = seen.images[number].T_ref_camera
-        data = observed_at_rest(sightings[own], points, T)
-        still = resect(data, T, pixel_noise, correlation=correlation)
-        moving = resect(data, T, pixel_noise, correlation=correlation, motion=prior)
-        evidence = log_motion_evidence(data, moving, still, prior, correlation)
-        total += (
-            min(MOST_EVIDENCE, max(-MOST_EVIDENCE, evidence)) if math.isfinite(evidence) else -MOST_EVIDENCE
-        )
+    total = 0.0
+    some = numbers[:: -(-len(numbers) // MOST_IMAGES)]
+    for _, states, normal in resections(sightings, points, some, correlation, (STILL, prior)):
+        still, moving = log_evidence(states, normal).view(2, -1)
+        gain = (moving - still).clamp(-MOST_EVIDENCE, MOST_EVIDENCE)
+        total += float(gain.nan_to_num(-MOST_EVIDENCE).sum())
     return prior if total > 0 else STILL

@@ -31,7 +31,6 @@ from bidnerf_core.mapping import (
     LandmarkConfig,
     TrackedKeypoints,
     TrackedViews,
-    noise,
     pose_updates,
     robust_covariance,
 )
@@ -97,7 +96,7 @@ def _by_own_landmarks(
     Poses from fewer landmarks scatter more: the variance is inversely proportional to their number.
     """
     sightings = seen.sightings
-    updates = pose_updates(seen, positions, noise(sightings, positions))
+    updates = pose_updates(seen, positions)
     if len(updates) < ENOUGH_IMAGES:
         return {}
     scatter = robust_covariance(torch.stack(list(updates.values())))

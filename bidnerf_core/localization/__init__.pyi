@@ -59,9 +59,6 @@ from .settings import RefinementSettings as RefinementSettings
 from .settings import RefinementStage as RefinementStage
 from .settings import TrackerConfig as TrackerConfig
 from .settings import objective_of as objective_of
-from .states import NUISANCES as NUISANCES
-from .states import States as States
-from .states import project as project
 from .support import DISPLACEMENT as DISPLACEMENT
 from .support import LEAST_EXPLAINED as LEAST_EXPLAINED
 from .support import NO_RIVAL as NO_RIVAL

@@ -25,7 +25,7 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
-from bidnerf_core.mapping import Calibration
+from bidnerf_core.mapping import true_intrinsics
 
 TEXTURED = 150
 """Matches of a usual image of the map from which an image without recognised landmarks shows something else."""
@@ -113,7 +113,7 @@ def localization_of(problem: Problem, answer: Answer, began: float) -> Localizat
     T, noise = answer.T_world_rig, float(answer.posterior.states.noise[answer.posterior.best])
     poses = [T] if problem.start is None else [problem.start, T]
     stated, camera = problem.views[-1].frame.intrinsics, answer.camera
-    corrected = None if camera is None else Calibration(*camera[:5].tolist()).applied(stated)
+    corrected = None if camera is None else true_intrinsics(stated, camera[:6])
     reason = answer.verdict.reason
     if answer.fused:
         reason += f", fused with {enumeration(answer.fused)}"

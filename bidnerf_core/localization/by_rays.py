@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3, Robust
-from bidnerf_core.localization.descend import damped_solution
 from bidnerf_core.localization.pivot import rendered_middle
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -23,9 +22,9 @@ from bidnerf_core.localization.settings import (
     mean_side,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.states import States
 from bidnerf_core.localization.support import Support, support
 from bidnerf_core.localization.terms.rays import ALONE, Rays
+from bidnerf_core.mapping import States, damped_solution
 
 NOISY = 2.5
 """Largest ratio of the colour differences at an accepted pose to those of the map's own images.

@@ -13,16 +13,14 @@ from torch import Tensor
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.by_rays import COLOUR_SIGMA, RayStage, RayTerms, localization_by_rays
-from bidnerf_core.localization.descend import descend
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import Proposals, by_depth, by_images, halve, judge, states_at
 from bidnerf_core.localization.settings import AutoConfig, ColourSettings, DepthLossSettings
-from bidnerf_core.localization.states import States
 from bidnerf_core.localization.support import SurfaceDiagnostics, support
 from bidnerf_core.localization.terms.rays import INDEPENDENT
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import SurfaceMap, trace
+from bidnerf_core.mapping import States, SurfaceMap, descend, trace
 
 WORSE = 0.05
 """Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict each other."""

@@ -15,8 +15,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.query import Query
-from bidnerf_core.localization.states import N, States
-from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, N, States
 
 # fmt: off
 STATED = (

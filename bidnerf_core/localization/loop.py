@@ -12,14 +12,6 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, accept
-from bidnerf_core.localization.descend import (
-    Quadratic,
-    Term,
-    descend,
-    log_evidence,
-    prior,
-    total,
-)
 from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Seed, explanations
 from bidnerf_core.localization.matching import (
     STRONGEST,
@@ -35,11 +27,24 @@ from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_c
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.states import MOTION, Sights, States, project
-from bidnerf_core.localization.terms.landmarks import Landmarks, point_variance
 from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import Features, LandmarkMap
+from bidnerf_core.mapping import (
+    MOTION,
+    Features,
+    LandmarkMap,
+    Landmarks,
+    Quadratic,
+    Sights,
+    States,
+    Term,
+    descend,
+    log_evidence,
+    point_variance,
+    prior,
+    project,
+    total,
+)
 
 MIRROR = "mirror image"
 """Name of the mode of an image whose mirror image fits."""

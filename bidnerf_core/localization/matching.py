@@ -17,14 +17,15 @@ from bidnerf_core.camera import exposure_times
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.query import Query
-from bidnerf_core.localization.states import States, imaged
 from bidnerf_core.mapping import (
     BLOCK,
     Features,
     FoundOnce,
     LandmarkMap,
+    States,
     detected,
     find_features,
+    imaged,
     k_means,
     nearest_centre,
     paired_squared_distances,

@@ -10,9 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.descend import Normal, Quadratic, log_evidence, unit_of
-from bidnerf_core.localization.states import CAMERA, P, States
-from bidnerf_core.localization.terms.landmarks import Landmarks
+from bidnerf_core.mapping import CAMERA, Landmarks, Normal, P, Quadratic, States, log_evidence, unit_of
 
 BY_SHARE = 10.0
 """Log odds per factor e between the evidence for two places: it is not proportional to the number of matches, since the right

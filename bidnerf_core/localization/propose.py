@@ -15,8 +15,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.explanations import Seed, cameras_of_map
 from bidnerf_core.localization.matching import Matches, log10_nfa
 from bidnerf_core.localization.query import Query
-from bidnerf_core.localization.states import States, project, rays_through
-from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, States, project, rays_through
 
 LADDER = (-0.35, 0.35, -0.7, 0.7)
 """Logarithms of the focal lengths, relative to the stated one, that are tried if it gives no consensus."""

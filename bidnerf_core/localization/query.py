@@ -14,8 +14,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.states import Sights
-from bidnerf_core.mapping import Features, ImageKeypoints, Keypoints, image_keypoints
+from bidnerf_core.mapping import Features, ImageKeypoints, Keypoints, Sights, image_keypoints
 
 THRESHOLD = 0.005
 """Largest reprojection error of an inlier as a fraction of the image's diagonal; at least two pixels."""

@@ -16,11 +16,9 @@ from torch.quasirandom import SobolEngine
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.descend import Term, descend
 from bidnerf_core.localization.pivot import Pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
-from bidnerf_core.localization.states import States
 from bidnerf_core.localization.support import same_pose
 from bidnerf_core.localization.terms.images import (
     ColourScales,
@@ -30,7 +28,7 @@ from bidnerf_core.localization.terms.images import (
     surface_renderer,
 )
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import SurfaceMap, cast
+from bidnerf_core.mapping import States, SurfaceMap, Term, cast, descend
 from bidnerf_core.progress import check_stopped
 
 RIVALS = 3

@@ -24,8 +24,8 @@ from bidnerf_core.localization import (
     SceneMap,
     SearchRecord,
     origin_of,
-    project,
 )
+from bidnerf_core.mapping import project
 from bidnerf_core.registry import PluginError
 from bidnerf_core.results import pose_error
 from bidnerf_core.viewer.explanations import (

@@ -20,10 +20,8 @@ from bidnerf_core.devices import constant
 from bidnerf_core.fields import RadianceField, SceneBounds, render
 from bidnerf_core.frames import View, continued
 from bidnerf_core.geometry import SE3, inlier_weight
-from bidnerf_core.localization.descend import Normal
-from bidnerf_core.localization.states import P, States
 from bidnerf_core.localization.terms.exposure import fit_exposure
-from bidnerf_core.mapping import SurfaceMap, cast
+from bidnerf_core.mapping import Normal, P, States, SurfaceMap, cast
 
 CHUNK = 16384
 """Number of rays rendered at a time."""

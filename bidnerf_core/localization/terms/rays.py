@@ -16,11 +16,9 @@ from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations, RadianceField, Rendering, SceneBounds, device_of, render
 from bidnerf_core.frames import Frame, View, continued
 from bidnerf_core.geometry import Robust
-from bidnerf_core.localization.descend import Normal
-from bidnerf_core.localization.states import MOTION, Sights, States, rays_by_camera, rays_through
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
-from bidnerf_core.localization.terms.landmarks import MAD
 from bidnerf_core.localization.terms.rendering import Derivatives, differentiate
+from bidnerf_core.mapping import MAD, MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
 RAYS = 1024
 INDEPENDENT = 300.0

@@ -14,11 +14,18 @@ from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import inlier_weight
-from bidnerf_core.localization.descend import Normal
-from bidnerf_core.localization.states import DEPTH, MOTION, Sights, States, rays_by_camera, rays_through
 from bidnerf_core.localization.terms.exposure import fit_exposure
-from bidnerf_core.localization.terms.landmarks import MAD
-from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping import (
+    DEPTH,
+    MAD,
+    MOTION,
+    Normal,
+    Sights,
+    States,
+    SurfaceMap,
+    rays_by_camera,
+    rays_through,
+)
 
 POINTS = 500
 """Number of points that are compared."""

@@ -21,10 +21,16 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.matching import OBLIQUE, LandmarkMatcher, Matches, Nearest, Projected
 from bidnerf_core.localization.propose import consensus
 from bidnerf_core.localization.query import THRESHOLD, Query
-from bidnerf_core.localization.states import Sights, States
-from bidnerf_core.localization.terms.landmarks import Landmarks, point_variance
 from bidnerf_core.localization.tracking.flow import Grey, alike, corners, flow
-from bidnerf_core.mapping import Features, LandmarkMap, measured_depth
+from bidnerf_core.mapping import (
+    Features,
+    LandmarkMap,
+    Landmarks,
+    Sights,
+    States,
+    measured_depth,
+    point_variance,
+)
 
 FRESH = -1
 """Landmark number of points that are not landmarks."""

@@ -20,7 +20,6 @@ from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, USUAL, skew, upd
 from bidnerf_core.localization.accept import Evidence, accept
 from bidnerf_core.localization.auto import auto, within_risk
 from bidnerf_core.localization.by_surface import is_blank
-from bidnerf_core.localization.descend import Normal, Quadratic, Term, descend, log_evidence, total
 from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, TURN
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
 from bidnerf_core.localization.loop import ANGLE, TOLERANCE
@@ -29,8 +28,6 @@ from bidnerf_core.localization.posterior import LEAST_DOUBT, Posterior
 from bidnerf_core.localization.problem import SceneMap, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig, TrackerConfig
-from bidnerf_core.localization.states import DEPTH, MOTION, N, P, States
-from bidnerf_core.localization.terms.landmarks import Landmarks
 from bidnerf_core.localization.terms.rays import ALONE, Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.localization.tracking.flow import Grey
@@ -42,7 +39,23 @@ from bidnerf_core.localization.tracking.state import (
     load_tracker_state,
     save_state,
 )
-from bidnerf_core.mapping import grey_image, measured_depth, strongest
+from bidnerf_core.mapping import (
+    DEPTH,
+    MOTION,
+    Landmarks,
+    N,
+    Normal,
+    P,
+    Quadratic,
+    States,
+    Term,
+    descend,
+    grey_image,
+    log_evidence,
+    measured_depth,
+    strongest,
+    total,
+)
 
 METHOD = "track"
 """Method name of a tracker's poses."""

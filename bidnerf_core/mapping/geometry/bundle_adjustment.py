@@ -19,7 +19,7 @@ from torch import Tensor
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
-from bidnerf_core.mapping.geometry.projection import by_update, projected
+from bidnerf_core.mapping.resection.states import by_camera_point, by_update, pinhole
 
 ADJUSTMENT_STEPS = 30
 """Maximum number of steps; from poses that are off by a few pixels, about ten suffice."""
@@ -143,16 +143,15 @@ def linearized(
     if bool(state.motion.any()):
         T = T @ poses_of_rows(times, state.motion[view])
     rotation = T.rotation.mT
-    local = (rotation @ (state.points[point] - T.translation)[..., None])[..., 0].numpy()
-    seen = projected(local)
-    scale = np.where(seen.front, sightings.focal.numpy() / noise, 0)
-    off = torch.from_numpy((seen.flat - sightings.image.numpy()) * scale[:, None])
+    local = (rotation @ (state.points[point] - T.translation)[..., None])[..., 0]
+    flat, depth, front = pinhole(local)
+    scale = torch.where(front, sightings.focal / noise, 0)[:, None]
+    off = (flat - sightings.image) * scale
     squared = off.square().sum(-1)
     weight = inlier_weight(squared, RESIDUAL_SCALE) / correlation
     cost = cauchy_loss(squared.numpy(), RESIDUAL_SCALE) / correlation
-    by_local = seen.by_point(scale)
-    by_view = torch.from_numpy(by_update(by_local, local))
-    by_point = torch.from_numpy(by_local) @ rotation
+    by_local = by_camera_point(flat, depth) * scale[..., None]
+    by_view, by_point = by_update(by_local, local), by_local @ rotation
     if prior.motion != STILL:
         # To first order in the motion, an update of the middle row's pose updates the pose of any other row alike.
         by_view = torch.cat([by_view, times[:, None, None] * by_view], dim=-1)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bidnerf_core.geometry import inlier_weight, mad_deviation
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
-from bidnerf_core.mapping.geometry.projection import projected
+from bidnerf_core.mapping.resection.states import by_camera_point, pinhole
 
 TRIANGULATION_STEPS = 8
 """Number of Gauss-Newton steps; from the linear solution, four or five suffice."""
@@ -42,11 +42,10 @@ def refined_points(
 def _normal_equations(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
-    seen = projected(sightings.in_camera(points).numpy())
-    front = torch.from_numpy(seen.front)
-    off = (torch.from_numpy(seen.flat) - sightings.image) * sightings.focal[:, None]
+    flat, depth, front = pinhole(sightings.in_camera(points))
+    off = (flat - sightings.image) * sightings.focal[:, None]
     weight = front * inlier_weight(off.square().sum(-1), scale)
-    jacobian = torch.from_numpy(seen.by_point(sightings.focal.numpy())) @ sightings.rotation
+    jacobian = by_camera_point(flat, depth / sightings.focal) @ sightings.rotation
     weighted = jacobian.mT * weight[:, None, None]
     matrix = summed(weighted @ jacobian, sightings.point, len(points))
     return matrix, summed((weighted @ off[..., None])[..., 0], sightings.point, len(points))

@@ -15,8 +15,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
-from bidnerf_core.mapping.geometry.observations import ObservedPoints, Sightings
-from bidnerf_core.mapping.geometry.resection import resect
+from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.geometry.triangulation import (
     fitting,
     intersected,
@@ -43,6 +42,7 @@ from bidnerf_core.mapping.landmarks.tracks import (
     likely_pairs_of_poses,
     seen_landmarks,
 )
+from bidnerf_core.mapping.resection.resection import resections
 from bidnerf_core.registry import PluginError
 from bidnerf_core.settings import Above, Range, Settings
 
@@ -60,16 +60,14 @@ TWO_VIEW_TOLERANCE = 1.5
 """Largest reprojection error (pixels) in a track of only two images."""
 
 
-def pose_scatter(
-    tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], noise: float
-) -> Float[Tensor, "6 6"]:
+def pose_scatter(tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "6 6"]:
     """Return the covariance of the right updates from given to resected poses; zero if there are too few images.
 
-    ``noise`` is that of the keypoints (pixels). The points from which an image is resected were triangulated from it as well,
+    The points from which an image is resected were triangulated from it as well,
     so its pose scatters too little: with k views of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image.
     The updates are rescaled accordingly.
     """
-    return update_scatter(list(pose_updates(tracked, positions, noise).values()))
+    return update_scatter(list(pose_updates(tracked, positions).values()))
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"]:
@@ -80,35 +78,20 @@ def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor
     return robust_covariance(torch.stack(known))
 
 
-def pose_updates(
-    tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], noise: float
-) -> dict[int, Float[Tensor, "6"]]:
+def pose_updates(tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"]) -> dict[int, Float[Tensor, "6"]]:
     """Return the right updates from given to resected poses, by image number, for images with enough points.
 
     They are corrected for each image's influence on its points, see ``pose_scatter``.
     """
     sightings, image = tracked.sightings, tracked.image
+    count = torch.bincount(image)
     seen = torch.bincount(sightings.point)[sightings.point].double()
-    updates = {}
-    for number in (torch.bincount(image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0].tolist():
-        own = (image == number).nonzero()[:, 0]
-        T = tracked.images[number].T_ref_camera
-        views = float(seen[own].mean())
-        found = resect(observed_at_rest(sightings[own], positions, T), T, noise)
-        update = (T.inverse() @ found.T_world_rig).log()
-        updates[number] = update * ((1 + 1 / views) / (1 - 1 / views)) ** 0.5
-    return updates
-
-
-def observed_at_rest(sightings: Sightings, positions: Float[Tensor, "n 3"], T: SE3) -> ObservedPoints:
-    """Return the points displaced so that a static camera at ``T`` observes them where the moving one did."""
-    count = len(sightings)
-    zeros = torch.zeros((count, 3), dtype=torch.float64)
-    eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
-    return ObservedPoints(
-        T.apply(sightings.in_camera(positions)), zeros[:, :2], zeros + torch.tensor([0.0, 0.0, 1.0]),
-        sightings.image, sightings.focal, zeros[:, 0], eye, zeros, sightings.exposure_times,
-    )  # fmt: skip
+    views = summed(seen, image, len(count)) / count
+    factor = ((1 + 1 / views) / (1 - 1 / views)).sqrt()
+    known, updates = (count >= LEAST_VISIBLE_POINTS).nonzero()[:, 0], dict[int, Float[Tensor, "6"]]()
+    for numbers, states, _ in resections(sightings, positions, known):
+        updates |= zip(numbers.tolist(), states.T.log() * factor[numbers, None], strict=True)
+    return {number: updates[number] for number in known.tolist()}
 
 
 def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
@@ -305,7 +288,7 @@ def _located(observations: TrackedKeypoints, config: LandmarkConfig) -> Landmark
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
         fused_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
-        pose_covariance=pose_scatter(kept, positions, pixel_noise),
+        pose_covariance=pose_scatter(kept, positions),
     )
     relative = keypoint_depth_noise(kept, positions)
     left = ~torch.isin(observations.number, kept.number)

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.localization.descend import Normal
-from bidnerf_core.localization.states import Projections, Sights, States, jacobian, project
+from bidnerf_core.mapping.resection.descend import Normal
+from bidnerf_core.mapping.resection.states import Projections, Sights, States, jacobian, project
 
 MAD = 1.4826
 """Ratio of the standard deviation to the median absolute deviation of a Gaussian."""

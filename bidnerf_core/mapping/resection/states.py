@@ -6,6 +6,7 @@ nuisances below. All in float64.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.geometry import SE3
 
 NUISANCES = (
@@ -45,8 +47,8 @@ class States:
     deviation: Float[Tensor, "h N"]
     log_prior: Float[Tensor, "h"]
     noise: Float[Tensor, "h"]  # pixels: standard deviation of a keypoint along each axis
-    mode: Int[Tensor, "h"]  # number of the matches (see ``terms.landmarks``) that belong to the hypothesis
-    row: Int[Tensor, "h"]  # number of the explanation (see ``explanations``)
+    mode: Int[Tensor, "h"]  # number of the matches (see ``Landmarks``) that belong to the hypothesis
+    row: Int[Tensor, "h"]  # number of the prior, as the caller counts them
 
     def __len__(self) -> int:
         return len(self.z)
@@ -126,8 +128,7 @@ def imaged(states: States, local: Float[Tensor, "h m 3"], times: Float[Tensor, "
     v, w = nuisances[:, None, 6:9], nuisances[:, None, 9:12].expand_as(local)
     speed = v + torch.linalg.cross(w, local)  # the camera moves by exp(time * motion), to second order
     local = local - times * speed + 0.5 * times**2 * torch.linalg.cross(w, speed)
-    front = local[..., 2] > 1e-9
-    flat = local[..., :2] / torch.where(front, local[..., 2], 1.0)[..., None]
+    flat, _, front = pinhole(local)
     bent = flat * (1 + nuisances[:, None, 3:4] * flat.square().sum(-1, keepdim=True))
     return Projections(bent @ linear(states).mT + nuisances[:, None, 1:3], local, flat, front)
 
@@ -141,15 +142,10 @@ def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor,
     lens = A @ (
         eye * (1 + k1 * square)[..., None] + 2 * k1[..., None] * flat[..., :, None] * flat[..., None, :]
     )
-    depth = torch.where(seen.front, seen.local[..., 2], 1.0)
-    by_point = (
-        torch.cat([lens, -lens @ flat[..., None]], -1) / depth[..., None, None]
-    )  # in the camera's frame
-    turning = torch.linalg.cross(by_point, seen.local[..., None, :].expand_as(by_point))
-    by_row = torch.cat([-by_point, turning], -1)  # by a right update of the camera of the row
-    by_point = by_point @ sights.rotation
+    by_point = lens @ by_camera_point(flat, pinhole(seen.local)[1])
+    by_row = by_update(by_point, seen.local)  # of the camera of the row
     rig = (sights.rotation.mT @ (seen.local - sights.translation)[..., None])[..., 0]
-    by_pose = torch.cat([-by_point, torch.linalg.cross(by_point, rig[..., None, :].expand_as(by_point))], -1)
+    by_pose = by_update(by_point @ sights.rotation, rig)
     across, down = A[..., 0] * bent[..., :1], A[..., 1] * bent[..., 1:]
     skewed = torch.cat([bent[..., 1:], torch.zeros_like(bent[..., 1:])], -1)
     by_camera = torch.stack([
@@ -161,11 +157,44 @@ def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor,
     return torch.cat([by_pose, by_nuisance * states.deviation[:, None, None]], -1)
 
 
+def pinhole(
+    local: Float[Tensor, "*m 3"],
+) -> tuple[Float[Tensor, "*m 2"], Float[Tensor, "*m"], Bool[Tensor, "*m"]]:
+    """Return points in a camera's frame (metres) on the plane z = 1, their depths, which are 1 if not in front of it, and if they are."""
+    front = local[..., 2] > 1e-9
+    depth = torch.where(front, local[..., 2], 1.0)
+    return local[..., :2] / depth[..., None], depth, front
+
+
+def by_camera_point(flat: Float[Tensor, "*m 2"], depth: Float[Tensor, "*m"]) -> Float[Tensor, "*m 2 3"]:
+    """Return the derivative of ``flat``, projections on the plane z = 1, with respect to the points in the camera's frame."""
+    eye = torch.eye(2, dtype=flat.dtype, device=flat.device).expand(*flat.shape, 2)
+    return torch.cat([eye, -flat[..., None]], -1) / depth[..., None, None]
+
+
+def by_update(by_point: Float[Tensor, "*m k 3"], points: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m k 6"]:
+    """Return derivatives by a right update of a pose, given those by ``points`` in its frame.
+
+    A point moves by -rho + p x phi under T exp(rho, phi), and r (p x phi) = (r x p) phi.
+    """
+    return torch.cat([-by_point, torch.linalg.cross(by_point, points[..., None, :])], -1)
+
+
 def linear(states: States) -> Float[Tensor, "h 2 2"]:
     """Return the map from the plane z = 1 of the true camera to that of the stated one, without the shift: ``[[a, s], [0, b]]``."""
     log_focal, half, skew = (states.nuisances[:, i] for i in (0, 4, 5))
     a, b = (log_focal + half / 2).exp(), (log_focal - half / 2).exp()
     return torch.stack([a, skew, torch.zeros_like(a), b], -1).unflatten(-1, (2, 2))
+
+
+def true_intrinsics(stated: Intrinsics, camera: Float[Tensor, "6"]) -> Intrinsics:
+    """Return the intrinsics of a camera with these nuisances; they cannot express a skew, which is ignored."""
+    log_focal, cx, cy, k1, log_aspect, _ = camera.tolist()
+    bent, *others = stated.distortion or (0.0, 0.0, 0.0, 0.0)
+    return replace(
+        stated, fx=stated.fx * math.exp(log_focal + log_aspect / 2), fy=stated.fy * math.exp(log_focal - log_aspect / 2),
+        cx=stated.cx + cx * stated.fx, cy=stated.cy + cy * stated.fy, distortion=(bent + k1, *others),
+    )  # fmt: skip
 
 
 def rays_through(states: States, image: Float[Tensor, "m 2"]) -> Float[Tensor, "h m 3"]:

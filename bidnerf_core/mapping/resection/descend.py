@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3, skew
-from bidnerf_core.localization.states import P, States
+from bidnerf_core.mapping.resection.states import P, States
 
 SETTLED = 0.01
 """Predicted decrease of the cost below which a hypothesis has converged."""
