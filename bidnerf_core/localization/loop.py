@@ -352,7 +352,7 @@ class Loop:
             found = self._posterior(quadratic, landmarks, given, systematic)
             if problem.colour_noise:
                 here = found.states[found.best : found.best + 1]
-                rendered = float(rays.colour_noise(here)[0]) / problem.colour_noise
+                rendered = float(rays.colour_error(here)[0]) / problem.colour_noise
         return self._judged(found, before, modes, landmarks, points, given, searched, tuple(fused), rendered)
 
     def _settled(self, best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic]:

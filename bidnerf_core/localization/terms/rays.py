@@ -144,6 +144,10 @@ class Rays:
         value = self._compared(moved(states, self.rgb.device))[:, self.coloured > 0, :3]  # host
         return (MAD * value.abs().flatten(1).nanmedian(-1).values).to(states.z.device)
 
+    def colour_error(self, states: States) -> Float[Tensor, "h"]:
+        """Return the root mean square difference of a colour, in which outliers count as little as in the loss."""
+        return (2 / 3 * self.costs(states).mean(-1)).sqrt() * self.noise
+
     def plain_costs(self) -> Float[Tensor, "n"] | None:
         """Return each ray's robust loss, in units of the noise, if all had the colour that fits best; None with depth, or without colours."""
         if (self.depth_loss is not None and bool((self.distance > 0).any())) or not bool(self.coloured.any()):
