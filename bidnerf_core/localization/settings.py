@@ -47,9 +47,9 @@ class DepthLossSettings(Settings):
     """Settings of the depth term of second-order steps, which applies where depth was measured."""
 
     # weight of the depth term; the photometric term has weight 1, and differences are in units of their scales
-    depth_weight: NotNegative = 3.0
+    depth_weight: NotNegative = 4.0
     depth_loss: RobustName = "huber"  # robust loss of depth differences
-    # depth difference, metres, at which outliers begin; None: 3.8 % of the scene's mean side
+    # depth difference, metres, at which outliers begin; None: 1.9 % of the scene's mean side
     depth_scale: Positive | None = None
 
 
@@ -150,7 +150,7 @@ class SpreadSettings(Settings):
 
     # number of poses tried, including the start; 1: the start alone
     poses: Annotated[int, Range(1, 10**5)] = 32
-    # standard deviation of the poses along each axis of the camera, metres; None: a fraction of the distance to the scene, 0.1 for
+    # standard deviation of the poses along each axis of the camera, metres; None: a fraction of the distance to the scene, 0.15 for
     # ``bid-lm`` and 0.04 for ``inerf-lm``
     spread_translation: NotNegative | None = None
     spread_rotation: NotNegative = 0.12  # standard deviation of the poses about each axis, radians
