@@ -61,7 +61,7 @@ def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig,
     if config.refine_steps:
         stage = RayStage(config.refine_steps, config.refine_rays, sigma=FIELD_SIGMA)
         term = BY_DEPTH.term(problem, stage, seed)
-        rays = term.fitted(best)
+        rays = replace(term, noise=problem.colour_noise or term.noise)
         steps: list[tuple[SE3, Tensor]] = []
         there, _ = descend(best, [refined, rays], config.refine_steps, middle, steps)
         inliers = 0.0

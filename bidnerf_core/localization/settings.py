@@ -180,7 +180,7 @@ class RenderedThresholds(Settings):
     # minimum inlier fraction of the rays for an accepted pose
     converged_inliers: NotNegative = 0.93
     # maximum length of a further step on those rays: of the scene relative to its distance, and in radians
-    converged_step: NotNegative = 0.02
+    converged_step: NotNegative = 0.01
 
 
 @dataclass(frozen=True)

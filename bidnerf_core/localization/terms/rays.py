@@ -274,9 +274,10 @@ class ComparedRays:
         return good.double().mean(-1)
 
     def colour_noise(self) -> Float[Tensor, "h"]:
-        """Return the robust standard deviation of the colour differences; NaN without colours."""
-        value = self.value[:, self.term.coloured > 0, :3].abs().flatten(1)  # host
-        return MAD * value.nanmedian(-1).values if value.shape[1] else value.new_full((len(value),), math.nan)
+        """Return the root mean square of the colour differences, as ``Problem.colour_noise`` is for the map's own images."""
+        coloured = self.term.coloured
+        total = self.value[..., :3].square().sum((1, 2)) / 3
+        return (total / coloured.sum().clamp(min=1)).sqrt()
 
     def fitted_noise(self) -> float:
         """Return the noise that follows from the scatter of the rays' gradients at the first state."""
