@@ -8,8 +8,11 @@ from .adam import AdamSteps as AdamSteps
 from .adam import captured as captured
 from .advice import ADVICE as ADVICE
 from .auto import localization_of as localization_of
+from .by_rays import RayStage as RayStage
+from .by_rays import RayTerms as RayTerms
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
+from .descend import descend as descend
 from .explanations import MOVING as MOVING
 from .localizer import Localizer as Localizer
 from .localizer import Start as Start
@@ -34,6 +37,8 @@ from .methods import matches_landmarks as matches_landmarks
 from .methods import require_start as require_start
 from .methods import require_use_of_depth as require_use_of_depth
 from .methods import settings_of as settings_of
+from .pivots import Pivot as Pivot
+from .pivots import pivot as pivot
 from .posterior import Posterior as Posterior
 from .problem import Problem as Problem
 from .problem import SceneMap as SceneMap
@@ -48,15 +53,14 @@ from .recording import recorded as recorded
 from .result import Localization as Localization
 from .result import Outcome as Outcome
 from .result import Verdict as Verdict
+from .search import states_at as states_at
 from .settings import AdamSettings as AdamSettings
 from .settings import AutoConfig as AutoConfig
-from .settings import ByColourConfig as ByColourConfig
 from .settings import ColourSettings as ColourSettings
+from .settings import DepthLossSettings as DepthLossSettings
 from .settings import DepthSettings as DepthSettings
 from .settings import DescentSettings as DescentSettings
 from .settings import ReachSettings as ReachSettings
-from .settings import RefinementSettings as RefinementSettings
-from .settings import RefinementStage as RefinementStage
 from .settings import TrackerConfig as TrackerConfig
 from .settings import objective_of as objective_of
 from .states import NUISANCES as NUISANCES
@@ -69,5 +73,8 @@ from .support import Support as Support
 from .support import SurfaceDiagnostics as SurfaceDiagnostics
 from .support import SurfaceThresholds as SurfaceThresholds
 from .support import odds as odds
+from .terms.images import Images as Images
+from .terms.rays import Rays as Rays
 from .terms.sampled import SampledLoss as SampledLoss
+from .terms.surface import Surface as Surface
 from .tracking.tracker import Tracker as Tracker

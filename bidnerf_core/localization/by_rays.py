@@ -13,7 +13,7 @@ from torch import Tensor
 from bidnerf_core.devices import moved
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.descend import damped_solution
-from bidnerf_core.localization.pivot import rendered_middle
+from bidnerf_core.localization.pivots import rendered_middle
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import Proposals, Stage, states_at

@@ -68,7 +68,7 @@ def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig,
         if float(_score(exposed, there)) <= float(_score(exposed, best)) + WORSE:
             path = SE3.cat([path, *(T for T, _ in steps[1:]), there.T])
             losses = torch.cat([losses, *(cost for _, cost in steps)])
-            best, inliers = there, float(term.at(there, derivatives=False).agreement()[0])
+            best, inliers = there, float(term.agreement(there)[0])
         diagnostics = replace(_diagnostics(exposed, best, found.margin), rendered_inliers=inliers)
     with torch.no_grad():
         T = best.T[0].normalized()

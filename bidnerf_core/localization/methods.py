@@ -34,13 +34,12 @@ from bidnerf_core.localization.by_rays import (
     centred,
     localization_by_rays,
 )
-from bidnerf_core.localization.pivot import middle_of_view, pivot
+from bidnerf_core.localization.pivots import middle_of_view, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import Stage, halve, image_stages, neighbours, states_at
 from bidnerf_core.localization.settings import (
     AdamSettings,
-    ByColourConfig,
     ColourRefinementSettings,
     ColourSettings,
     DepthLossSettings,
@@ -65,7 +64,6 @@ class SharedSettings:
 
     matches_landmarks: bool = True  # whether images are matched with the map's landmarks
     depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
-    by_colour: ByColourConfig = ByColourConfig()  # how a tracker refines poses by colour alone
     rays: int = 0  # number of rays that may be rendered to compare explanations of an image
     risk: float | None = None  # tolerated fraction of wrong answers among the accepted ones
 
@@ -256,10 +254,12 @@ BID = Method(
     needs_start=True,
     # The paper's settings, with updates in the camera's frame as in its Alg. 1, and about the middle of the scene as by default.
     presets={
-        name: BidConfig(
-            DescentSettings(level=0, pivot=about), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
-        )
-        for name, about in (("paper", "camera"), ("paper-scene", "scene"))
+        "paper": BidConfig(
+            DescentSettings(level=0, pivot="camera"), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
+        ),
+        "paper-scene": BidConfig(
+            DescentSettings(level=0, pivot="scene"), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
+        ),
     },
     summary="Adam on colour and depth at the coarse level (BID-NeRF)",
 )

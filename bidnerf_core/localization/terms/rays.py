@@ -19,7 +19,6 @@ from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.descend import Normal
 from bidnerf_core.localization.states import MOTION, Sights, States, rays_by_camera, rays_through
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
-from bidnerf_core.localization.terms.landmarks import MAD
 from bidnerf_core.localization.terms.rendering import Derivatives, differentiate
 
 RAYS = 1024
@@ -100,8 +99,8 @@ class Rays:
             parts.append((
                 zero[:, :2], zero[:, 0], _looking_along(some.directions), some.origins, zero, zero[:, 0], some.distance,
             ))  # fmt: skip
-        image, times, R, t, *measured = (torch.cat(part) for part in zip(*parts, strict=True))
-        return moved(Rays(field, bounds, Sights(image, times, R, t), *measured), device_of(field))
+        image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
+        return moved(Rays(field, bounds, Sights(image, times, R, t), rgb, coloured, depth), device_of(field))
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -123,6 +122,10 @@ class Rays:
         """Return each ray's robust loss, without derivatives, in units of the noise."""
         found = self.at(moved(states, self.rgb.device), derivatives=False)
         return (self._robust(found.value)[0] / self.noise**2).to(states.z.device)
+
+    def agreement(self, states: States) -> Float[Tensor, "h"]:
+        """Return the fraction of the rays whose colours and distances agree with the rendering."""
+        return self.at(moved(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
 
     def plain_costs(self) -> Float[Tensor, "n"] | None:
         """Return each ray's robust loss, in units of the noise, if all had the colour that fits best.
@@ -216,7 +219,7 @@ class Rays:
         R, sights = states.T.rotation[:, None], self.sights
         by_origin, by_direction = by_origin @ R, by_direction @ R  # in the rig's axes
 
-        def by_frame(origin, direction, at, along):
+        def by_frame(origin: Tensor, direction: Tensor, at: Tensor, along: Tensor) -> Tensor:
             turning = torch.linalg.cross(along[..., None, :].expand_as(direction), direction)
             lever = torch.linalg.cross(at[..., None, :].expand_as(origin), origin)
             return torch.cat([origin, turning + lever], -1)
