@@ -39,7 +39,6 @@ from bidnerf_core.localization import (
     AdamSettings,
     AdamSteps,
     DescentSettings,
-    RayCounts,
     ReachSettings,
     SampledLoss,
     captured,
@@ -65,7 +64,7 @@ def made_steps(
     problem = rig(scene, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
     usual = METHODS["bid"].settings("paper-scene")
     loss = SampledLoss(
-        problem.on_device(), objective_of(usual.colour, usual.depth), RayCounts(rays),
+        problem.on_device(), objective_of(usual.colour, usual.depth), 0,
         DescentSettings(rays=rays, level=level), ReachSettings(), generator or torch.Generator(device).manual_seed(0),
     )  # fmt: skip
     # Poses hardly move, so that all steps render the same.

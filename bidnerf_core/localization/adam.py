@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant, moved, noted, without_waiting
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.pivot import Pivot
+from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.settings import AdamSettings, AnswerName
 from bidnerf_core.progress import check_stopped
 

@@ -182,7 +182,7 @@ AUTO = Method(
     needs_start=False,
     uses_landmarks=True,
     shared=lambda config: SharedSettings(
-        config.landmarks, config.depth_sensor, config.by_colour, config.fused_rays, config.risk
+        config.landmarks, config.depth_sensor, config.fused_rays, config.risk
     ),
     summary="landmarks, then search on the baked surface by depth or colour; no start needed",
 )

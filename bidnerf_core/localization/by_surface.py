@@ -18,7 +18,6 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import Proposals, by_depth, by_images, halve, judge, states_at
 from bidnerf_core.localization.settings import AutoConfig, ColourSettings, DepthLossSettings
 from bidnerf_core.localization.support import SurfaceDiagnostics, support
-from bidnerf_core.localization.terms.rays import INDEPENDENT
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import States, SurfaceMap, descend, trace
 
@@ -59,15 +58,15 @@ def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig,
     refined = finest.fitted_noise(best)
     if config.refine_steps:
         stage = RayStage(config.refine_steps, config.refine_rays, sigma=FIELD_SIGMA)
-        term = replace(BY_DEPTH.term(problem, stage, seed), independent=INDEPENDENT)
-        rays = term.fitted(best)
+        term = BY_DEPTH.term(problem, stage, seed)
+        rays = replace(term, noise=problem.colour_noise or term.noise)
         steps: list[tuple[SE3, Tensor]] = []
-        moved, _ = descend(best, [refined, rays], config.refine_steps, middle, steps)
+        there, _ = descend(best, [refined, rays], config.refine_steps, middle, steps)
         inliers = 0.0
-        if float(_score(exposed, moved)) <= float(_score(exposed, best)) + WORSE:
-            path = SE3.cat([path, *(T for T, _ in steps[1:]), moved.T])
+        if float(_score(exposed, there)) <= float(_score(exposed, best)) + WORSE:
+            path = SE3.cat([path, *(T for T, _ in steps[1:]), there.T])
             losses = torch.cat([losses, *(cost for _, cost in steps)])
-            best, inliers = moved, float(term.agreement(moved)[0])
+            best, inliers = there, float(term.agreement(there)[0])
         diagnostics = replace(_diagnostics(exposed, best, found.margin), rendered_inliers=inliers)
     with torch.no_grad():
         T = best.T[0].normalized()
@@ -152,8 +151,8 @@ def localize_by_images(
 ) -> Localization:
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer.
 
-    The first round is fast. The others assume that part of the scene is hidden. If no answer is accepted, the one that agrees with
-    most of the rendered rays is returned. With a reason why it is ``hopeless``, the best pose of one search is rejected without
+    The first round is fast. The others assume that part of the scene is hidden. If no answer is accepted, the one with the
+    smallest loss is returned. With a reason why it is ``hopeless``, the best pose of one search is rejected without
     refinement, which would take many seconds.
     """
     began, c = time.perf_counter(), config.by_colour
@@ -183,8 +182,8 @@ def localize_by_images(
         answer = localization_by_rays(problem, refined, fresh, middle, c.thresholds, "auto", began)
         if answer.converged:
             return answer
-        answers.append((float(fresh.agreement(refined.states)[0]), answer))
-    return max(answers, key=lambda answer: answer[0])[1]
+        answers.append((answer.loss, answer))
+    return min(answers, key=lambda answer: answer[0])[1]
 
 
 def is_blank(frame: Frame) -> bool:

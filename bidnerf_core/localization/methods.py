@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Annotated, Any
@@ -34,13 +34,12 @@ from bidnerf_core.localization.by_rays import (
     centred,
     localization_by_rays,
 )
-from bidnerf_core.localization.pivot import middle_of_view, pivot
+from bidnerf_core.localization.pivots import middle_of_view, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search import halve, image_stages, neighbours, states_at
+from bidnerf_core.localization.search import Stage, halve, image_stages, neighbours, states_at
 from bidnerf_core.localization.settings import (
     AdamSettings,
-    ByColourConfig,
     ColourRefinementSettings,
     ColourSettings,
     DepthLossSettings,
@@ -65,7 +64,6 @@ class SharedSettings:
 
     matches_landmarks: bool = True  # whether images are matched with the map's landmarks
     depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
-    by_colour: ByColourConfig = ByColourConfig()  # how a tracker refines poses by colour alone
     rays: int = 0  # number of rays that may be rendered to compare explanations of an image
     risk: float | None = None  # tolerated fraction of wrong answers among the accepted ones
 
@@ -256,10 +254,12 @@ BID = Method(
     needs_start=True,
     # The paper's settings, with updates in the camera's frame as in its Alg. 1, and about the middle of the scene as by default.
     presets={
-        name: BidConfig(
-            DescentSettings(level=0, pivot=about), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
-        )
-        for name, about in (("paper", "camera"), ("paper-scene", "scene"))
+        "paper": BidConfig(
+            DescentSettings(level=0, pivot="camera"), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
+        ),
+        "paper-scene": BidConfig(
+            DescentSettings(level=0, pivot="scene"), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
+        ),
     },
     summary="Adam on colour and depth at the coarse level (BID-NeRF)",
 )
@@ -280,8 +280,6 @@ Steps = Annotated[int, Range(1, 10**5)]
 ExpertCount = Annotated[int, Range(1, 10**5), EXPERT]
 RayCount = Annotated[int, Range(7, 10**7)]
 ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
-CENTRING = 2
-"""Number of times that poses around the start are first centred on the measured points."""
 
 
 @dataclass(frozen=True)
@@ -310,47 +308,6 @@ class BidLmStages(Settings):
 
 
 @dataclass(frozen=True)
-class BidLmConfig(Settings):
-    """Settings of method ``bid-lm``."""
-
-    spread: SpreadSettings = SpreadSettings()
-    stages: BidLmStages = BidLmStages()
-    colour: ColourSettings = ColourSettings()
-    depth: DepthLossSettings = DepthLossSettings()
-    exposure: bool = False  # estimate a gain and an offset for each colour channel
-    thresholds: RenderedThresholds = RenderedThresholds()
-
-
-def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
-    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``."""
-    began, start = time.perf_counter(), problem.start_for("bid-lm")
-    middle = middle_of_view(problem, start)
-    poses = _around(start, config.spread, 0.1, middle, seed)
-    if problem.has_depth:
-        for _ in range(CENTRING):
-            poses = centred(problem, poses, middle)
-    terms, stages = RayTerms(config.colour, config.depth, config.exposure), config.stages.stages()
-    found = halve(states_at(poses), terms.stages(problem, stages, seed), middle)
-    fresh = terms.term(problem, stages[-1], seed + len(stages))
-    return localization_by_rays(problem, found, fresh, middle, config.thresholds, "bid-lm", began)
-
-
-def _around(start: SE3, spread: SpreadSettings, share: float, middle: torch.Tensor, seed: int) -> SE3:
-    """Return poses around the start; ``share`` is the usual displacement relative to the distance of the scene."""
-    along = spread.spread_translation
-    along = share * float(middle.norm()) if along is None else along
-    return neighbours(start, spread.poses, along, spread.spread_rotation, seed)
-
-
-BID_LM = Method(
-    bid_lm,
-    BidLmConfig,
-    needs_start=True,
-    summary="second-order steps on colour and depth, from coarse to fine",
-)
-
-
-@dataclass(frozen=True)
 class ImageSearchSettings(Settings):
     """Settings of the search with small renderings, which grow as the number of poses decreases."""
 
@@ -369,6 +326,60 @@ class ImageSearchSettings(Settings):
             (self.width * 3 // 2, self.middle_steps, 2),
             (self.width * 3, self.last_steps, 2),
         ]
+
+
+def _small_images(problem: Problem, search: ImageSearchSettings) -> Iterable[Stage]:
+    """Yield the stages of a comparison with small renderings of the field's coarsest level."""
+    renderer = field_renderer(problem.level(0), problem.bounds)
+    return image_stages(problem, renderer, problem.device, ColourScales(), search.stages())
+
+
+@dataclass(frozen=True)
+class BidLmConfig(Settings):
+    """Settings of method ``bid-lm``."""
+
+    spread: SpreadSettings = SpreadSettings()
+    stages: BidLmStages = BidLmStages()
+    colour: ColourSettings = ColourSettings()
+    depth: DepthLossSettings = DepthLossSettings()
+    exposure: bool = False  # estimate a gain and an offset for each colour channel
+    thresholds: RenderedThresholds = RenderedThresholds()
+
+
+def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
+    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``.
+
+    Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.
+    """
+    began, start = time.perf_counter(), problem.start_for("bid-lm")
+    middle = middle_of_view(problem, start)
+    poses = _around(start, config.spread, 0.1, middle, seed)
+    terms, stages = RayTerms(config.colour, config.depth, config.exposure), config.stages.stages()
+    first: Iterable[Stage] = ()
+    if problem.has_depth:
+        poses = SE3.cat([poses, centred(problem, poses, middle)])
+    else:
+        first, stages = _small_images(problem, ImageSearchSettings()), stages[2:]
+    found = halve(
+        states_at(poses), chain(first, terms.stages(problem, stages, seed)), middle, problem.device
+    )
+    fresh = terms.term(problem, stages[-1], seed + len(stages))
+    return localization_by_rays(problem, found, fresh, middle, config.thresholds, "bid-lm", began)
+
+
+def _around(start: SE3, spread: SpreadSettings, share: float, middle: torch.Tensor, seed: int) -> SE3:
+    """Return poses around the start; ``share`` is the usual displacement relative to the distance of the scene."""
+    along = spread.spread_translation
+    along = share * float(middle.norm()) if along is None else along
+    return neighbours(start, spread.poses, along, spread.spread_rotation, seed)
+
+
+BID_LM = Method(
+    bid_lm,
+    BidLmConfig,
+    needs_start=True,
+    summary="second-order steps on colour and depth, from coarse to fine",
+)
 
 
 @dataclass(frozen=True)
@@ -391,15 +402,14 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
     began, start, steps = time.perf_counter(), problem.start_for("inerf-lm"), config.steps
     problem = problem.without_depth()
     middle = middle_of_view(problem, start)
-    renderer = field_renderer(problem.level(0), problem.bounds)
-    by_images = image_stages(problem, renderer, problem.device, ColourScales(), config.search.stages())
     stages = [
         RayStage(steps.coarse_steps, steps.coarse_rays, 2, 0, 2, sigma=COLOUR_SIGMA),
         RayStage(steps.fine_steps, steps.fine_rays, sigma=COLOUR_SIGMA / 2),
     ]
     terms = RayTerms(config.colour, None, config.exposure)
     poses = states_at(_around(start, config.spread, 0.04, middle, seed))
-    found = halve(poses, chain(by_images, terms.stages(problem, stages, seed)), middle, problem.device)
+    first = _small_images(problem, config.search)
+    found = halve(poses, chain(first, terms.stages(problem, stages, seed)), middle, problem.device)
     fresh = terms.term(problem, stages[-1], seed + len(stages))
     return localization_by_rays(problem, found, fresh, middle, config.thresholds, "inerf-lm", began)
 

@@ -16,7 +16,7 @@ from torch.quasirandom import SobolEngine
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.pivot import Pivot
+from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.support import same_pose
@@ -149,11 +149,11 @@ def hypotheses(
         noise = torch.randn((len(T.translation), 6), generator=generator, dtype=torch.float64)
         return about.moved(T, noise * _spread(translation * extent, rotation))
 
-    def drawn(count: int) -> SE3:
+    def drawn(many: int) -> SE3:
         """Draw keyframes, none repeated before all have been drawn."""
         total = len(keyframes.translation)
-        order = [torch.randperm(total, generator=generator) for _ in range(max(1, -(-count // total)))]
-        return keyframes[torch.cat(order)[:count]]
+        order = [torch.randperm(total, generator=generator) for _ in range(max(1, -(-many // total)))]
+        return keyframes[torch.cat(order)[:many]]
 
     parts = list[SE3]()
     if start is not None:
@@ -170,10 +170,10 @@ def hypotheses(
         plain = displaced(plain, 0.02, 0.05)
     parts.append(plain)
     if by_points:
-        half = count // 2
-        quaternions = torch.randn((half // 4, 4), generator=generator, dtype=torch.float64)
+        rest = count // 2
+        quaternions = torch.randn((rest // 4, 4), generator=generator, dtype=torch.float64)
         turns = quaternion_to_rotation_matrix(normalize(quaternions, dim=-1))
-        rotations = torch.cat([displaced(drawn(half - len(turns)), 0.02, 0.05).rotation, turns])
+        rotations = torch.cat([displaced(drawn(rest - len(turns)), 0.02, 0.05).rotation, turns])
         centre = surface.surfels.positions.median(0).values.cpu().double()
         parts.append(SE3(rotations, centre - rotations @ middle.cpu().double()))
     else:
@@ -211,6 +211,10 @@ def judge(points: Surface) -> Surface:
     return replace(points, noise=JUDGED / 2 * points.surface.extent, colour_weight=1.0)
 
 
+def _mean_cost(points: Surface) -> Callable[[States], Float[Tensor, "h"]]:
+    return lambda states: points.costs(states).mean(-1)
+
+
 def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Proposals:
     """Align measured points with the surface from ``count`` hypotheses all over the scene, best first.
 
@@ -221,13 +225,8 @@ def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Propos
     for n, steps, keep, distance, colour in POINT_STAGES:
         some = points.first(n)
         noise = distance * surface.extent / 2 or surface.cell
-        judged = judge(points.first(max(n, COMPARED_POINTS)))
-        stages.append(
-            Stage(
-                [replace(some, noise=noise, colour_weight=colour)], steps, keep,
-                (lambda states, term=judged: term.costs(states).mean(-1)) if steps else None,
-            )
-        )  # fmt: skip
+        score = _mean_cost(judge(points.first(max(n, COMPARED_POINTS)))) if steps else None
+        stages.append(Stage([replace(some, noise=noise, colour_weight=colour)], steps, keep, score))
     start = hypotheses(surface, problem.start, middle, count, True, seed)
     return halve(states_at(start), stages, middle, surface.device)
 

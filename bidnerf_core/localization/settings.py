@@ -19,7 +19,7 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import DrawerName
 from bidnerf_core.geometry import Robust, RobustName
 from bidnerf_core.localization.accept import least_confidence
-from bidnerf_core.localization.pivot import PivotName
+from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 RENDERED_DEPTH_SHARE = 0.038
@@ -38,18 +38,15 @@ class ColourSettings(Settings):
     colour_loss: RobustName = "huber"  # robust loss of colour differences
     colour_scale: Positive = 0.1  # colour difference, in [0, 1], at which outliers begin
 
-    def robust(self, scale: float | None = None) -> Robust:
-        return Robust(self.colour_loss, self.colour_scale if scale is None else scale)
-
 
 @dataclass(frozen=True)
 class DepthLossSettings(Settings):
     """Settings of the depth term of second-order steps, which applies where depth was measured."""
 
     # weight of the depth term; the photometric term has weight 1, and differences are in units of their scales
-    depth_weight: NotNegative = 3.0
+    depth_weight: NotNegative = 4.0
     depth_loss: RobustName = "huber"  # robust loss of depth differences
-    # depth difference, metres, at which outliers begin; None: 3.8 % of the scene's mean side
+    # depth difference, metres, at which outliers begin; None: 1.9 % of the scene's mean side
     depth_scale: Positive | None = None
 
 
@@ -71,29 +68,14 @@ class DepthSettings(Settings):
     # weight of the term that penalises transparency where depth was measured
     opacity_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
 
-    @property
-    def used(self) -> bool:
-        return max(self.depth_weight, self.free_space_weight, self.opacity_weight) > 0
 
-
-def objective_of(
-    colour: ColourSettings,
-    depth: DepthSettings | None,
-    colour_scale: float | None = None,
-    depth_scale: float | None = None,
-    miss_scales: float | None = None,
-) -> Objective:
-    """Return the objective given by the settings; a stage may replace their scales with its own.
-
-    ``miss_scales`` is the depth residual, in depth scales, of a ray that hits nothing; None means the paper's.
-    """
-    terms = [colour_term(colour.robust(colour_scale))]
-    if depth is not None and depth.used:
-        scale = depth_scale or depth.depth_scale
-        assert scale is not None
-        robust = Robust(depth.depth_loss, scale)
-        miss = None if miss_scales is None else miss_scales * scale
-        terms.append(depth_term(robust, depth.depth_weight, DEPTH_RESIDUALS[depth.depth_residual], miss))
+def objective_of(colour: ColourSettings, depth: DepthSettings | None) -> Objective:
+    """Return the objective of first-order steps, whose depth scale must be given (eq. 5)."""
+    terms = [colour_term(Robust(colour.colour_loss, colour.colour_scale))]
+    if depth is not None and max(depth.depth_weight, depth.free_space_weight, depth.opacity_weight) > 0:
+        assert depth.depth_scale is not None
+        robust = Robust(depth.depth_loss, depth.depth_scale)
+        terms.append(depth_term(robust, depth.depth_weight, DEPTH_RESIDUALS[depth.depth_residual]))
         if depth.free_space_weight > 0:
             terms.append(free_space_term(robust, depth.free_space_weight))
         if depth.opacity_weight > 0:
@@ -157,50 +139,13 @@ class SpreadSettings(Settings):
 
 
 @dataclass(frozen=True)
-class RefinementSettings(Settings):
-    """Settings of second-order steps on rendered rays."""
-
-    pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
-    # what an update rotates about: middle of the scene, camera, world
-    pivot: Annotated[PivotName, EXPERT] = "scene"
-    exposure: bool = False  # estimate a gain and a bias for each colour channel
-    surface_sigma: NotNegative = 0.03  # uncertainty of the map's surfaces in coarse steps, metres
-    # rendering weight below which a sample has no derivative
-    least_weight: Annotated[float, Range(0.0, 0.999999), EXPERT] = 0.01
-    # length of a step below which a stage ends (metres, radians)
-    stop_step: Annotated[float, Range(0.0), EXPERT] = 1e-4
-    # number of samples within the depth window of a stage that has one
-    window_samples: Annotated[int, Range(1, 10**4), EXPERT] = 12
-
-
-@dataclass(frozen=True)
 class RenderedThresholds(Settings):
     """Thresholds for accepting a pose, applied to newly drawn rendered rays."""
 
     # minimum inlier fraction of the rays for an accepted pose
     converged_inliers: NotNegative = 0.93
     # maximum length of a further step on those rays: of the scene relative to its distance, and in radians
-    converged_step: NotNegative = 0.02
-
-
-@dataclass(frozen=True)
-class RefinementStage:
-    """A stage of refinement: steps at one level of detail on one draw of rays; with 0 steps, poses are only ranked."""
-
-    steps: int
-    rays: int  # per pose
-    keep: int = 1  # number of poses with which the stage begins: the best so far
-    level: int | None = None  # of the field: 0 is the coarsest, None the field itself
-    blur: int = 1  # width, in pixels, of the squares over which observed colours are averaged
-    colour_scale: float = 0.1  # colour difference at which outliers begin
-    depth_scale: float = 0.1  # depth difference, metres, at which outliers begin
-    surface_sigma: float = (
-        0.0  # metres: standard deviation of surfaces; residuals with steep gradients count less
-    )
-    window: float = 0.0  # metres sampled around the measured depth; 0: the whole ray
-    damping: float = 1e-3  # of the first step
-    # number of times that each pose is first shifted to align the middle of the rendering with that of the measurements
-    centring: int = 0
+    converged_step: NotNegative = 0.01
 
 
 def mean_side(bounds: SceneBounds) -> float:
@@ -236,7 +181,6 @@ class ByColourConfig(Settings):
 
     steps: ColourRefinementSettings = ColourRefinementSettings()
     colour: ColourSettings = ColourSettings()
-    refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006, exposure=True)
     thresholds: RenderedThresholds = RenderedThresholds()
 
 

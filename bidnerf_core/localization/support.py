@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import ACCEPTED
-from bidnerf_core.localization.pivot import Pivot
+from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.result import Outcome, Verdict
 
 DISPLACEMENT = 0.1

@@ -11,25 +11,25 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from bidnerf_core.devices import without_waiting
+from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.fields import RadianceField, SceneBounds, levels
 from bidnerf_core.localization import (
     AdamSettings,
     AdamSteps,
     BidConfig,
     ColourSettings,
+    DepthLossSettings,
     DepthSettings,
     DescentSettings,
     Problem,
-    RayCounts,
-    RefinementSettings,
-    RefinementStage,
-    RenderedCostSettings,
+    RayStage,
+    RayTerms,
     SampledLoss,
     descend,
     objective_of,
     pivot,
     rig,
+    states_at,
 )
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 from bidnerf_core.testing.faults import calling, require_that
@@ -63,8 +63,8 @@ def check_steps(field: RadianceField) -> None:
         expected = _first_order(_problem(field), number, None)
         with Elsewhere() as mode:
             with calling(f"{type(field).__name__}.to(device)"):
-                moved: Any = cast(Any, copy.deepcopy(field)).to(DEVICE)
-            problem = _problem(moved)
+                there: Any = cast(Any, copy.deepcopy(field)).to(DEVICE)
+            problem = _problem(there)
             if problem.device != DEVICE:
                 return
             who = f"{type(field).__name__}, level {number}"
@@ -99,11 +99,10 @@ def _problem(field: RadianceField) -> Problem:
 def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor:
     """Return the pose (4 4) after two steps; the first fills caches, the second must not leave the device."""
     device, start = problem.device, problem.start_for("bid")
-    objective = objective_of(ColourSettings(), DepthSettings())
-    settings, generator = DescentSettings(level=level), torch.Generator(device).manual_seed(0)
-    loss = SampledLoss(
-        problem.on_device(), objective, RayCounts(CHECKED_RAYS), settings, BidConfig().reach, generator
-    )
+    objective = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1))
+    settings = DescentSettings(CHECKED_RAYS, level=level)
+    generator = torch.Generator(device).manual_seed(0)
+    loss = SampledLoss(problem.on_device(), objective, 0, settings, BidConfig().reach, generator)
     steps = AdamSteps(loss, pivot("scene", problem), AdamSettings(), start.to(device))
     with without_waiting():
         steps()
@@ -116,12 +115,10 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 
 
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
-    about = pivot("scene", problem).to(DEVICE)
-    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
-    stage, generator = RefinementStage(2, CHECKED_RAYS, level=level), torch.Generator().manual_seed(0)
-    cost = settings.drawn(problem.on_device(), stage, about, generator)
-    start = problem.start_for("bid-lm")[None].to(DEVICE)
+    terms = RayTerms(ColourSettings(), DepthLossSettings())
+    rays = terms.term(problem, RayStage(2, CHECKED_RAYS, level=level), 0)
+    start = moved(states_at(problem.start_for("bid-lm")[None]), DEVICE)
     with without_waiting():
-        descend(cost, start, 1, about.moved)
+        descend(start, [rays], 1)
         with mode.strict():
-            descend(cost, start, 2, about.moved, stop=settings.refinement.stop_step)
+            descend(start, [rays], 2)

@@ -52,8 +52,7 @@ def test_surfels_lie_on_the_true_surface() -> None:
 def test_all_that_was_seen_is_there() -> None:
     surface = baked.toy()
     for view in baked.unseen():
-        cloud = baked.cloud(view, count=500)
-        world = view.T_ref_camera.apply(cloud.points.double()).float()
+        world = view.T_ref_camera.apply(baked.points(view, count=500).points).float()
         assert (surface.distance(world) < 2 * surface.cell).float().mean() > 0.95
 
 

@@ -12,7 +12,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import PointCloud, Problem, rig
+from bidnerf_core.localization import Problem, Surface, rig
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
 from bidnerf_core.scenes import (
     Box,
@@ -71,20 +71,11 @@ def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None =
     return rig(FieldMap(FIELD, BOUNDS, toy() if surface is None else surface), views, start)
 
 
-def cloud(*views: View, count: int = 1000, seed: int = 0) -> PointCloud:
+def points(*views: View, count: int = 1000, seed: int = 0, surface: SurfaceMap | None = None) -> Surface:
     """Return measured points of views whose poses are known in the world, in the last one's frame."""
-    generator = torch.Generator().manual_seed(seed)
-    return PointCloud.measured(problem(*views).views, None, count, generator)
-
-
-def points(
-    places: Tensor, rgb: Tensor, origins: Tensor | None = None, coloured: Tensor | None = None
-) -> PointCloud:
-    """Return a cloud of given points, by default measured from the camera, and all with a colour."""
-    origins = torch.zeros_like(places) if origins is None else origins
-    return PointCloud(
-        places, rgb, origins, torch.ones(len(places), dtype=torch.bool) if coloured is None else coloured
-    )
+    found = Surface.of(problem(*views).views, None, toy() if surface is None else surface, seed, count)
+    assert found is not None
+    return found
 
 
 def of_points(

@@ -18,7 +18,7 @@ from bidnerf_core.frames import Frame, View, continued
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
 from bidnerf_core.localization.terms.rendering import Derivatives, differentiate
-from bidnerf_core.mapping import MAD, MOTION, Normal, Sights, States, rays_by_camera, rays_through
+from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
 RAYS = 1024
 INDEPENDENT = 300.0
@@ -98,76 +98,53 @@ class Rays:
             parts.append((
                 zero[:, :2], zero[:, 0], _looking_along(some.directions), some.origins, zero, zero[:, 0], some.distance,
             ))  # fmt: skip
-        image, times, R, t, *measured = (torch.cat(part) for part in zip(*parts, strict=True))
-        return moved(Rays(field, bounds, Sights(image, times, R, t), *measured), device_of(field))
+        image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
+        return moved(Rays(field, bounds, Sights(image, times, R, t), rgb, coloured, depth), device_of(field))
 
     def __len__(self) -> int:
         return len(self.rgb)
 
     def __call__(self, states: States) -> Normal:
-        here = moved(states, self.rgb.device)
-        value, rows, steepness = self._residuals(here)
-        cost, weight = self._robust(value)
-        if self.sigma > 0:
-            weight = weight / (1 + (self.sigma / self.loss.scale * steepness).square())
-        flat, pull = rows.flatten(1, 2), (weight * value).flatten(1, 2)
-        hessian = (flat * weight.flatten(1)[..., None]).mT @ flat
-        share = self._share
-        found = Normal(share * cost.sum(-1), share * (flat * pull[..., None]).sum(1), share * hessian)
-        return moved(found, states.z.device)
+        return moved(self.at(moved(states, self.rgb.device)).normal(), states.z.device)
 
-    @property
-    def _share(self) -> float:
-        return self.independent / (len(self) + self.independent) / self.noise**2
+    def at(self, states: States, derivatives: bool = True) -> ComparedRays:
+        """Render the rays at ``states``, which are on the field's device, and compare them with what was measured."""
+        if derivatives:
+            return ComparedRays(self, *self._residuals(states))
+        *_, origins, directions = self._sent(states)
+        rendering = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)
+        seen = self._channels(rendering, torch.arange(len(origins), device=origins.device))
+        value, _ = self._differences(seen.double().unflatten(0, (len(states), -1)))
+        return ComparedRays(self, value, value[..., None], value)
 
     def costs(self, states: States) -> Float[Tensor, "h n"]:
         """Return each ray's robust loss, without derivatives, in units of the noise."""
-        return (
-            self._robust(self._compared(moved(states, self.rgb.device)))[0].to(states.z.device)
-            / self.noise**2
-        )
-
-    def cost(self, states: States) -> Float[Tensor, "h"]:
-        """Return the cost alone."""
-        return self._share * self.noise**2 * self.costs(states).sum(-1)
+        found = self.at(moved(states, self.rgb.device), derivatives=False)
+        return (self._robust(found.value)[0] / self.noise**2).to(states.z.device)
 
     def agreement(self, states: States) -> Float[Tensor, "h"]:
         """Return the fraction of the rays whose colours and distances agree with the rendering."""
-        value = self._compared(moved(states, self.rgb.device)).abs()
-        good = (value[..., :3] <= OUTLIER * self.loss.scale).all(-1)
-        if self.depth_loss is not None:
-            good = good & (value[..., 3] <= OUTLIER * self._depth_unit * self.depth_loss.scale)
-        return good.double().mean(-1).to(states.z.device)
-
-    def colour_noise(self, states: States) -> Float[Tensor, "h"]:
-        """Return the robust standard deviation of the colour differences."""
-        value = self._compared(moved(states, self.rgb.device))[:, self.coloured > 0, :3]  # host
-        return (MAD * value.abs().flatten(1).nanmedian(-1).values).to(states.z.device)
+        return self.at(moved(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
 
     def colour_error(self, states: States) -> Float[Tensor, "h"]:
         """Return the root mean square difference of a colour, in which outliers count as little as in the loss."""
         return (2 / 3 * self.costs(states).mean(-1)).sqrt() * self.noise
 
     def plain_costs(self) -> Float[Tensor, "n"] | None:
-        """Return each ray's robust loss, in units of the noise, if all had the colour that fits best; None with depth, or without colours."""
-        if (self.depth_loss is not None and bool((self.distance > 0).any())) or not bool(self.coloured.any()):
+        """Return each ray's robust loss, in units of the noise, if all had the colour that fits best.
+
+        None with depth, or without colours.
+        """
+        with_depth = self.depth_loss is not None and bool((self.distance > 0).any())
+        if with_depth or not bool(self.coloured.any()):
             return None
-        _, offset = self._exposure(torch.zeros_like(self.rgb)[None])
+        _, offset = self._exposure(torch.zeros_like(self.rgb)[None], always=True)
         value = (offset - self.rgb) * self.coloured[:, None]
         return (self._robust(value)[0] / self.noise**2)[0].cpu()
 
     def fitted(self, states: States) -> Rays:
         """Return the term with the noise that follows from the scatter of the rays' gradients at the first state."""
-        value, rows, _ = self._residuals(moved(states[:1], self.rgb.device))
-        weight = self._robust(value)[1][0, :, :, None]
-        rows = rows[0, :, :, :6]
-        hessian = (weight * rows).flatten(0, 1).mT @ rows.flatten(0, 1)
-        scores = (weight[..., 0] * value[0])[..., None] * rows
-        scores = (scores - scores.mean(0)).flatten(0, 1)
-        unit = hessian.diagonal().clamp(min=1e-12).rsqrt()
-        whitened = torch.linalg.pinv(unit[:, None] * hessian * unit, hermitian=True)
-        ratio = whitened @ (unit[:, None] * (scores.mT @ scores) * unit)
-        return replace(self, noise=min(max(math.sqrt(max(float(ratio.trace()), 0) / 6), 0.005), 0.3))  # host
+        return replace(self, noise=self.at(moved(states[:1], self.rgb.device)).fitted_noise())
 
     @property
     def _depth_unit(self) -> float:
@@ -207,13 +184,6 @@ class Rays:
         off = rendering.distance - rendering.opacity * measured + (1 - rendering.opacity) * miss
         return torch.cat([rendering.rgb, torch.where(measured > 0, off, 0)[:, None]], -1)
 
-    def _compared(self, states: States) -> Float[Tensor, "h n c"]:
-        """Return the residuals without derivatives."""
-        *_, origins, directions = self._sent(states)
-        rendering = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)
-        seen = self._channels(rendering, torch.arange(len(origins), device=origins.device))
-        return self._differences(seen.double().unflatten(0, (len(states), -1)))[0]
-
     def _differences(
         self, seen: Float[Tensor, "h n c"]
     ) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h 1 3"]]:
@@ -225,9 +195,9 @@ class Rays:
         return torch.cat([value, self._depth_unit * seen[..., 3:]], -1), gain
 
     def _exposure(
-        self, seen: Float[Tensor, "h n 3"]
+        self, seen: Float[Tensor, "h n 3"], always: bool = False
     ) -> tuple[Float[Tensor, "h 1 3"], Float[Tensor, "h 1 3"]]:
-        if not self.exposure:
+        if not (self.exposure or always):
             return torch.ones_like(seen[:, :1]), torch.zeros_like(seen[:, :1])
         half = 2 * self.loss.scale
         known, precision = self.coloured[None, :, None], GAIN_PRIOR * len(self)
@@ -252,7 +222,7 @@ class Rays:
         R, sights = states.T.rotation[:, None], self.sights
         by_origin, by_direction = by_origin @ R, by_direction @ R  # in the rig's axes
 
-        def by_frame(origin, direction, at, along):
+        def by_frame(origin: Tensor, direction: Tensor, at: Tensor, along: Tensor) -> Tensor:
             turning = torch.linalg.cross(along[..., None, :].expand_as(direction), direction)
             lever = torch.linalg.cross(at[..., None, :].expand_as(origin), origin)
             return torch.cat([origin, turning + lever], -1)
@@ -279,6 +249,53 @@ class Rays:
             colours = eliminate(rows[..., :3, :], seen[..., :3], weight)
             rows = torch.cat([colours, rows[..., 3:, :]], -2)
         return value, rows, steepness
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedRays:
+    """Rendered minus measured, of n rays from each of h poses."""
+
+    term: Rays
+    value: Float[Tensor, "h n c"]
+    rows: Float[Tensor, "h n c P"]  # derivatives
+    steepness: Float[Tensor, "h n c"]  # norm of the gradient by the ray's origin, per metre
+
+    def normal(self) -> Normal:
+        term = self.term
+        cost, weight = term._robust(self.value)
+        if term.sigma > 0:  # adds a variance of (steepness x sigma)^2
+            confidence = (1 + (term.sigma / term.loss.scale * self.steepness).square()).rsqrt()
+            weight = confidence.square() * term._robust(confidence * self.value)[1]
+        flat, pull = self.rows.flatten(1, 2), (weight * self.value).flatten(1, 2)
+        hessian = (flat * weight.flatten(1)[..., None]).mT @ flat
+        share = term.independent / (len(term) + term.independent) / term.noise**2
+        return Normal(share * cost.sum(-1), share * (flat * pull[..., None]).sum(1), share * hessian)
+
+    def agreement(self) -> Float[Tensor, "h"]:
+        """Return the fraction of the rays whose colours and distances agree with the rendering."""
+        term, size = self.term, self.value.abs()
+        good = (size[..., :3] <= OUTLIER * term.loss.scale).all(-1)
+        if term.depth_loss is not None:
+            good = good & (size[..., 3] <= OUTLIER * term._depth_unit * term.depth_loss.scale)
+        return good.double().mean(-1)
+
+    def colour_noise(self) -> Float[Tensor, "h"]:
+        """Return the root mean square of the colour differences, as ``Problem.colour_noise`` is for the map's own images."""
+        coloured = self.term.coloured
+        total = self.value[..., :3].square().sum((1, 2)) / 3
+        return (total / coloured.sum().clamp(min=1)).sqrt()
+
+    def fitted_noise(self) -> float:
+        """Return the noise that follows from the scatter of the rays' gradients at the first state."""
+        weight = self.term._robust(self.value)[1][0, :, :, None]
+        rows = self.rows[0, :, :, :6]
+        hessian = (weight * rows).flatten(0, 1).mT @ rows.flatten(0, 1)
+        scores = (weight[..., 0] * self.value[0])[..., None] * rows
+        scores = (scores - scores.mean(0)).flatten(0, 1)
+        unit = hessian.diagonal().clamp(min=1e-12).rsqrt()
+        whitened = torch.linalg.pinv(unit[:, None] * hessian * unit, hermitian=True)
+        ratio = whitened @ (unit[:, None] * (scores.mT @ scores) * unit)
+        return min(max(math.sqrt(max(float(ratio.trace()), 0) / 6), 0.005), 0.3)  # host
 
 
 def averaged(frame: Frame, size: int) -> Float[Tensor, "h w 3"]:

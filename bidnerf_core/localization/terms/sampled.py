@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields import Objective, Observations, Rays, masked_mean, render, widened
+from bidnerf_core.fields import Objective, Observations, Rays, SceneBounds, masked_mean, render, widened
 from bidnerf_core.frames import DRAWERS, Frame, draw
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.problem import Problem

@@ -114,8 +114,8 @@ class Surface:
         if total < LEAST:
             return None
         order = torch.randperm(total, generator=generator)
-        image, times, R, t, *measured = (torch.cat(part)[order] for part in zip(*parts, strict=True))
-        term = Surface(surface, Sights(image, times, R, t), *measured, noise=2 * surface.cell)
+        image, times, R, t, z, fixed, rgb, coloured = (torch.cat(part)[order] for part in zip(*parts, strict=True))
+        term = Surface(surface, Sights(image, times, R, t), z, fixed, rgb, coloured, 2 * surface.cell)
         return moved(term, surface.device)
 
     def __len__(self) -> int:
@@ -148,7 +148,7 @@ class Surface:
         cost = share * 2 * (1 - inlier).sum(-1)
         weight = share * inlier.square() / self.noise**2
         R = here.T.rotation
-        gradient = hessian = 0
+        gradient, hessian = torch.zeros_like(here.z[:, :1]), torch.zeros_like(here.z[:, :1, None])
         if self.colour_weight:
             difference, slope = self._colours(index, along)
             alike = self._alike(difference)
@@ -226,7 +226,7 @@ class Surface:
         seen = self.coloured[:, None]
         return difference * seen, slope * seen[..., None]
 
-    def _offsets(self, states: States):
+    def _offsets(self, states: States) -> tuple[Tensor, ...]:
         rays, sights = rays_through(states, self.sights.image), self.sights
         local = rays * (self.z * states.nuisances[:, DEPTH, None].exp())[..., None] + self.fixed
         v, w = (states.nuisances[:, None, part].expand_as(local) for part in (slice(6, 9), slice(9, 12)))
@@ -241,7 +241,7 @@ class Surface:
         beyond = (along.norm(dim=-1) - DISC * self.surface.cell).clamp(min=0)
         return across, across.square() + beyond.square(), normal, index, along, local, rays
 
-    def _rows(self, states, normal, local, rays) -> Float[Tensor, "h n P"]:
+    def _rows(self, states: States, normal: Tensor, local: Tensor, rays: Tensor) -> Float[Tensor, "h n P"]:
         sights = self.sights
         rig = (sights.rotation @ local[..., None])[..., 0] + sights.translation
         by_pose = torch.cat([normal, torch.linalg.cross(rig, normal)], -1)

@@ -15,7 +15,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.problem import Problem
 
 PivotName = Literal["scene", "camera", "world"]
-MIDDLE_RAYS = 256
+MIDDLE_RAYS = 128
 """Number of rays whose renderings give the middle of the visible scene."""
 
 

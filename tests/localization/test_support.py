@@ -1,4 +1,4 @@
-"""Agreement beyond chance: a plain wall looks the same from anywhere, so that no pose before it is accepted.
+"""Support of a pose: a plain wall looks the same from anywhere, so that no pose before it is accepted.
 
 ``support`` and ``log_odds`` are needed here for the odds themselves, which no answer shows.
 """
@@ -18,10 +18,10 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import NO_RIVAL, AutoConfig, Localization, Outcome, Problem, Support, rig
+from bidnerf_core.localization import NO_RIVAL, AutoConfig, Localization, Outcome, Pivot, Problem, Support, rig
 
 # Inside: the odds themselves, far from the values at which they decide
-from bidnerf_core.localization.beyond_chance import log_odds, support
+from bidnerf_core.localization.support import log_odds, same_pose, support
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 from bidnerf_core.scenes import look_at
 from problems import FieldMap, localize
@@ -168,3 +168,18 @@ def test_confidence_is_that_of_the_pose_among_its_rivals() -> None:
     said = replace(sure, other=0.0).rejection()
     assert said is not None
     assert said.outcome is Outcome.AMBIGUOUS
+
+
+def test_poses_are_the_same_by_where_they_put_the_middle_and_by_their_angle() -> None:
+    """In any world frame and unit of length; a turn about the middle moves it nowhere, and counts by its angle."""
+    about = Pivot.at_point(MIDDLE)
+    xi = torch.zeros((4, 6), dtype=torch.float64)
+    xi[0, 0], xi[1, 0], xi[2, 4], xi[3, 4] = 0.19, 0.21, 0.09, 0.11
+    T = look_at((0.1, -0.2, 1.6), (0.3, 0.2, 0.0))
+    others = about.moved(SE3(T.rotation.expand(4, 3, 3), T.translation.expand(4, 3)), xi)
+    expected = [True, False, True, False]
+    assert same_pose(T, others, MIDDLE).tolist() == expected
+    elsewhere = SE3.exp(torch.tensor([5.0, -3.0, 2.0, 0.4, 0.5, -1.0], dtype=torch.float64))
+    assert same_pose(elsewhere @ T, elsewhere @ others, MIDDLE).tolist() == expected
+    small, fewer = (SE3(x.rotation, 1e-3 * x.translation) for x in (T, others))
+    assert same_pose(small, fewer, 1e-3 * MIDDLE).tolist() == expected
