@@ -1,4 +1,4 @@
-"""Verdicts: from the measures of a pose, or of a tracked frame, to its outcome and reason.
+"""Verdicts: from the measures of a pose to its outcome and reason.
 
 The methods' own tests have right and wrong answers as a whole; the verdicts are needed here for the threshold of each measure.
 """
@@ -27,13 +27,6 @@ from bidnerf_core.localization.acceptance import (
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.settings import RenderedThresholds
-from bidnerf_core.localization.tracking.measuring import (
-    as_certain_as_usual,
-    not_by_chance,
-    precise_enough,
-    shape_verdict,
-    unconfirmed,
-)
 
 
 def rejection(T: SE3, cloud: PointCloud, margin: float = math.inf) -> Verdict | None:
@@ -181,52 +174,3 @@ def test_only_points_with_a_colour_tell_of_colours() -> None:
     assert outcome(view.T_ref_camera, inverted) is Outcome.COLOUR_MISMATCH
     bare = baked.points(seen.points, 1 - seen.rgb, seen.origins, torch.zeros_like(coloured))
     assert outcome(view.T_ref_camera, bare) is Outcome.CONVERGED
-
-
-ACCEPTED = Verdict(Outcome.CONVERGED, "30 landmark inliers")
-
-
-def covariance(translation: float) -> torch.Tensor:
-    """Return a covariance whose position is uncertain along one oblique direction."""
-    along = torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64) / 3
-    found = 1e-8 * torch.eye(6, dtype=torch.float64)
-    found[:3, :3] += translation**2 * torch.outer(along, along)
-    return found
-
-
-def test_landmarks_spread_evenly_over_the_threshold_agree_by_chance() -> None:
-    """The standard deviation of such residuals, by which a fit is recognised that is none."""
-    angle, radius = torch.rand(2, 200_000, generator=torch.Generator().manual_seed(0))
-    place = 4.0 * radius.sqrt() * (2 * torch.pi * angle).cos()
-    assert float(place.std()) == pytest.approx(4.0 / 2, rel=0.01)
-    assert not_by_chance(ACCEPTED, 1.9, 4.0) is ACCEPTED
-    refused = not_by_chance(ACCEPTED, 2.1, 4.0)
-    assert refused.outcome is Outcome.AMBIGUOUS
-    assert refused.reason.startswith(ACCEPTED.reason)
-
-
-@pytest.mark.parametrize("judge", [precise_enough, as_certain_as_usual])
-def test_an_uncertain_position_is_imprecise_and_other_rejections_stay(judge: object) -> None:
-    limit = {precise_enough: 0.03, as_certain_as_usual: 4.5}[judge]  # type: ignore[index]
-    assert judge(ACCEPTED, covariance(0.99 * limit), 1.0) is ACCEPTED  # type: ignore[operator]
-    assert judge(ACCEPTED, covariance(1.01 * limit), 1.0).outcome is Outcome.IMPRECISE  # type: ignore[operator]
-    other = Verdict(Outcome.OFF_SURFACE, "")
-    assert judge(other, covariance(10.0), 1.0) is other  # type: ignore[operator]
-
-
-def test_nothing_is_unusual_where_the_usual_error_is_not_known() -> None:
-    assert as_certain_as_usual(ACCEPTED, covariance(10.0), 0.0) is ACCEPTED
-
-
-def test_a_shape_without_a_time_is_not_accepted() -> None:
-    small = covariance(1e-3)
-    assert shape_verdict(ACCEPTED, small, 1.0, 0.01, stamped=True) is ACCEPTED
-    assert "time stamp" in shape_verdict(ACCEPTED, small, 1.0, 0.01, stamped=False).reason
-    assert shape_verdict(ACCEPTED, covariance(0.05), 1.0, 1.0, stamped=True).outcome is Outcome.IMPRECISE
-    assert shape_verdict(ACCEPTED, covariance(0.02), 1.0, 0.004, stamped=True).outcome is Outcome.IMPRECISE
-
-
-def test_few_followed_landmarks_need_confirmation() -> None:
-    assert unconfirmed(ACCEPTED).outcome is Outcome.TOO_FEW_MATCHES
-    other = Verdict(Outcome.UNDETERMINED, "")
-    assert unconfirmed(other) is other

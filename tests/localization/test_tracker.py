@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -18,6 +20,17 @@ from bidnerf_core import Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata
+from bidnerf_core.localization import AutoConfig
+
+# Inside: flow, and the parts of a state that only rare sequences fill
+from bidnerf_core.localization.tracking.flow import alike
+from bidnerf_core.localization.tracking.motion import Clock
+from bidnerf_core.localization.tracking.state import (
+    CorrectedCamera,
+    TrackerState,
+    load_tracker_state,
+    save_state,
+)
 from bidnerf_core.results import normalized_error_squared, pose_error
 from bidnerf_core.testing import CAMERA, textured_map, view
 from conditions import ground_landmarks, with_landmarks
@@ -33,7 +46,7 @@ from flights import (
     tracked,
     without_depth,
 )
-from localizations import CHI2_99
+from localizations import CHI2_99, assert_covered
 from refusals import refused
 
 Flight = list[tuple[float, Frame, SE3]]
@@ -236,31 +249,47 @@ def test_a_state_with_damaged_numbers_or_tensors_is_refused_and_changes_nothing(
     tensors, metadata = read_tensors_and_metadata(path, "a state")
     content = json.loads(metadata["bidnerf"])
 
-    parts = {name: tensor for name, tensor in tensors.items() if name.startswith(("points.", "motion."))}
-    negative, doubled = -tensors["motion.noise"], 2 * tensors["motion.rotation"]
+    def changed(place: str, value: Any) -> dict[str, Any]:
+        """Return the numbers with the value at ``place``, such as ``motion.reach``, replaced."""
+        state = json.loads(json.dumps(content["state"]))
+        *parents, last = place.split(".")
+        functools.reduce(dict.__getitem__, parents, state)[last] = value
+        return dict(state)
+
+    numbers = content["state"]
+    rotation, noise = "motion.T_world_camera.rotation", "motion.noise"
+    without = {name: tensor for name, tensor in tensors.items() if name != "points.pixels"}
+    fewer = tensors | {"points.landmark": tensors["points.landmark"][1:].clone()}
     wrong: list[tuple[dict[str, torch.Tensor], dict[str, Any], str, str, str | None]] = [
-        (tensors, {"frames": "3"}, ": frames", "found '3'", "int"),
-        (tensors, {"age": -1}, "", "age is -1", "0 or more"),
-        (tensors, {"interval": 0}, "", "no field 'interval'", "any of clock"),
-        (tensors, {"reach": 0.0}, "", "reach is 0.0", "a positive distance"),
-        (tensors, {"reach": None}, "", "only one of reach and agility", "both or neither"),
-        (tensors, {"noise": []}, ": noise", "found []", "float"),
-        *(
-            (
-                tensors | {name: part[None].contiguous()},
-                {},
-                "",
-                f"{name} is {part.dtype} {[1, *part.shape]}",
-                None,
-            )
-            for name, part in parts.items()
+        (tensors, changed("frames", "3"), ": frames", "found '3'", "int"),
+        (tensors, changed("age", -1), "", "age is -1", "0 or more"),
+        (tensors, numbers | {"interval": 0}, "", "no field 'interval'", "any of clock"),
+        (tensors, changed("motion.reach", 0.0), "", "reach is 0.0", "a positive distance"),
+        (tensors, changed("motion.reach", None), ": motion: reach", "found None", "float"),
+        (tensors, changed("motion.noise", 1.0), ": motion: noise", "found 1.0", None),
+        (tensors, changed("noise", []), ": noise", "found []", "float"),
+        (tensors | {noise: tensors[noise].float()}, numbers, "", "motion.noise", "torch.float64"),
+        (tensors | {noise: -tensors[noise]}, numbers, "", "a variance of the motion is negative", None),
+        (
+            tensors | {rotation: 2 * tensors[rotation]},
+            numbers,
+            "",
+            "the pose of the motion is not rigid",
+            None,
         ),
-        (tensors | {"motion.noise": negative}, {}, "", "a variance of the motion is negative", None),
-        (tensors | {"motion.rotation": doubled}, {}, "", "the pose of the motion is not rigid", None),
-        ({n: t for n, t in tensors.items() if n != "points.pixels"}, {}, "", "'points.pixels'", None),
+        (without, numbers, "", "no tensor 'points.pixels'", None),
+        (fewer, numbers, "", "the points have different numbers", None),
     ]
-    for changed, numbers, field, found, expected in wrong:
-        save_file(changed, path, {"bidnerf": json.dumps(content | {"state": content["state"] | numbers})})
+    for name, part in tensors.items():
+        if name.startswith(("points.", "motion.")):
+            place = ": ".join(["", *name.split(".")])
+            found = f"found {part.dtype} {[1, *part.shape]}"
+            batch = {name: part[None].contiguous()}
+            if "T_world" in name:  # a batch of poses
+                place, found = "", "the pose of the motion is not rigid"
+            wrong.append((tensors | batch, numbers, place, found, None))
+    for damaged, state, field, found, expected in wrong:
+        save_file(damaged, path, {"bidnerf": json.dumps(content | {"state": state})})
         with refused(where=f"{path}{field}", found=found, expected=expected):
             tracker.restore(path)
         assert tracker.tracking
@@ -290,6 +319,108 @@ def test_a_map_without_landmarks_is_tracked_by_depth() -> None:
         )
         < 0.03
     )
+
+
+def depth_only(frame: Frame) -> Frame:
+    return replace(frame, rgb=torch.zeros_like(frame.rgb), has_colour=False)
+
+
+def test_an_image_without_depth_is_tracked_by_colour_in_a_map_without_landmarks() -> None:
+    bare = replace(textured_map(), landmarks=None)
+    off = torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64)
+    frames = [(t, without_depth(frame), T) for t, frame, T in flight()[:1]]
+    tracker = Tracker(Localizer(bare, config=AutoConfig(landmarks=False)), start=flight_pose(0).retract(off))
+    answers = tracked(frames, tracker)
+    assert_right(answers, frames)
+    assert float(pose_error(answers[0].T_world_camera, flight_pose(0)).translation) < 0.01
+
+
+def test_a_wrong_start_is_replaced_by_a_search() -> None:
+    frames = flight()[:3]
+    answers = tracked(frames, Tracker(localizer(), start=flight_pose(60)))
+    assert_right(answers, frames)
+
+
+def test_frames_without_colours_are_tracked_between_photos() -> None:
+    """The ground determines the height and the tilts; where the rest is known well enough, a pose is accepted."""
+    frames = [(t, depth_only(f) if n % 3 else f, T) for n, (t, f, T) in enumerate(flight()[:10])]
+    answers = tracked(frames, Tracker(localizer()))
+    assert_right(answers[slice(0, None, 3)], frames[slice(0, None, 3)])
+    assert_honest(answers, frames)
+    between = [(answers[n], frames[n][2]) for n in range(10) if n % 3]
+    assert sum(answer.converged for answer, _ in between) >= 2
+    for answer, truth in between:
+        assert "measured points lie on the surface" in answer.reason
+        assert answer.outcome in (Outcome.CONVERGED, Outcome.IMPRECISE)
+        assert_covered(answer.T_world_camera, truth, answer.covariance)
+
+
+def test_a_shape_without_a_time_is_not_accepted() -> None:
+    tracker = Tracker(localizer())
+    tracked(flight()[:4], tracker)
+    answer = tracker(depth_only(flight()[4][1]))
+    assert answer.outcome is Outcome.IMPRECISE
+    assert "without a time stamp" in answer.reason
+
+
+def test_shape_alone_neither_begins_a_sequence_nor_corrects_a_vague_prediction() -> None:
+    """A wall would fit any other wall."""
+    tracker = Tracker(localizer())
+    answers = tracked([(t, depth_only(f), T) for t, f, T in flight()[:2]], tracker)
+    assert [answer.outcome for answer in answers] == [Outcome.TOO_FEW_MATCHES] * 2
+    assert_right(tracked(flight()[2:3], tracker), flight()[2:3])
+    late = tracker(depth_only(flight()[3][1]), flight()[3][0] + 5.0)
+    assert late.outcome is Outcome.UNDETERMINED
+    assert "too uncertain" in late.reason
+    assert torch.equal(late.poses.translation[0], late.poses.translation[1])
+
+
+def test_a_frame_without_colours_and_depth_is_reported() -> None:
+    tracker = Tracker(localizer())
+    tracked(flight()[:2], tracker)
+    answer = tracker(without_depth(depth_only(flight()[2][1])), flight()[2][0])
+    assert answer.outcome is Outcome.TOO_FEW_MATCHES
+    assert_right(tracked(flight()[3:5], tracker), flight()[3:5])
+
+
+def test_a_lost_tracker_continues_by_odometry() -> None:
+    """Over ground that the map does not show, the motion between frames is still measured."""
+    tracker = Tracker(localizer())
+    tracked(flight()[:3], tracker)
+    foreign = [tracker(view(flight_pose(n), f"{n}", seed=9).frame, INTERVAL * n) for n in range(3, 9)]
+    for n in range(1, 6):
+        moved = foreign[n - 1].T_world_camera.inverse() @ foreign[n].T_world_camera
+        error = pose_error(moved, flight_pose(n + 2).inverse() @ flight_pose(n + 3))
+        assert "bridged by odometry" in foreign[n].reason
+        assert float(error.translation) < 0.02
+        assert float(error.rotation_deg) < 0.8
+    sizes = [float(a.covariance.diagonal().sum()) for a in foreign if a.covariance is not None]
+    assert sizes == sorted(sizes)
+
+
+def test_flow_of_mere_noise_is_recognised() -> None:
+    generator = np.random.default_rng(0)
+    noise = [(150 + 5 * generator.standard_normal((96, 128))).astype(np.uint8) for _ in range(2)]
+    place = torch.tensor([[30.5, 40.5], [60.5, 20.5], [3.5, 2.5]])
+    assert not bool(alike(noise[0], noise[1], place, place).any())
+    moved = np.roll(noise[0], (2, 3), (0, 1))
+    assert alike(noise[0], moved, place, place + torch.tensor([3.0, 2.0])).tolist()[:2] == [True, True]
+
+
+def test_corrections_of_intrinsics_follow_one_another(tmp_path: Path) -> None:
+    first = CorrectedCamera(replace(CAMERA, fx=140.0, cx=60.0), CAMERA, False)
+    second = CorrectedCamera(CAMERA, replace(CAMERA, fx=133.0, cy=50.0), False)
+    both = first.then(second)
+    frame = replace(flight()[0][1], intrinsics=first.given)
+    assert both.corrected(frame).intrinsics == second.corrected(first.corrected(frame)).intrinsics
+    assert both.focal_factor(frame) == pytest.approx((133 / 140) ** 0.5)  # those down did not change
+    other = replace(frame, intrinsics=replace(first.given, fx=154.0))  # it has focused nearer
+    refocused = first.corrected(other).intrinsics
+    assert refocused.fx == pytest.approx(154 * 130 / 140)
+    assert replace(refocused, fx=CAMERA.fx) == CAMERA
+    path = tmp_path / "state.safetensors"
+    save_state(path, TrackerState(Clock(None, 0.1), camera=both), "map")
+    assert load_tracker_state(path, "map").camera == both
 
 
 def test_a_beginning_that_nobody_recognises_is_reported() -> None:

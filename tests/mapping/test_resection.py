@@ -23,22 +23,18 @@ from bidnerf_core.localization.landmarks.hypotheses import (
     camera_hypotheses,
     posterior,
 )
-from bidnerf_core.localization.tracking.points import PointFit, with_motion
 from bidnerf_core.mapping import (
     FIXED,
     GIVEN,
     NOMINAL,
     STRETCHED,
     Calibration,
-    LandmarkMap,
     ObservedPoints,
     ReprojectionErrors,
     State,
-    build_landmarks,
     log_likelihood_ratio,
     resect,
 )
-from landmark_scene import Points, ring
 from observed_points import FOCAL, HEIGHT, TRUE, observed
 
 
@@ -274,26 +270,3 @@ def test_the_part_of_the_covariance_by_the_motion_is_what_a_known_motion_lacks()
     rest = unknown.covariance - unknown.covariance_by_motion
     torch.testing.assert_close(rest.diagonal(), known.covariance.diagonal(), rtol=0.3, atol=0)
     assert not resect(data, TRUE, 0.5).covariance_by_motion.any()
-
-
-def landmarks_without_scatter() -> LandmarkMap:
-    points = Points()
-    sure = torch.full((4,), 1e-4, dtype=torch.float64)
-    return replace(build_landmarks(ring(points), points), correlation=1.0, calibration_scatter=sure)
-
-
-def test_followed_points_get_the_motion_that_they_show() -> None:
-    data = observed_while_moving(MOTION, noise=0.3)
-    still = resect(data, TRUE, 0.5)
-    every = torch.ones(len(data), dtype=torch.bool)
-    found = with_motion(PointFit(still, data, every), landmarks_without_scatter())
-    assert found.fit.motion.any()
-    assert error(found.T_world_camera) < 0.5 * error(still.T_world_rig)
-    residuals = found.still_data.residuals(found.T_world_camera).norm(dim=-1)
-    assert float(residuals.median()) < 0.7 * float(data.residuals(still.T_world_rig).norm(dim=-1).median())
-
-
-def test_followed_points_of_which_none_agrees_show_no_motion() -> None:
-    data = observed_while_moving(MOTION)
-    found = PointFit(resect(data, TRUE, 0.5), data, torch.zeros(len(data), dtype=torch.bool))
-    assert not with_motion(found, landmarks_without_scatter()).fit.motion.any()

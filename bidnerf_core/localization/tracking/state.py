@@ -149,7 +149,7 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
     if motion is None:
         return state
     T = motion.T_world_camera
-    if T.translation.shape != (3,) or not bool(T.is_rigid().all()):
+    if T.rotation.dim() + T.translation.dim() != 3 or not bool(T.is_rigid().all()):
         raise InputError("the pose of the motion is not rigid", where=path)
     if any(bool((part.diagonal() < 0).any()) for part in (motion.noise, motion.bias)):
         raise InputError("a variance of the motion is negative", where=path)

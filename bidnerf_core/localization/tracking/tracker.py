@@ -16,18 +16,18 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, USUAL, skew, update_between
+from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
 from bidnerf_core.localization.accept import Evidence, accept
-from bidnerf_core.localization.auto import auto, within_risk
+from bidnerf_core.localization.auto import localization_of, unrecognized, within_risk
 from bidnerf_core.localization.by_surface import is_blank
-from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, TURN
+from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, STATED, TURN
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
-from bidnerf_core.localization.loop import ANGLE, TOLERANCE
+from bidnerf_core.localization.loop import ANGLE, TOLERANCE, Loop
 from bidnerf_core.localization.matching import log10_nfa
-from bidnerf_core.localization.posterior import LEAST_DOUBT, Posterior
+from bidnerf_core.localization.posterior import Posterior
 from bidnerf_core.localization.problem import SceneMap, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig, TrackerConfig
+from bidnerf_core.localization.settings import LEAST_POINTS, TrackerConfig
 from bidnerf_core.localization.terms.rays import ALONE, Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.localization.tracking.flow import Grey
@@ -53,6 +53,7 @@ from bidnerf_core.mapping import (
     grey_image,
     log_evidence,
     measured_depth,
+    prior,
     strongest,
     total,
 )
@@ -244,7 +245,6 @@ class Tracker:
         """The number of frames since the last accepted pose."""
         return self._state.lost
 
-    @torch.no_grad()
     def __call__(self, frame: Frame, time: float | None = None) -> Localization:
         """Estimate T_world_camera of the next frame.
 
@@ -385,13 +385,16 @@ class Tracker:
             frame = later.corrected(frame)
         state = replace(state, points=Points.none(), camera=camera)
         measured = self.measure(frame, image, state, motion)
-        if measured is None or not measured.verdict.accepted:
+        if measured is not None and measured.verdict.accepted:
+            reason = f"{reason}; {measured.verdict.reason}"
+        else:
             measured = Measurement(motion, Verdict(found.outcome, found.reason), found.loss, state)
         state = self._after(frame, image, replace(measured, motion=motion))
         return replace(found, reason=reason, covariance=motion.covariance), state
 
     # Measuring.
 
+    @torch.no_grad()
     def measure(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion
     ) -> Measurement | None:
@@ -469,8 +472,8 @@ class Tracker:
     def _fused(self, frame: Frame, state: TrackerState, fit: Fit, predicted: Motion) -> Measurement:
         """Fuse landmarks with measured depth, and both with the prediction; then judge the pose.
 
-        Whether the camera moved during the readout, and the effect of errors of its intrinsics, are determined in frames in which
-        landmarks are recognised, and change little until the next one.
+        Whether the camera moved during the readout, and the effect of its intrinsics and of correlated errors, are determined in
+        frames in which landmarks are recognised, and change little until the next one.
         """
         landmarks, points = self._landmarks, fit.points
         assert landmarks is not None
@@ -479,34 +482,45 @@ class Tracker:
         deviation[1, MOTION] = torch.tensor([MOVE * fit.distance] * 3 + [TURN] * 3, dtype=torch.float64)
         deviation[:, DEPTH] = 2 * self.localizer.depth_sensor.scale
         rows = torch.tensor([0, 1] if fit.is_recognised else [int(state.moves)])
+        log_prior = torch.tensor([1 - moving, moving], dtype=torch.float64).log()
         states = replace(
-            fit.states[torch.zeros_like(rows)], deviation=deviation[rows], row=rows,
-            log_prior=torch.tensor([1 - moving, moving], dtype=torch.float64).log()[rows],
-        )  # fmt: skip
-        term, words = fit.term.weighted_for(fit.states), ""
-        terms: list[Term] = [term]
+            fit.states[torch.zeros_like(rows)], deviation=deviation[rows], row=rows, log_prior=log_prior[rows]
+        )
+        term = fit.term.weighted_for(fit.states)
         depth, objection = self._depth(frame, state, points, fit.states)
-        if depth is not None:
-            free = replace(fit.states, deviation=deviation[1:])
-            terms.append(Quadratic.of(depth(free), free))  # which hardly changes in these steps
-            words = ", fused with depth"
-        elif objection:
-            words = f", without depth: {objection}"
-        states, normal = descend(states, terms, 2 if int(rows.sum()) else self.config.depth_steps)
-        best = int(log_evidence(states, normal).argmax())
-        hessian, states, doubt = normal.hessian[best], states[best : best + 1], state.doubt
-        covariance = torch.linalg.inv_ex(hessian)[0][:6, :6]
+        words = "" if depth is None else ", fused with depth"
+        words = f", without depth: {objection}" if objection else words
+        steps, here = 2 if int(rows.sum()) else self.config.depth_steps, fit.states
+        # Depth is linearized, as it hardly changes in these steps; few landmarks may be far off without it.
+        for _ in range(2 if fit.is_recognised and depth is not None else 1):
+            terms: list[Term] = [term]
+            if depth is not None:
+                free = replace(here, deviation=deviation[1:])
+                terms.append(Quadratic.of(depth.fitted_noise(here)(free), free))
+            states, normal = descend(states, terms, steps)
+            best = int(log_evidence(states, normal).argmax())
+            here = states[best : best + 1]
+        states, doubt = here, state.doubt
+        covariance = torch.linalg.inv_ex(normal.hessian[best])[0][:6, :6]
         if fit.is_recognised:
-            # The true camera differs from the stated one, but landmarks show that no better than their scatter allows.
             scatter = landmarks.calibration_scatter.double()
-            unknown = states.deviation.clone()
-            unknown[:, :4] = (scatter.square() * LEAST_DOUBT**2 / (scatter.square() + LEAST_DOUBT**2)).sqrt()
-            whole = total(replace(states, deviation=unknown), terms).hessian[0]
-            by_camera = torch.linalg.solve_ex(whole[:6, :6], whole[:6, 6:10])[0]
-            doubt = by_camera @ by_camera.T
+            focal, centre, k1 = (STATED[0][n] for n in (1, 2, 3))
+            exact = torch.tensor([focal, centre, centre, k1], dtype=torch.float64)
+            deviation[:, :4] = torch.hypot(exact, scatter)
+            free = replace(states, deviation=deviation[1:])
+            whole = Quadratic.of(total(free, terms) - prior(free), free)
+            both = torch.zeros(2, dtype=torch.long)
+            rivals = replace(
+                free[both], z=torch.where(deviation > 0, free.z, 0), deviation=deviation, log_prior=log_prior
+            )
+            found = Posterior.of(rivals, whole, term, scatter)
+            excess, axes = torch.linalg.eigh(found.mixture() - covariance)
+            doubt, covariance = (axes * excess.clamp(min=0)) @ axes.T, found.mixture()
+        else:
+            covariance = covariance + doubt
         # Errors that an image's landmarks share recur in the next image.
         share = 1 / float(term.correlation)
-        shared = (1 - share) * covariance + landmarks.pose_covariance + doubt
+        shared = (1 - share) * covariance + landmarks.pose_covariance
         motion = predicted.updated(PoseEstimate(states.T[0], share * covariance, shared))
         state = replace(state, noise=float(states.noise), moves=bool(states.row), doubt=doubt)
         return self._judged(state, replace(fit, states=states), motion, words)
@@ -525,12 +539,8 @@ class Tracker:
             scale = float(ratio.median())
             if abs(scale - 1) > PLAUSIBLE * math.hypot(2 * sensor.scale, SCALE_NOISE):
                 return None, f"it is {1 / scale:.3g} times that of the landmarks"
-        drawn = Surface.of(
-            [View(frame, SE3.identity())], None, surface, state.frames, self.config.depth_points
-        )
-        if drawn is None:
-            return None, ""
-        return replace(drawn, independent=USUAL.tracked_points).fitted_noise(states), ""
+        view = View(frame, SE3.identity())
+        return Surface.of([view], None, surface, state.frames, self.config.depth_points), ""
 
     def _judged(self, state: TrackerState, fit: Fit, motion: Motion, words: str) -> Measurement:
         """Judge a pose by landmarks, after its fusion with the prediction."""
@@ -590,17 +600,17 @@ class Tracker:
             return Measurement(predicted, Verdict(Outcome.UNDETERMINED, why), 1.0, state)
         zero, hessian = torch.zeros((1, P), dtype=torch.float64), torch.zeros((1, P, P), dtype=torch.float64)
         hessian[0, :6, :6] = torch.linalg.inv(covariance)
-        prior = Quadratic(states, zero[:, 0], zero, hessian)
+        prediction = Quadratic(states, zero[:, 0], zero, hessian)
         for wider in WIDER:
             here: Term
             if isinstance(term, Surface):
                 fitted = replace(term, noise=max(term.noise, off)).fitted_noise(states)
-                independent = USUAL.tracked_points * wider**2  # the same information from a wider basin
+                independent = term.independent * wider**2  # the same information from a wider basin
                 fitted = replace(fitted, noise=wider * fitted.noise, independent=independent)
                 here = Determined(fitted) if image is None else fitted
             else:
                 here = term.fitted(states)
-            states, normal = descend(states, [prior, here], STEPS)
+            states, normal = descend(states, [prediction, here], STEPS)
         information = normal.hessian[0, :6, :6] - hessian[0, :6, :6]
         fused = torch.linalg.inv(normal.hessian[0, :6, :6])
         kept, measured = torch.eye(6).double() - fused @ information, fused @ information @ fused
@@ -684,8 +694,11 @@ class Tracker:
         frames since the last accepted pose, 0 at the beginning of a sequence.
         """
         if self._landmarks is not None:
-            problem = self.localizer.problem(frame)
-            found = auto(replace(problem, surface=None), AutoConfig(fused_rays=0), seed)
+            assert self.localizer.matcher is not None
+            began = clocks.perf_counter()
+            problem = replace(self.localizer.problem(frame), sensor=self.localizer.depth_sensor)
+            answer = Loop(problem.views, self.localizer.matcher, problem, seed=seed)()
+            found = unrecognized(problem) if answer is None else localization_of(problem, answer, began)
             if self.localizer.shared.risk is not None:
                 found = within_risk(found, self.localizer.shared.risk)
             due = lost == 0 or (lost % FIRST_FULL_SEARCH == 0 and _is_power_of_two(lost // FIRST_FULL_SEARCH))
