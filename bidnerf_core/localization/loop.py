@@ -72,6 +72,8 @@ FROM_START = 6.0
 """Log odds of a place per factor e of its distance from the start: in six dimensions, the density of a normal distribution of unknown
 width falls with the sixth power of the distance.
 """
+MANY_VISIBLE, CONTRADICTED = 200, 1.5
+"""Number of visible landmarks from which a pose can be contradicted, and multiple of the chance matches below which it is."""
 CELLS = 10
 """Number of rows and columns of the grid whose occupied cells measure how far matches spread over an image."""
 
@@ -100,8 +102,8 @@ class Answer:
     distance: float  # median distance of the matched landmarks
     evidence: Evidence
     verdict: Verdict
-    fused: tuple[str, ...]  # the measurements other than landmarks
     contradicted: bool  # whether hardly more landmarks match than by chance, although many should
+    fused: tuple[str, ...] = ()  # the measurements other than landmarks
 
     @property
     def T_world_rig(self) -> SE3:
@@ -322,11 +324,12 @@ class Loop:
         problem, terms = self.problem, list[Term]([landmarks])
         best, quadratic = self._settled(best, landmarks, given)
         found = self._posterior(quadratic, landmarks, given)
-        points, fused, rendered = None, list[str](), None
+        points, fused = None, list[str]()
+        others: dict[str, float | None] = {}
         if problem is not None and problem.surface is not None and problem.has_depth:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
         if points is not None and found.mode == 0:
-            points = points.fitted_noise(found.states[found.best : found.best + 1])
+            points = points.fitted_noise(found.chosen)
             terms.append(points)
             fused.append("depth")
             best, _ = descend(best, terms, 5)
@@ -339,7 +342,7 @@ class Loop:
             and found.mode == 0
             and self._blur(found, landmarks) > RAYS_BEYOND
         ):
-            here = found.states[found.best : found.best + 1]
+            here = found.chosen
             rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed).fitted(here)
             fused.append("rendering")
             here, _ = descend(here, [*terms, rays], 4)
@@ -351,9 +354,18 @@ class Loop:
             systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
             found = self._posterior(quadratic, landmarks, given, systematic)
             if problem.colour_noise:
-                here = found.states[found.best : found.best + 1]
-                rendered = float(rays.colour_error(here)[0]) / problem.colour_noise
-        return self._judged(found, before, modes, landmarks, points, given, searched, tuple(fused), rendered)
+                others["rendered_noise"] = float(rays.colour_error(found.chosen)[0]) / problem.colour_noise
+        if points is not None:
+            near, alike = points.inliers(found.chosen)
+            others |= {"on_surface": float(near.mean()), "colour_inliers": float((near * alike).mean())}
+        mass = min(self._mass(each, landmarks, given) for each in (found, before))
+        answer = self._judged(found, mass, modes, landmarks, given, searched, others)
+        return replace(answer, fused=tuple(fused))
+
+    def _mass(self, found: Posterior, term: Landmarks, given: Explanations) -> float:
+        """Return the probability that the pose is within the tolerance, and its camera credible."""
+        credible, shared = given.credible[found.states.row], self.landmarks.pose_covariance
+        return found.mass(term.distance(found.chosen), shared, TOLERANCE, ANGLE, credible)
 
     def _settled(self, best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic]:
         """Return the most probable state of each mode (g), and the model about it by which it is the most probable."""
@@ -393,15 +405,14 @@ class Loop:
     def _blur(self, found: Posterior, term: Landmarks) -> float:
         """Return the standard deviation of the scene's projection at the best pose, pixels."""
         position = found.mixture()[:3, :3].trace().sqrt()
-        return float(term.focal.max() * position.nan_to_num(math.inf)) / term.distance(
-            found.states[found.best]
-        )
+        return float(term.focal.max() * position.nan_to_num(math.inf)) / term.distance(found.chosen)
 
     def _judged(
-        self, found: Posterior, before: Posterior, modes: list[Mode], term: Landmarks, points: Surface | None,
-        given: Explanations, searched: bool, fused: tuple[str, ...], rendered: float | None,
+        self, found: Posterior, mass: float, modes: list[Mode], term: Landmarks, given: Explanations, searched: bool,
+        others: dict[str, float | None],
     ) -> Answer:  # fmt: skip
-        mode, state = modes[found.mode], found.states[found.best : found.best + 1]
+        """Collect the evidence for the most probable pose; ``others`` is that of measurements other than landmarks."""
+        mode, state = modes[found.mode], found.chosen
         query = mode.query
         inlier = (term.residuals(state)[0][0] <= 9) & (term.valid[found.mode] > 0)
         count, distance = int(inlier.sum()), term.distance(state)
@@ -412,25 +423,19 @@ class Loop:
         size = torch.tensor([query.camera.width, query.camera.height])
         cells = ((pixels / size * CELLS).long().clamp(0, CELLS - 1) * torch.tensor([1, CELLS])).sum(-1)
         cells = cells + CELLS**2 * query.view[mode.matches.keypoint]
-        shared = self.landmarks.pose_covariance
-        covariance = HEAVY_TAILS * (found.mixture() + shared)
+        covariance = HEAVY_TAILS * (found.mixture() + self.landmarks.pose_covariance)
         position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf))
-        credible = given.credible[found.states.row]
+        row = found.states.row
         agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
-        near = alike = None
-        if points is not None:
-            near, alike = points.inliers(state)
         evidence = Evidence(
             log10_nfa=log10_nfa(len(mode.by_descriptors), agreeing, query.by_chance) if searched else 0.0,
             inliers=count, by_chance=chance, recall=count / max(1, min(seen.visible, len(query.view))),
             spread=len(cells.unique()) / CELLS**2 / len(query.images),
             noise_ratio=float(state.noise) / self.landmarks.noise,
             other_place=float(found.probability[found.states.mode != found.mode].sum()),
-            credible=float(found.probability[credible].sum()), replaced=float(found.probability[~given.usual[found.states.row]].sum()), precision=position / distance,
-            mass=min(x.mass(distance, shared, TOLERANCE, ANGLE, credible) for x in (found, before)), searched=searched,
-            on_surface=None if near is None else float(near.mean()),
-            colour_inliers=None if near is None or alike is None else float((near * alike).mean()),
-            rendered_noise=rendered,
+            credible=float(found.probability[given.credible[row]].sum()),
+            replaced=float(found.probability[~given.usual[row]].sum()),
+            precision=position / distance, mass=mass, searched=searched, **others,
         )  # fmt: skip
         verdict = accept(evidence)
         if mode.name == MIRROR:
@@ -440,11 +445,7 @@ class Loop:
         contradicted = seen.visible >= MANY_VISIBLE and count < CONTRADICTED * chance + LEAST_AGREEING
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
-        return Answer(modes, found, given, term, covariance, distance, evidence, verdict, fused, contradicted)
-
-
-MANY_VISIBLE, CONTRADICTED = 200, 1.5
-"""Number of visible landmarks from which a pose can be contradicted, and multiple of the chance matches below which it is."""
+        return Answer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)
 
 
 def _is_better(one: Answer, other: Answer) -> bool:

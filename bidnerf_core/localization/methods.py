@@ -360,9 +360,7 @@ def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization
         poses = SE3.cat([poses, centred(problem, poses, middle)])
     else:
         first, stages = _small_images(problem, ImageSearchSettings()), stages[2:]
-    found = halve(
-        states_at(poses), chain(first, terms.stages(problem, stages, seed)), middle, problem.device
-    )
+    found = halve(states_at(poses), chain(first, terms.stages(problem, stages, seed)), middle, problem.device)
     fresh = terms.term(problem, stages[-1], seed + len(stages))
     return localization_by_rays(problem, found, fresh, middle, config.thresholds, "bid-lm", began)
 

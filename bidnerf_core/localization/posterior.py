@@ -68,6 +68,11 @@ class Posterior:
         return int(self.states.mode[self.best])
 
     @property
+    def chosen(self) -> States:
+        """The most probable state (1)."""
+        return self.states[self.best : self.best + 1]
+
+    @property
     def _own(self) -> Float[Tensor, "h"]:
         """Probabilities given the most probable mode."""
         own = self.probability * (self.states.mode == self.mode)

@@ -114,7 +114,9 @@ class Surface:
         if total < LEAST:
             return None
         order = torch.randperm(total, generator=generator)
-        image, times, R, t, z, fixed, rgb, coloured = (torch.cat(part)[order] for part in zip(*parts, strict=True))
+        image, times, R, t, z, fixed, rgb, coloured = (
+            torch.cat(part)[order] for part in zip(*parts, strict=True)
+        )
         term = Surface(surface, Sights(image, times, R, t), z, fixed, rgb, coloured, 2 * surface.cell)
         return moved(term, surface.device)
 

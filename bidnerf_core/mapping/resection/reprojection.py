@@ -123,8 +123,8 @@ class Landmarks:
 
     def distance(self, states: States) -> float:
         """Return the median distance of the matched points from the first state's pose, metres."""
-        g = int(states.mode.flatten()[0])
-        away = (self.points[g] - states.T.translation.reshape(-1, 3)[0]).norm(dim=-1)
+        g = int(states.mode[0])
+        away = (self.points[g] - states.T.translation[0]).norm(dim=-1)
         return float(away[self.valid[g] > 0].median())
 
     def _odds(self, states: States) -> Float[Tensor, "h m"]:
