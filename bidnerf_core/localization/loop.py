@@ -68,6 +68,10 @@ RAYS_BEYOND = 0.6
 """Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them."""
 HEAVY_TAILS = 1.7
 """Factor of the covariance by which the ellipsoid of a Gaussian's 95 % holds 95 % of the poses: errors have heavier tails."""
+AGREEING, MANY_MORE, GRADUATED = 0.7, 1.3, (16.0, 8.0, 4.0, 2.0, 1.0)
+"""Fraction of the matches by descriptors that agree with a usual camera, from which no other is tried; how many times more must agree with
+another; and the noise of its fits, relative to that at first.
+"""
 FROM_START = 6.0
 """Log odds of a place per factor e of its distance from the start: in six dimensions, the density of a normal distribution of unknown
 width falls with the sixth power of the distance.
@@ -255,6 +259,8 @@ class Loop:
                 continue
             modes.append(Mode(name, query, near, found))
             best.append(self._compared(modes[-1], start, given, query.threshold / 2))
+            if searched and len(modes) == 1:
+                best[0] = self._warped(modes[0], start, given, best[0])
         seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
             for g, mode in enumerate(modes):
@@ -283,6 +289,25 @@ class Loop:
         states, _ = descend(states, [term], 4)
         states, normal = descend(term.with_noise(states), [term], 3)
         return states[log_evidence(states, normal).argmax()[None]]
+
+    def _warped(self, mode: Mode, seed: Seed, given: Explanations, best: States) -> States:
+        """Return the fit of a camera that explains any warp of the image, if many more matches agree with it, or else ``best``.
+
+        Consensus finds those matches of a sheared image, or of a photo of a picture, that happen to agree with a usual camera. From
+        there, the fit to all matches is graduated: residuals as large as the warp count at first (Blake and Zisserman 1987).
+        """
+        query, found = mode.query, mode.by_descriptors
+        agreeing = int(inliers(query, self.landmarks, found, best).sum())
+        if agreeing >= AGREEING * len(found):
+            return best
+        states = given.first(seed, 0, query.threshold / 2)
+        state = states[(states.row == given.widest).nonzero()[:, 0]]
+        term = self._term([replace(mode, matches=found)], best)
+        for factor in GRADUATED:
+            state = replace(state, noise=torch.full_like(state.noise, factor * query.threshold / 2))
+            state, _ = descend(state, [term], 4)
+        more = int(inliers(query, self.landmarks, found, state).sum())
+        return state if more > MANY_MORE * agreeing else best
 
     def _places(
         self, nearest: Nearest, seed: Seed, nfa: float, best: list[States]
