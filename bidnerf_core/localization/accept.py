@@ -37,7 +37,6 @@ class Evidence:
     searched: bool  # whether landmarks found the pose, or only confirm one found by other means
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
-    rendered_noise: float | None = None  # of rendered colours, relative to those of the map's own images
 
     @property
     def above_chance(self) -> float:
@@ -103,7 +102,6 @@ def features(found: Evidence) -> dict[str, float]:
         # Without measured points, the surface neither supports nor contradicts a pose.
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
         "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
-        "rendered_noise": 0.0
         if found.rendered_noise is None
         else math.log10(max(found.rendered_noise, 0.1)) - 0.25,
     }

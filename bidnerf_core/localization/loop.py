@@ -378,8 +378,6 @@ class Loop:
             systematic = torch.zeros_like(quadratic.hessian)
             systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
             found = self._posterior(quadratic, landmarks, given, systematic)
-            if problem.colour_noise:
-                others["rendered_noise"] = float(rays.colour_error(found.chosen)[0]) / problem.colour_noise
         if points is not None:
             near, alike = points.inliers(found.chosen)
             others |= {"on_surface": float(near.mean()), "colour_inliers": float((near * alike).mean())}

@@ -126,10 +126,6 @@ class Rays:
         """Return the fraction of the rays whose colours and distances agree with the rendering."""
         return self.at(moved(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
 
-    def colour_error(self, states: States) -> Float[Tensor, "h"]:
-        """Return the root mean square difference of a colour, in which outliers count as little as in the loss."""
-        return (2 / 3 * self.costs(states).mean(-1)).sqrt() * self.noise
-
     def plain_costs(self) -> Float[Tensor, "n"] | None:
         """Return each ray's robust loss, in units of the noise, if all had the colour that fits best.
 
