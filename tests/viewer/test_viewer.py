@@ -27,10 +27,10 @@ from bidnerf_core.localization import (
     Evidence,
     Outcome,
     SearchRecord,
-    States,
     Support,
     recorded,
 )
+from bidnerf_core.mapping import States
 from bidnerf_core.progress import stopped_by
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.viewer import ShownAnswer, shown_trajectory
