@@ -19,6 +19,7 @@ from bidnerf_core.io import reduced, resampled
 from bidnerf_core.localization import (
     ADVICE,
     METHODS,
+    MIRROR,
     Answer,
     Localization,
     SceneMap,
@@ -31,7 +32,6 @@ from bidnerf_core.results import pose_error
 from bidnerf_core.viewer.explanations import (
     APART,
     HERE,
-    MIRROR_IMAGE,
     TURNED_DEG,
     Contest,
     contests,
@@ -327,7 +327,7 @@ def _matches(scene: SceneMap, found: Localization, answer: Answer) -> ShownMatch
     there = torch.where(seen.front[0, :, None], there, torch.nan)
     size = torch.tensor([query.camera.width, query.camera.height], dtype=torch.float64)
     shares = [query.keypoints.pixels[keypoint] / size, there / size]
-    if mode.name == MIRROR_IMAGE:  # drawn on the image as it is
+    if mode.name == MIRROR:  # drawn on the image as it is
         shares = [torch.stack([1 - share[:, 0], share[:, 1]], dim=-1) for share in shares]
     every = max(1, math.ceil(len(keypoint) / MOST_MATCHES))
     return ShownMatches(
@@ -350,7 +350,7 @@ def _runner_up(
         if given_up := earlier(found, answer):
             return _rendered(scene, answer.T_world_rig.to("cpu"), given_up, frame, quick)
         for mode, T, probability in probable_poses(answer):
-            if mode != answer.posterior.mode and answer.modes[mode].name != MIRROR_IMAGE:
+            if mode != answer.posterior.mode and answer.modes[mode].name != MIRROR:
                 shown = _rendered(scene, T, "the next most probable pose by landmarks", frame, quick)
                 return replace(shown, probability=probability)
     T = found.T_world_camera.to("cpu", torch.float64)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.localization import (
     DISPLACEMENT,
+    MIRROR,
     MOVING,
     NO_RIVAL,
     Answer,
@@ -36,8 +37,6 @@ CAMERAS = {
     "map, about": "the camera of the map's images (slightly off)",
 }
 """Descriptions of the explanations of the camera."""
-MIRROR_IMAGE = "mirror image"
-"""Name of the mode that explains the mirrored image."""
 HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
 APART, TURNED_DEG = 0.1, 10.0
 """Distance (fraction of that to the scene) and angle beyond which two poses are different answers."""
@@ -98,26 +97,25 @@ def probable_poses(answer: Answer) -> list[tuple[int, SE3, float]]:
     """Return the number, the most probable pose and the probability of each mode, the most probable mode first."""
     posterior, found = answer.posterior, list[tuple[int, SE3, float]]()
     for mode in range(len(answer.modes)):
-        own = posterior.probability * (posterior.states.mode == mode)
-        T = posterior.states.T[int(own.argmax())].to("cpu")
-        found.append((mode, posterior.pose().to("cpu") if mode == posterior.mode else T, float(own.sum())))
+        probability = float(posterior.probability[posterior.states.mode == mode].sum())
+        found.append((mode, posterior.place(mode).to("cpu"), probability))
     return sorted(found, key=lambda each: -each[2])
 
 
 def _of_modes(found: Localization, answer: Answer) -> Contest:
-    shown, here = list[ShownExplanation](), answer.T_world_rig.to("cpu")
+    shown, here, best = list[ShownExplanation](), answer.T_world_rig.to("cpu"), answer.posterior.mode
     for mode, T, probability in probable_poses(answer):
-        name = earlier(found, answer) or HERE
-        if mode != answer.posterior.mode:
-            name = f"a pose {float((T.translation - here.translation).norm()):.3g} {symbol(found.unit)} away"
-        if answer.modes[mode].name == MIRROR_IMAGE:
-            name = "the mirror image"
-        shown.append(
-            ShownExplanation(name, probability, rows_of(T) if mode != answer.posterior.mode else None)
+        apart = float((T.translation - here.translation).norm())
+        name = (
+            f"a pose {apart:.3g} {symbol(found.unit)} away"
+            if mode != best
+            else earlier(found, answer) or HERE
         )
-    mirrored = sum(mode.name == MIRROR_IMAGE for mode in answer.modes)
-    questions = ("This pose or another?", "Pose or mirror image?", "This pose, another, or the mirror image?")
-    return Contest(questions[mirrored + (mirrored and len(answer.modes) > 2)], tuple(shown))
+        name = "the mirror image" if answer.modes[mode].name == MIRROR else name
+        shown.append(ShownExplanation(name, probability, None if mode == best else rows_of(T)))
+    others = {mode.name == MIRROR for mode in answer.modes[1:]}
+    question = "Pose or mirror image?" if others == {True} else "This pose or another?"
+    return Contest("This pose, another, or the mirror image?" if len(others) > 1 else question, tuple(shown))
 
 
 def _of_cameras(found: Localization, answer: Answer) -> Contest:

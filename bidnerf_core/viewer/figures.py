@@ -29,10 +29,12 @@ MEASURES = {
     "credible": ("camera as stated, or nearly", ".0%", "probability of the explanations of the camera that the image may have"),
     "precision": ("uncertainty of the position", ".2%", "standard deviation, as a share of the distance to the scene"),
     "mass": ("pose within the tolerance", ".0%", "probability by all explanations of the image together"),
+    "replaced": ("another camera than stated", ".0%", "probability that it is not even like the map's; not tested by itself"),
     "recall": ("landmarks recognised", ".0%", "share of the landmarks in view, or of the keypoints, that match; not tested by itself"),
     "noise_ratio": ("reprojection errors", ".1f", "relative to those of the map's own images; not tested by itself"),
     "on_surface": ("measured points on the surface", ".0%", "share of the measured depth that lies there; not tested by itself"),
     "colour_inliers": ("points with the surface's colour", ".0%", "share that lies there and has its colour; not tested by itself"),
+    "rendered_noise": ("errors of rendered colours", ".1f", "relative to those of the map's own images; not tested by itself"),
 }  # fmt: skip
 """The name, format and meaning of each measure of a pose by landmarks, those with a bound first."""
 OF_SURFACE = {

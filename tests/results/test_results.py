@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import threading
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Loc
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import Photos, write_transforms
 from bidnerf_core.frames import View
+from bidnerf_core.localization import Evidence
 from bidnerf_core.progress import Progress
 from bidnerf_core.results import Answer, Answers, Failure, TrajectoryErrors, localize_each, within
 from bidnerf_core.testing import textured_map
@@ -222,6 +223,18 @@ def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch
     assert keys[0] == keys[1] == keys[2]
     with refused(where=files[1], found="no such file", expected="an image file"):
         localize_each(Localizer(scene(), warm_up=False), Photos([files[1]], CameraSource(CAMERA)))
+
+
+@pytest.mark.parametrize(("by_chance", "asked"), [(4.0, False), (30.0, True)])
+def test_ambiguous_images_raise_the_question_if_hardly_more_matches_than_by_chance(
+    by_chance: float, asked: bool
+) -> None:
+    measured = {part.name: 0.5 for part in fields(Evidence)}
+    evidence = Evidence(**measured | {"inliers": 30, "by_chance": by_chance})  # type: ignore[arg-type]
+    answers = Answers("hashgrid")
+    for number in range(3):
+        answers.append(Answer(f"{number}", number, CAMERA, replace(FOUND, diagnostics=evidence)))
+    assert bool(answers.question) is asked
 
 
 def test_answers_in_a_format_of_poses_hold_the_accepted_ones(

@@ -6,7 +6,7 @@ import html
 import math
 import re
 from base64 import b64decode
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +27,10 @@ from bidnerf_core.localization import (
     Evidence,
     Outcome,
     SearchRecord,
-    States,
     Support,
     recorded,
 )
+from bidnerf_core.mapping import States
 from bidnerf_core.progress import stopped_by
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.viewer import ShownAnswer, shown_trajectory
@@ -132,6 +132,13 @@ def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: ShownAnswer
     assert any(figure.passed is False for figure in refused.figures)
     assert max(len(step.scores) for step in refused.steps) > 50  # the hypotheses of the search on the surface
     assert refused.runner_up is not None
+
+
+def test_every_part_of_the_evidence_is_a_figure() -> None:
+    """The number of matches by chance and the way in which a pose was found are in others."""
+    parts = {part.name for part in fields(Evidence)} - {"by_chance", "searched"} | {"above_chance"}
+    assert set(MEASURES) == parts
+    assert {bound.measure for bound in BOUNDS} <= parts
 
 
 @pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.measure)
