@@ -27,8 +27,6 @@ from .rolling_shutter import AT_REST as AT_REST
 from .rolling_shutter import STILL as STILL
 from .rolling_shutter import MotionPrior as MotionPrior
 from .rolling_shutter import exposure_times as exposure_times
-from .rolling_shutter import moved_array as moved_array
-from .rolling_shutter import moved_points as moved_points
 from .rolling_shutter import poses_of_rows as poses_of_rows
 from .source import CameraSource as CameraSource
 from .source import FoundCamera as FoundCamera

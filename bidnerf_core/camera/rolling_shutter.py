@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.geometry import SE3, cross_matrix
+from bidnerf_core.geometry import SE3
 
 MOVE, TURN = 0.005, 0.01
 """Typical motion of a hand-held camera during readout (a few hundredths of a second): translation along each
@@ -63,24 +62,3 @@ def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "*m 6"]) -> S
     ``motion`` belongs to a single image, or holds one row per time.
     """
     return SE3.exp(times[:, None] * motion.to(times))
-
-
-def moved_points(
-    points: Float[Tensor, "m 3"], times: Float[Tensor, "m"], motion: Float[Tensor, "6"]
-) -> Float[Tensor, "m 3"]:
-    """Transform points from the camera frame at the middle row to the camera frame at their times of
-    exposure.
-    """
-    found = moved_array(points.double().numpy(), times.numpy(), motion.numpy())
-    return torch.from_numpy(found).to(points.dtype)
-
-
-def moved_array(
-    points: Float[np.ndarray, "m 3"], times: Float[np.ndarray, "m"], motion: Float[np.ndarray, "6"]
-) -> Float[np.ndarray, "m 3"]:
-    """Compute ``moved_points`` for NumPy arrays, with the inverse exponential to second order."""
-    turning = cross_matrix(motion[3:]).T
-    velocity = motion[:3] + points @ turning
-    share = times[:, None]
-    moved: np.ndarray = points - share * velocity + 0.5 * share**2 * (velocity @ turning)
-    return moved

@@ -12,7 +12,6 @@ from .by_rays import RayStage as RayStage
 from .by_rays import RayTerms as RayTerms
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
-from .descend import descend as descend
 from .explanations import MOVING as MOVING
 from .localizer import Localizer as Localizer
 from .localizer import Start as Start

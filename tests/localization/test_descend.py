@@ -10,11 +10,10 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3, skew
-from bidnerf_core.localization import States, descend, states_at
+from bidnerf_core.localization import states_at
 
 # Inside: the model of a term, from which a step follows
-from bidnerf_core.mapping import Normal
-from bidnerf_core.mapping import P
+from bidnerf_core.mapping import Normal, P, States, descend
 
 GENERATOR = torch.Generator().manual_seed(0)
 POINTS = torch.randn((40, 3), generator=GENERATOR, dtype=torch.float64) + torch.tensor([0.0, 0, 4])
@@ -40,13 +39,18 @@ def reprojection(states: States) -> Normal:
     jacobian = (torch.stack(rows, -2) @ T.rotation[:, None] @ local).flatten(1, 2)
     r = residuals(T).flatten(1)
     gradient, hessian = torch.zeros((len(r), P)).double(), torch.zeros((len(r), P, P)).double()
-    gradient[:, :6], hessian[:, :6, :6] = WEIGHT * (r[:, None] @ jacobian)[:, 0], WEIGHT * jacobian.mT @ jacobian
+    gradient[:, :6], hessian[:, :6, :6] = (
+        WEIGHT * (r[:, None] @ jacobian)[:, 0],
+        WEIGHT * jacobian.mT @ jacobian,
+    )
     return Normal(WEIGHT / 2 * r.square().sum(-1), gradient, hessian)
 
 
 def starts(count: int, spread: float = 0.2) -> States:
     generator = torch.Generator().manual_seed(1)
-    return states_at(SE3.exp(XI_TRUE + spread * torch.randn((count, 6), generator=generator, dtype=torch.float64)))
+    return states_at(
+        SE3.exp(XI_TRUE + spread * torch.randn((count, 6), generator=generator, dtype=torch.float64))
+    )
 
 
 @pytest.mark.parametrize("pivot", [None, torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)])

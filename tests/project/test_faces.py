@@ -20,12 +20,10 @@ REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 EXCEPTIONS = {
     "benchmarks/paper_tables.py": "shows the progress of the command line",
     "tests/conftest.py": "does in this process what a process of a comparison does",
-    "tests/captures/test_moving_captures.py": "a capture that moved makes motions likelier in the queries of its map",
     "tests/fields/test_hits.py": "the derivatives of a solver through the layers of a field that only these tests have",
     "tests/frames/test_masks.py": "hides pixels from everything that reads them, in whichever package",
     "tests/frames/test_pixel_store.py": "the memory that reading photos takes, which five packages share",
     "tests/localization/test_call_counts.py": "counts how often keypoints are detected, in captures as in queries",
-    "tests/mapping/test_resection.py": "when the fits that are tested here are evidence of a motion",
     "tests/maps/test_interrupted_saves.py": "interrupts every writer of files, in whichever package",
     "tests/maps/test_map_collections.py": "a worker of the service searches the collection that its maps form",
     "tests/robustness/harness.py": "loads the commands before it forks processes that run them",

@@ -1,1 +1,1 @@
-"""Geometry of points seen in images: reprojection errors and their derivatives, resection, triangulation, bundle adjustment."""
+"""Unknown points that images see: triangulation, and bundle adjustment of the points together with the poses."""

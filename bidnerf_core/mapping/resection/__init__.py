@@ -1,1 +1,1 @@
-"""Poses from points that images see: states of h hypotheses, Levenberg-Marquardt, and robust reprojection errors."""
+"""Poses from known points: the unknowns of many hypotheses, reprojection errors, and their minimization, for maps and queries."""

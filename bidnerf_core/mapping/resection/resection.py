@@ -37,7 +37,7 @@ def resections(
 
     ``correlation`` is the number of sightings that count as one because their errors are correlated. Yields the numbers of b
     images; their states under the first prior, then under the next, whose poses are right updates of the images' given ones; and
-    the normal equations there. The Hessian is the inverse covariance of an estimate. All states of an image share the noise of
+    the normal equations there. The Hessian is the inverse covariance of an estimate from twenty points or more. All states of an image share the noise of
     the best, so that their evidence can be compared; the last prior should be the widest.
     """
     local, order = sightings.in_camera(points), sightings.view.argsort(stable=True)
@@ -45,7 +45,9 @@ def resections(
     first = count.cumsum(0) - count
     deviation = torch.zeros((len(motions), N), dtype=torch.float64)
     deviation[:, MOTION] = torch.stack([motion.deviations for motion in motions])
-    for some in images[count[images].argsort()].split(BATCH):
+    images = images[count[images].argsort()]
+    for start in range(0, len(images), BATCH):
+        some = images[start : start + BATCH]
         b, m = len(some), int(count[some].max())
         number = torch.arange(m)
         own = order[(first[some, None] + number).clamp(max=len(order) - 1)]  # ends with those of other images

@@ -160,7 +160,10 @@ def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor,
 def pinhole(
     local: Float[Tensor, "*m 3"],
 ) -> tuple[Float[Tensor, "*m 2"], Float[Tensor, "*m"], Bool[Tensor, "*m"]]:
-    """Return points in a camera's frame (metres) on the plane z = 1, their depths, which are 1 if not in front of it, and if they are."""
+    """Return the projections on the plane z = 1 of points in a camera's frame (metres), their depths, and whether they are in front.
+
+    The depth of points behind the camera is taken as 1.
+    """
     front = local[..., 2] > 1e-9
     depth = torch.where(front, local[..., 2], 1.0)
     return local[..., :2] / depth[..., None], depth, front
