@@ -31,7 +31,7 @@ WARM_UP = 3
 _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 Loss = Callable[[SE3], Tensor]
-RATE = 0.01
+RATE = 0.0125
 """Usual learning rate: of translations as a fraction of the distance to the pivot, of rotations in radians."""
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 """Decay rates of the moments, and the constant added to the root of the second (Kingma and Ba 2015, Alg. 1)."""

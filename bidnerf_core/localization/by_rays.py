@@ -124,6 +124,8 @@ def localization_by_rays(
     elif not agreement >= thresholds.converged_inliers:
         least = f"expected {thresholds.converged_inliers:.0%}"
         verdict = Verdict(Outcome.RENDERING_MISMATCH, f"{share}, {least}")
+    elif (rejection := compared.rejection()) is not None:
+        verdict = rejection
     elif not length <= thresholds.converged_step:
         most = f"expected {thresholds.converged_step:g} at most"
         verdict = Verdict(
@@ -132,8 +134,6 @@ def localization_by_rays(
     elif fresh.depth_loss is None and problem.colour_noise and not noise <= NOISY * problem.colour_noise:
         known = f"{problem.colour_noise:.2g} in the map's own images"
         verdict = Verdict(Outcome.RENDERING_MISMATCH, f"the colours differ by {noise:.2g}, but by {known}")
-    else:
-        verdict = compared.rejection() or verdict
     path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
     path = SE3.cat([path[:-1], T[None]]) if len(path.translation) > 1 else path
     return Localization(

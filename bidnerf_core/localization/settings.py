@@ -111,7 +111,7 @@ class AdamSettings(Settings):
     """Settings of Adam's steps and of the criteria that end them."""
 
     max_steps: Count = 200  # maximum number of steps
-    # initial length of a step, metres and radians; None: 1 % of the distance to the pivot
+    # initial length of a step, metres and radians; None: 1.25 % of the distance to the pivot
     learning_rate: Annotated[float, Above(0.0, 1e3)] | None = None
     decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor by which the learning rate falls in decay_steps
     decay_steps: Count = 100  # number of steps in which the learning rate falls by decay

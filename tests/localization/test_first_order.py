@@ -1,7 +1,6 @@
 """First-order methods: what updates turn about, when descents stop, where pixels are drawn, and what widens their reach; presets.
 
-``AdamSteps``, ``History`` and ``Blurred`` are needed here for what no answer shows: steps beside torch's Adam, the rule of the best pose,
-and a convolution in closed form.
+``AdamSteps`` and ``History`` are needed here for what no answer shows: steps beside torch's Adam, and the rule of the best pose.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from bidnerf_core.localization import (
     Outcome,
     Pivot,
     Problem,
-    RayCounts,
     ReachSettings,
     SampledLoss,
     objective_of,
@@ -41,10 +39,9 @@ from bidnerf_core.localization import (
     settings_of,
 )
 
-# Inside: torch's Adam as an oracle, the rule of the best pose, and the convolution of the image
-from bidnerf_core.localization.costs.sampled import Blurred
-from bidnerf_core.localization.solvers.history import WINDOW, History
-from bidnerf_core.localization.solvers.pivots import PivotName
+# Inside: the rule of the best pose
+from bidnerf_core.localization.adam import RATE, WINDOW, History
+from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.scenes import GaussianBlobs
 from bidnerf_core.settings import to_flat
 from blob_images import BOUNDS, CAMERA, TRUTH
@@ -97,6 +94,7 @@ def test_the_learning_rate_is_inerfs(problem: Problem) -> None:
     xi = (found.poses[1] @ found.poses[0].inverse()).log()  # a left update
     torch.testing.assert_close(xi.abs(), torch.full((6,), 0.01, dtype=torch.float64), rtol=1e-3, atol=0)
     config = InerfConfig().adam
+    assert config.learning_rate is not None
     assert config.learning_rate * config.decay ** (200 / config.decay_steps) == pytest.approx(0.01 * 0.8**2)
 
 
@@ -127,17 +125,22 @@ def test_a_turn_moves_the_camera_as_far_as_a_shift(problem: Problem) -> None:
     assert pivot("camera", problem).lever_arm == 1
     assert pivot("world", problem).lever_arm == 1
     about = pivot("scene", problem)
+    usual = AdamSettings()
+    assert usual.learning_rate is None
+    first = AdamSteps(lambda T: T.translation.sum(), about, usual, TRUTH)._rate
+    torch.testing.assert_close(first[0], torch.tensor(RATE * about.lever_arm).double())
+    torch.testing.assert_close(first[3], torch.tensor(RATE).double())
     turn = torch.tensor([0, 0, 0, 1e-4, 0, 0], dtype=torch.float64)
     shift = float((about.moved(TRUTH, turn).translation - TRUTH.translation).norm())
     assert shift == pytest.approx(1e-4 * about.lever_arm, rel=0.05)
 
 
 def test_fixed_pixels_are_drawn_once(problem: Problem) -> None:
-    objective = objective_of(BidConfig().colour, BidConfig().depth)
+    objective = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1))
     for renew in (True, False):
         generator = torch.Generator().manual_seed(0)
         loss = SampledLoss(
-            problem, objective, RayCounts(64), DescentSettings(renew=renew), ReachSettings(), generator
+            problem, objective, 0, DescentSettings(rays=64, renew=renew), ReachSettings(), generator
         )
         assert torch.equal(loss(problem.start), loss(problem.start)) is not renew
 
@@ -247,18 +250,6 @@ def test_the_length_of_steps_is_measured() -> None:
     assert history([]).recent_step() == math.inf
 
 
-def test_a_batch_adds_its_best_pose_after_each_step() -> None:
-    """Two poses over two steps; the history gets half of each cost, as the loss that Adam reports."""
-    xi = torch.zeros((3, 2, 6), dtype=torch.float64)
-    xi[..., 0] = torch.tensor([[0.0, 10.0], [1.0, 11.0], [2.0, 12.0]])
-    costs = torch.tensor([[4.0, 6.0], [3.0, 2.0], [1.0, 2.0]], dtype=torch.float64)
-    seen = History([SE3.identity()])
-    assert len(seen.poses) == 1
-    seen.add_batch(SE3.exp(xi), costs)
-    assert [float(T.translation[0]) for T in seen.poses] == pytest.approx([0.0, 11.0, 2.0])
-    assert seen.losses == [2.0, 1.0]
-
-
 BACK = (0.0, 0.0, 0.0)
 BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0, BACK)
 
@@ -292,7 +283,7 @@ def problem_at(frame: Frame, shift: float) -> Problem:
 
 def loss_of(problem: Problem, **reach: float) -> SampledLoss:
     return SampledLoss(
-        problem, objective_of(ColourSettings(), DepthSettings()), RayCounts(64), DescentSettings(),
+        problem, objective_of(ColourSettings(), DepthSettings(depth_scale=0.1)), 0, DescentSettings(rays=64),
         ReachSettings(**reach), torch.Generator().manual_seed(0),
     )  # fmt: skip
 
@@ -321,25 +312,11 @@ def test_points_beyond_the_box_are_right_where_the_scene_goes_on_there(frame: Fr
     assert float(gradient(loss_of(problem, box_weight=1.0), problem).abs().max()) < 1e-9
 
 
-def test_a_blurred_field_is_the_field_convolved_with_a_gaussian() -> None:
-    """The convolution of a plane wave ``cos(k x)`` is ``exp(-k^2 sigma^2 / 2) cos(k x)``."""
-
-    class Wave(Ball):
-        def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
-            return FieldValues(1 + torch.cos(5 * positions[..., 0]), torch.zeros_like(positions))
-
-    blurred = Blurred(Wave(), 0.2, torch.Generator().manual_seed(0))
-    at = torch.tensor([0.1, 0.0, 0.0]).expand(20000, 3)
-    found = float(blurred.query(at, at).density.mean())
-    exact = 1 + float(torch.exp(torch.tensor(-0.5)) * torch.cos(torch.tensor(0.5)))
-    assert found == pytest.approx(exact, abs=0.02)
-    assert blurred.sampler is Wave.sampler
-
-
 def test_the_papers_settings_are_presets() -> None:
     paper, ours = (to_flat(METHODS["bid"].settings(name)) for name in ("paper", "paper-scene"))
     assert (paper["rays"], paper["max_steps"], paper["level"], paper["depth_weight"]) == (2048, 1000, 0, 1.0)
     assert (paper["pivot"], ours["pivot"]) == ("camera", "scene")
+    assert (paper["learning_rate"], paper["depth_scale"]) == (0.02, 0.1)  # metres
     assert {name for name in paper if paper[name] != ours[name]} == {"pivot"}
     assert (paper["candidates"], paper["box_weight"]) == (1, 0.0)  # nothing is added to the paper's objective
     inerf = to_flat(METHODS["inerf"].settings("paper"))
@@ -362,7 +339,7 @@ def test_depth_that_has_no_weight_is_not_used(frame: Frame) -> None:
     problem = problem_at(frame, 3.0)
     loss = replace(
         loss_of(problem, box_weight=1.0),
-        objective=objective_of(ColourSettings(), DepthSettings(depth_weight=0.0)),
+        objective=objective_of(ColourSettings(), DepthSettings(depth_weight=0.0, depth_scale=0.1)),
     )
     assert float(gradient(loss, problem).abs().max()) < 1e-9
 

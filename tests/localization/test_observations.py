@@ -19,7 +19,6 @@ from bidnerf_core.localization import (
     DepthSettings,
     DescentSettings,
     Problem,
-    RayCounts,
     ReachSettings,
     SampledLoss,
     objective_of,
@@ -30,7 +29,7 @@ from problems import localize, single
 from refusals import refused
 from tiny import depth_rays_of
 
-OBJECTIVE = objective_of(ColourSettings(), DepthSettings())
+OBJECTIVE = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1))
 T_CAMERA_LIDAR = SE3.exp(torch.tensor([0.3, -0.4, 0.1, 0.2, 1.5, -0.4], dtype=torch.float64))
 
 

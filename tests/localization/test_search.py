@@ -105,7 +105,7 @@ def test_centring_takes_back_most_of_a_shift_and_leaves_a_view_of_nothing() -> N
     for _ in range(3):
         found = centred(problem, found, middle)
     assert torch.equal(found.rotation[0], start.rotation)
-    assert float((found.translation[0] - TRUTH.translation).norm()) < 0.3 * 0.54
+    assert float((found.translation[0] - TRUTH.translation).norm()) < 0.5 * 0.54  # the median of few pixels
     away = TRUTH.retract(torch.tensor([0, 0, 0, math.pi, 0, 0], dtype=torch.float64))[None]
     assert torch.equal(centred(problem, away, middle).matrix(), away.matrix())
 
