@@ -30,13 +30,23 @@ from bidnerf_core.captures.shutter_evidence import common_motion
 from bidnerf_core.captures.training_poses import training_poses
 from bidnerf_core.fields import render, render_image
 from bidnerf_core.frames import all_pixels, observe
-from bidnerf_core.localization import MOVING, LandmarkMatcher, Loop
+from bidnerf_core.localization import LandmarkMatcher, Motion, propose
+from bidnerf_core.localization.landmarks.hypotheses import (
+    SHARE_AS_MAP,
+    SHARE_MOVING,
+    camera_hypotheses,
+    posterior,
+    share_moving,
+)
 from bidnerf_core.mapping import (
+    GIVEN,
     LandmarkConfig,
     TrackedViews,
     landmark_tensors,
     landmarks_from_tensors,
+    observed_at_rest,
     pose_updates,
+    resect,
     tracked_views,
 )
 from bidnerf_core.testing import BOUNDS, CAMERA, ground, unseen
@@ -196,20 +206,6 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stored_cameras(views) != found.cameras
 
 
-def test_rays_of_a_moving_view_start_where_the_camera_was_at_their_rows() -> None:
-    view = unseen()
-    camera = view.frame.intrinsics
-    motion = torch.tensor([0.02, -0.01, 0.03, 0.01, 0.03, -0.02], dtype=torch.float64)
-    pixels = torch.tensor([[10, 0], [10, camera.height // 2], [30, camera.height - 1]])
-    found = observe(replace(view, motion=motion), pixels, torch.float64)
-    for number, (_, row) in enumerate(pixels.tolist()):
-        moment = (row + 0.5) / camera.height - 0.5
-        there = replace(view, T_ref_camera=view.T_ref_camera @ SE3.exp(moment * motion))
-        expected = observe(there, pixels[number : number + 1], torch.float64)
-        torch.testing.assert_close(found.origins[number], expected.origins[0])
-        torch.testing.assert_close(found.points[number], expected.points[0])
-
-
 def test_training_draws_the_rays_of_the_rows() -> None:
     view = replace(unseen(), motion=motions(1.0)[2], landmarks=None)
     still = replace(unseen(), landmarks=None)
@@ -274,6 +270,25 @@ def test_landmarks_tell_how_many_of_their_images_moved() -> None:
     tensors = landmark_tensors(landmarks)
     with pytest.raises(ValueError, match=r"moving is 1\.5, expected a fraction"):
         landmarks_from_tensors(tensors | {"moving": torch.tensor(1.5, dtype=torch.float64)})
+    assert share_moving(landmarks) == 0.75 * SHARE_AS_MAP
+    assert share_moving(replace(landmarks, moving=0.0)) == SHARE_MOVING
+
+
+def test_weaker_motions_are_believed_where_the_map_moved() -> None:
+    """Images whose motion is about as probable as none are judged by either prior probability."""
+    tracked, _, true = tracks(0.35)
+    seen, positions = tracked.at(true).triangulated(LandmarkConfig())
+    taken, sure = {SHARE_MOVING: 0, 0.8: 0}, torch.full((4,), 1e-4, dtype=torch.float64)
+    for number in range(VIEWS):
+        own = (seen.image == number).nonzero()[:, 0]
+        data = observed_at_rest(seen.sightings[own], positions, true[number])
+        fit = resect(data, true[number], NOISE)
+        for share in taken:
+            judged = posterior(
+                data, fit.T_world_rig, NOISE, camera_hypotheses([]), 1.0, GIVEN, sure, share
+            ).with_stated
+            taken[share] += judged.best.motion is Motion.MOVING
+    assert taken[SHARE_MOVING] < taken[0.8]
 
 
 def test_slow_motions_are_taken_from_queries_of_a_moving_map() -> None:
@@ -284,7 +299,7 @@ def test_slow_motions_are_taken_from_queries_of_a_moving_map() -> None:
     seen = {}
     for share in (0.0, 1.0):
         matcher = LandmarkMatcher(replace(landmarks, moving=share))
-        found = [Loop([View(v.frame, SE3.identity())], matcher, features=points)() for v in views]
-        assert all(answer is not None for answer in found)
-        seen[share] = sum(answer is not None and answer.explanation.endswith(MOVING) for answer in found)
+        found = [propose(matcher, [View(v.frame, SE3.identity())], points) for v in views]
+        assert all(pose is not None for pose in found)
+        seen[share] = sum(pose is not None and pose.has_motion for pose in found)
     assert seen[1.0] > seen[0.0] > 0

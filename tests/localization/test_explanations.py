@@ -100,8 +100,8 @@ def test_a_corrected_camera_projects_as_the_true_one_or_there_is_no_correction(
     rays = true.unproject(true.pixel_centres(torch.float64)[::16, ::16]).reshape(-1, 3)
     flat = States.known(SE3.identity().to("cpu", torch.float64), found)
     there = rays_through(flat, stated.unproject(true.project(rays))[:, :2])[0]
-    off = (true.project(there) - true.project(rays)).norm(dim=-1)
-    assert float(off.median()) < 1.0
+    error = (true.project(there) - true.project(rays)).norm(dim=-1)
+    assert float(error.median()) < 1.0
 
 
 def test_lenses_that_no_correction_describes_are_not_compared() -> None:

@@ -89,10 +89,10 @@ def near(T: SE3) -> SE3:
 def assert_as_expected(found: Localization, truth: SE3, expected: Expected, true: Intrinsics) -> None:
     """Compare an answer with the true pose and the ``true`` camera."""
     error = pose_error(found.T_world_camera, truth)
-    off, turned = float(error.translation), float(error.rotation_deg)
+    away, turned = float(error.translation), float(error.rotation_deg)
     largest = (expected.metres, expected.degrees) if isinstance(expected, Right) else LARGEST
-    is_near = off <= largest[0] and turned <= largest[1]
-    assert is_near or not found.converged, f"accepted, and off by {off} m and {turned} degrees"
+    is_near = away <= largest[0] and turned <= largest[1]
+    assert is_near or not found.converged, f"accepted, and off by {away} m and {turned} degrees"
     if isinstance(expected, Right):
         camera = "map" if "(map" in found.reason else "estimated"
         camera = "given" if found.intrinsics is None else camera
@@ -289,8 +289,8 @@ GROUND: dict[str, tuple[Any, Expected]] = {
 
 @pytest.mark.parametrize("name", GROUND)
 def test_ground(name: str) -> None:
-    asked, expected = GROUND[name]
-    query = asked()
+    make, expected = GROUND[name]
+    query = make()
     scene = with_landmarks(query.get("landmarks") or ground_landmarks())
     found = Localizer(scene, config=query.get("config", QUICK), warm_up=False)(query["views"])
     truth, camera = query["views"][-1].T_ref_camera, GROUND_CAMERA
@@ -405,7 +405,7 @@ def test_a_query_detects_its_keypoints_once_and_its_mirror_image_not_at_all(
 
 
 class Unrendered(TexturedGround):
-    """A field that must not be asked for anything."""
+    """A field that must not be rendered."""
 
     def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
         raise AssertionError("rendered")
@@ -469,17 +469,17 @@ def test_images_of_different_cameras_are_localized_with_the_stated_ones() -> Non
 class Degenerate:
     """Landmarks and keypoints that leave a pose undetermined."""
 
-    most: int | None = None  # keypoints
-    kept: int | None = None  # landmarks
+    keypoints: int | None = None
+    landmarks: int | None = None
     squeezed: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors of the landmarks' positions
     far: float = 0.0  # metres: from the landmarks to where they seem to be
 
 
 DEGENERATE = {
-    "no landmarks": Degenerate(kept=0),
-    "5 landmarks": Degenerate(kept=5),
-    "7 keypoints": Degenerate(most=7),
-    "no keypoints": Degenerate(most=0),
+    "no landmarks": Degenerate(landmarks=0),
+    "5 landmarks": Degenerate(landmarks=5),
+    "7 keypoints": Degenerate(keypoints=7),
+    "no keypoints": Degenerate(keypoints=0),
     "coplanar": Degenerate(squeezed=(1.0, 1.0, 0.0)),
     "collinear": Degenerate(squeezed=(1.0, 0.0, 0.0)),
     "one point": Degenerate(squeezed=(0.0, 0.0, 0.0)),
@@ -493,9 +493,9 @@ DEGENERATE = {
 def test_degenerate_input_has_a_finite_answer_that_is_not_accepted_or_none(
     name: str, start: SE3 | None
 ) -> None:
-    given, seen, known = DEGENERATE[name], points(), point_landmarks()[slice(0, DEGENERATE[name].kept)]
+    given, seen, known = DEGENERATE[name], points(), point_landmarks()[slice(0, DEGENERATE[name].landmarks)]
     factors = torch.tensor(given.squeezed)
-    view = point_view(seen, POSES[0], most=given.most)
+    view = point_view(seen, POSES[0], most=given.keypoints)
     matching = LandmarkMatcher(replace(known, positions=known.positions * factors + given.far))
     problem = rig(with_landmarks(known), [view], start, matcher=matching)
     found = Loop(problem.views, matching, problem, features=seen)()

@@ -164,11 +164,11 @@ def test_a_landmark_that_two_keypoints_claim_goes_to_the_more_similar_one() -> N
     view = point_view(seen, TRUE)
     before = projected(query(view, seen=seen), landmarks).matches(5.0)
     own = seen.seen[-1]
-    off = replace(own[slice(0, 20)], pixels=own.pixels[:20] + 1)
-    worse = (off.descriptors.int() + 6 * torch.randint(-1, 2, off.descriptors.shape)).clamp(0, 255).byte()
+    nearby = replace(own[slice(0, 20)], pixels=own.pixels[:20] + 1)
+    worse = (nearby.descriptors.int() + 6 * torch.randint(-1, 2, nearby.descriptors.shape)).clamp(0, 255).byte()
     parts = [
         torch.cat([getattr(own, n), value])
-        for n, value in (("pixels", off.pixels), ("sizes", off.sizes), ("descriptors", worse))
+        for n, value in (("pixels", nearby.pixels), ("sizes", nearby.sizes), ("descriptors", worse))
     ]
     seen.seen[-1] = type(own)(*parts)
     assert pairs(projected(query(view, seen=seen), landmarks).matches(5.0)) <= pairs(before)
@@ -221,16 +221,16 @@ def test_descriptors_of_a_mirrored_image_are_permuted_ones() -> None:
     assert found.camera == expected.camera
     distance = torch.cdist(found.keypoints.pixels, expected.keypoints.pixels)
     sizes = (found.keypoints.sizes[:, None] / expected.keypoints.sizes).log().abs()
-    apart, other = torch.where(sizes < 0.1, distance, torch.inf).min(1)
-    same = apart < 0.7
+    nearest, other = torch.where(sizes < 0.1, distance, torch.inf).min(1)
+    same = nearest < 0.7
     assert float(same.double().mean()) > 0.7
-    off = (
+    difference = (
         found.keypoints.descriptors[same].float() - expected.keypoints.descriptors[other[same]].float()
     ).norm(dim=-1)
     unrelated = (found.keypoints.descriptors.float() - expected.keypoints.descriptors.float().mean(0)).norm(
         dim=-1
     )
-    assert float((off < 0.5 * unrelated.median()).double().mean()) > 0.7
+    assert float((difference < 0.5 * unrelated.median()).double().mean()) > 0.7
     torch.testing.assert_close(
         found.sights.image[same], expected.sights.image[other[same]], rtol=0, atol=0.01
     )

@@ -80,8 +80,8 @@ def squared_errors(posteriors: list[Posterior]) -> Tensor:
     """Return squared errors in units of the covariances."""
     found = []
     for posterior in posteriors:
-        off = (posterior.pose().inverse() @ TRUTH).log()
-        found.append(off @ torch.linalg.solve(posterior.mixture(), off))
+        error = (posterior.pose().inverse() @ TRUTH).log()
+        found.append(error @ torch.linalg.solve(posterior.mixture(), error))
     return torch.stack(found)
 
 
@@ -201,8 +201,8 @@ def test_the_pose_is_that_of_the_true_camera_where_the_apparent_one_is_spurious(
         wide = deviation(torch.cat([apparent, CAMERA[1:]]))
         all_of = torch.cat([torch.tensor([scatter], dtype=torch.float64), NO_SCATTER[1:]])
         found = solved(term, wide, all_of)
-        off = (found.pose().inverse() @ TRUTH).log()
-        depths.append((abs(float(off[2])), float(found.mixture()[2, 2].sqrt())))
+        error = (found.pose().inverse() @ TRUTH).log()
+        depths.append((abs(float(error[2])), float(found.mixture()[2, 2].sqrt())))
         if scatter == 0.2:
             assert abs(float(found.states.nuisances[0, 0])) < 0.002
         if scatter == 0.0:

@@ -220,8 +220,8 @@ def test_the_gradient_of_each_term_is_the_derivative_of_its_cost_by_each_unknown
     with torch.no_grad():
         term, at = make()
         found, expected = term(at), PER_UNIT * derivative(lambda s: term(s).cost, at, step)
-    off = (PER_UNIT * found.gradient - expected).abs() / expected.abs().amax(-1, keepdim=True)
-    assert {u: x for u, x in zip(UNKNOWNS, off.amax(0).tolist(), strict=True) if x > tolerance} == {}
+    error = (PER_UNIT * found.gradient - expected).abs() / expected.abs().amax(-1, keepdim=True)
+    assert {u: x for u, x in zip(UNKNOWNS, error.amax(0).tolist(), strict=True) if x > tolerance} == {}
     assert bool((torch.linalg.eigvalsh(found.hessian) >= -1e-9 * found.hessian.abs().amax()).all())
     torch.testing.assert_close(found.hessian, found.hessian.mT)
 
