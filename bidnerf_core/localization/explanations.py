@@ -114,6 +114,7 @@ class Explanations:
         With another focal length or principal point, the camera is moved along its axis and turned so that it sees about the same.
         """
         kinds = [i for i, name in enumerate(self.names) if name.removesuffix(MOVING) not in SIMILAR_TO_OTHERS]
+        kinds = kinds or list(range(len(self)))
         still = [i for i in kinds if not self.names[i].endswith(MOVING)]
         moving = [i for i in kinds if i not in still]
         row = torch.tensor(still + moving[:1])

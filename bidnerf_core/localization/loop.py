@@ -415,15 +415,14 @@ class Loop:
         given: Explanations,
         systematic: Tensor | float = 0.0,
     ) -> Posterior:
-        states = given.about(quadratic.here)
+        states, log_odds = given.about(quadratic.here), torch.zeros(len(quadratic.here), dtype=torch.float64)
         if self.problem is not None and (start := self.problem.start) is not None:
             # Of two places that look the same, the one nearer to the start is the likelier.
             update = (start.inverse() @ quadratic.here.T).log()
             away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
-            log_prior = states.log_prior - FROM_START * away.clamp(min=1e-9).log()[states.mode]
-            states = replace(states, log_prior=log_prior)
+            log_odds = -FROM_START * away.clamp(min=1e-9).log()
         scatter = self.landmarks.calibration_scatter.double()
-        return Posterior.of(states, quadratic, landmarks, scatter, systematic)
+        return Posterior.of(states, quadratic, landmarks, scatter, systematic, log_odds)
 
     def _blur(self, found: Posterior, term: Landmarks) -> float:
         """Return the standard deviation of the scene's projection at the best pose, pixels."""

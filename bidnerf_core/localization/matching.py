@@ -191,6 +191,7 @@ class Nearest:
     def of(query: Query, matcher: LandmarkMatcher, strongest: int) -> Nearest:
         landmarks = matcher.landmarks
         first = torch.searchsorted(query.view, query.view)
+        strongest = strongest if len(landmarks) else 0
         keypoint = (torch.arange(len(query.view)) - first < strongest).nonzero()[:, 0]
         distance, index = matcher.nearest(query.keypoints.descriptors[keypoint], LOOKED_UP)
         position, size = landmarks.positions[index], landmarks.sizes[index]

@@ -44,16 +44,19 @@ class Posterior:
         landmarks: Landmarks,
         scatter: Float[Tensor, "4"],
         systematic: Float[Tensor, "g P P"] | float = 0.0,
+        log_odds: Float[Tensor, "g"] | float = 0.0,
     ) -> Posterior:
-        """Compare explanations within a mode by their cost, and modes by the evidence of landmarks. ``terms`` are the models of all terms, and ``systematic`` is the scatter of their gradient
-        (in its units) in addition to that of independent errors.
+        """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
+
+        ``terms`` are the models of all terms, and ``systematic`` is the scatter of their gradient (in its units) in addition to that
+        of independent errors.
         """
         states, normal = terms.minimum(states)
         log = log_evidence(states, normal)
         member = states.mode[None] == torch.arange(len(terms.here), device=log.device)[:, None]
         norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
         by_mode = landmarks.evidence(terms.here)
-        log = log + (BY_SHARE * by_mode.clamp(min=LEAST_EVIDENCE).log() - norm)[states.mode]
+        log = log + (log_odds + BY_SHARE * by_mode.clamp(min=LEAST_EVIDENCE).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)
         best = int(probability.argmax())  # host
         covariance = robust_covariance(states, normal, terms, landmarks, systematic)

@@ -14,7 +14,7 @@ from bidnerf_core.captures import TrainingPoses, pose_contradiction, surveyed
 
 # Inside: the choice of poses is tested without a training around it
 from bidnerf_core.captures.training_poses import training_poses
-from bidnerf_core.localization import LandmarkMatcher, landmark_verdict, propose
+from bidnerf_core.localization import LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, posed_keypoints, tracked_views
 from landmark_scene import Points, looking_in
 
@@ -66,10 +66,10 @@ def test_a_photo_of_either_room_is_not_accepted_in_the_other() -> None:
     matcher = LandmarkMatcher(found.tracked.landmarks(DEFAULT_LANDMARKS))
     for number in range(6):
         query = points.view(looking_in(1.0 * number + 0.1, 0.2, 3.8), seed=number)
-        answer = propose(matcher, [query], points, seek_rivals=True)
+        answer = Loop([query], matcher, features=points)()
         assert answer is not None
-        assert landmark_verdict(answer).accepted
-        here, there = answer.T_world_camera.translation, answer.rivals[0].T_world_rig.translation
+        assert answer.verdict.outcome is Outcome.AMBIGUOUS
+        here, there = (answer.posterior.place(mode).translation for mode in (0, 1))
         assert float((here - there).norm()) == pytest.approx(float(AWAY.norm()), abs=0.05)
 
 

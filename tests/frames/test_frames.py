@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames import Frame, observe
+from bidnerf_core.geometry import SE3
+from bidnerf_core.testing import unseen
 from refusals import refused
 
 LENS = Intrinsics(20, 20, 12, 8, 24, 16)
@@ -97,3 +99,17 @@ def test_arrays_need_intrinsics(camera: Any) -> None:
         where="frame image", found=f"camera is a {type(camera).__name__}", expected="Intrinsics(fx="
     ):
         Frame.from_numpy(np.zeros((16, 24, 3), np.uint8), camera)
+
+
+def test_rays_of_a_moving_view_start_where_the_camera_was_at_their_rows() -> None:
+    view = unseen()
+    camera = view.frame.intrinsics
+    motion = torch.tensor([0.02, -0.01, 0.03, 0.01, 0.03, -0.02], dtype=torch.float64)
+    pixels = torch.tensor([[10, 0], [10, camera.height // 2], [30, camera.height - 1]])
+    found = observe(replace(view, motion=motion), pixels, torch.float64)
+    for number, (_, row) in enumerate(pixels.tolist()):
+        moment = (row + 0.5) / camera.height - 0.5
+        there = replace(view, T_ref_camera=view.T_ref_camera @ SE3.exp(moment * motion))
+        expected = observe(there, pixels[number : number + 1], torch.float64)
+        torch.testing.assert_close(found.origins[number], expected.origins[0])
+        torch.testing.assert_close(found.points[number], expected.points[0])

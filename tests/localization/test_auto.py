@@ -21,7 +21,6 @@ from bidnerf_core.localization import (
     AutoConfig,
     Localization,
     Outcome,
-    PointCloud,
     Problem,
     rig,
     settings_of,
@@ -176,8 +175,6 @@ def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_se
     rays = in_camera(view)
     start = perturb(view.T_ref_camera, 0.1, 5, 0)
     problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [narrow], start, rays)
-    cloud = PointCloud.measured(problem.views, rays, 1000, torch.Generator().manual_seed(0))
-    assert 0.1 < float(cloud.coloured.float().mean()) < 0.9
     assert_right(found_for(problem), view.T_ref_camera)
 
 

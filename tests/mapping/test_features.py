@@ -13,6 +13,7 @@ import torch
 import tiny
 from bidnerf_core import InputError
 from bidnerf_core.mapping import (
+    FoundOnce,
     Keypoints,
     Sift,
     byte_of_zero,
@@ -27,6 +28,7 @@ from bidnerf_core.mapping import (
 
 # Inside: the normalization of descriptors, before they are rounded to bytes
 from bidnerf_core.mapping.landmarks.features import root_normalized
+from conditions import CountedDetector
 
 
 def blobs(centres: list[tuple[float, float]], sigma: float = 3.0) -> torch.Tensor:
@@ -139,3 +141,15 @@ def test_descriptors_of_different_lengths_are_told() -> None:
 
     with pytest.raises(InputError, match="descriptors have 8 and 9 channels in different images"):
         tracked_views(tiny.views(3), stranger)
+
+
+def test_equal_images_have_the_same_keypoints_and_others_their_own() -> None:
+    detector, image = CountedDetector(), textured(0)
+    once = FoundOnce(detector)
+    found = once(image)
+    assert once(image) is found
+    assert once(image.clone()) is found
+    assert once(image.flip(1)) is not found
+    assert len(detector.images) == 2
+    assert FoundOnce(detector, [(image, found)])(image) is found
+    assert len(detector.images) == 2

@@ -162,9 +162,13 @@ class Rays:
         """Return the sights on the plane z = 1, their lengths and directions in the rig's frame; and the rays (h n), world."""
         rays, sights = rays_through(states, self.sights.image), self.sights
         length = rays.norm(dim=-1, keepdim=True)
-        unit = (sights.rotation @ (rays / length)[..., None])[..., 0]
+        sight, times = rays / length, sights.times[:, None]
+        v, w = (states.nuisances[:, None, part].expand_as(sight) for part in (slice(6, 9), slice(9, 12)))
+        turned = normalize(sight + times * torch.linalg.cross(w, sight), dim=-1)  # when the row was exposed
+        unit = (sights.rotation @ turned[..., None])[..., 0]
         directions = unit @ states.T.rotation.mT
-        origins = states.T.translation[:, None] + sights.translation @ states.T.rotation.mT
+        away = (sights.rotation @ (times * v)[..., None])[..., 0] + sights.translation
+        origins = states.T.translation[:, None] + away @ states.T.rotation.mT
         return rays, length, unit, origins.float().flatten(0, 1), directions.float().flatten(0, 1)
 
     def _channels(self, rendering: Rendering, index: Int[Tensor, "k"]) -> Float[Tensor, "k c"]:

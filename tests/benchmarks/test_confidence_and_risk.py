@@ -1,40 +1,50 @@
-"""Tolerated risk: the calibration keeps its promise, and a smaller risk accepts fewer answers."""
+"""How confidences are fitted to answers, and calibrated for a tolerated risk: the calibration keeps its promise."""
 
 from __future__ import annotations
 
 import importlib
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from bidnerf_core import Localizer, Tracker
+from bidnerf_core.localization import LogisticModel
 
-# Inside: the calibrated levels, and poses on either side of them
-from bidnerf_core.localization import AutoConfig, Outcome, risk
-from bidnerf_core.testing import textured_map, unseen
-from localizations import answer
-from refusals import refused
 
-LEVELS = ((0.01, 0.97), (0.05, 0.9), (0.1, 0.8))
+def benchmark(name: str) -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+        return importlib.import_module(name)
 
 
 @pytest.fixture(scope="module")
 def calibration() -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-        return importlib.import_module("risk")
+    return benchmark("risk")
 
 
-@pytest.fixture
-def levels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(risk, "levels", lambda: LEVELS)
+@pytest.fixture(scope="module")
+def learning() -> ModuleType:
+    return benchmark("confidence")
+
+
+def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
+    """Examples drawn from a known model give its probabilities back, but for what the ridge shrinks."""
+    random = np.random.default_rng(0)
+    true = LogisticModel({"a": 2.0, "b": -1.0}, 0.3)
+    given = []
+    for number in range(4000):
+        features = dict(zip("ab", random.normal(size=2).tolist(), strict=True))
+        right = bool(random.random() < true.probability(features))
+        given.append(learning.Example(features, right, str(number % 2), str(number % 4)))
+    found = learning.fitted(given, ridge=1e-5)
+    for values in ({"a": 1.0, "b": 0.0}, {"a": -1.0, "b": 1.0}):
+        assert found.probability(values) == pytest.approx(true.probability(values), abs=0.06)
+    said = learning.cross_validated(given, by_fault=True)["all"]
+    assert said["expected_calibration_error"] < 0.1
 
 
 def row(confidence: float, right: bool, fault: str, scene: str = "a", inliers: int = 50) -> dict[str, Any]:
@@ -114,78 +124,3 @@ def test_counts_of_a_test(calibration: ModuleType) -> None:
     rows = [row(0.9, True, "none"), row(0.7, False, "none"), row(0.7, True, "blur"), row(0.2, True, "blur")]
     found = calibration.realised([(r, dict.fromkeys(calibration.RISKS, 0.7)) for r in rows])["0.1"]
     assert found == {"accepted": 3, "wrong": 1, "right_lost": 1}
-
-
-def test_stored_levels_are_monotone() -> None:
-    risks, least = [share for share, _ in risk.levels()], [confidence for _, confidence in risk.levels()]
-    assert risks == sorted(set(risks))
-    assert least == sorted(least, reverse=True)
-    assert all(0 < share < 1 for share in risks)
-    assert all(0 <= confidence <= 1 for confidence in least)
-
-
-@pytest.mark.usefixtures("levels")
-def test_a_smaller_risk_accepts_a_subset() -> None:
-    answers = [answer(confidence=value) for value in np.linspace(0.5, 1, 101)]
-    accepted = [
-        {place for place, found in enumerate(answers) if risk.within_risk(found, share).converged}
-        for share in (0.01, 0.03, 0.05, 0.07, 0.1)
-    ]
-    for fewer, more in pairwise(accepted):
-        assert fewer <= more
-    assert len(accepted[0]) < len(accepted[2]) < len(accepted[4]) < len(answers)
-    assert accepted[1] == accepted[0]  # between two levels, the stricter one holds
-
-
-@pytest.mark.usefixtures("levels")
-def test_what_is_not_sure_enough_is_uncertain_with_the_same_pose() -> None:
-    found = answer(confidence=0.95)
-    judged = risk.within_risk(found, 0.01)
-    assert judged.outcome is Outcome.UNCERTAIN
-    assert judged.T_world_camera is found.T_world_camera
-    assert judged.confidence == 0.95
-    assert "0.950" in judged.reason
-    assert "0.970" in judged.reason
-    assert found.reason in judged.reason
-
-
-@pytest.mark.usefixtures("levels")
-def test_an_answer_without_a_confidence_is_not_accepted_at_any_risk() -> None:
-    assert risk.within_risk(answer(), 0.1).outcome is Outcome.UNCERTAIN
-
-
-@pytest.mark.usefixtures("levels")
-def test_a_rejection_stays_what_it_is() -> None:
-    found = answer(outcome=Outcome.MIRRORED, confidence=0.99)
-    assert risk.within_risk(found, 0.1) is found
-
-
-@pytest.mark.usefixtures("levels")
-@pytest.mark.parametrize("share", [0.0, 0.009, 0.11, 1.0, -1.0, math.nan, math.inf, "0.05"])
-def test_a_risk_that_was_not_calibrated_is_refused(share: Any) -> None:
-    with refused(found=f"risk is {share!r}", expected="0.01 to 0.1"):
-        AutoConfig(risk=share)
-
-
-def test_without_calibration_every_risk_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(risk, "levels", lambda: ())
-    AutoConfig()
-    with refused(found="risk is 0.05, but no risk was calibrated"):
-        AutoConfig(risk=0.05)
-
-
-@pytest.mark.parametrize("search", ["localizer", "tracker"])
-def test_the_localizer_and_the_search_of_a_tracker_keep_to_it(
-    search: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(risk, "levels", lambda: ((0.01, 1.0), (0.1, 0.5)))
-    found = []
-    for share in (None, 0.1, 0.01):
-        localizer = Localizer(textured_map(), config=AutoConfig(fused_rays=0, risk=share), warm_up=False)
-        frame = unseen().frame
-        each = localizer(frame) if search == "localizer" else Tracker(localizer)(frame, 0.0)
-        found.append(each)
-    assert [each.converged for each in found] == [True, True, False]
-    for each in found[1:]:
-        assert torch.equal(each.T_world_camera.matrix(), found[0].T_world_camera.matrix())
-        assert each.confidence == found[0].confidence

@@ -1,0 +1,507 @@
+"""The answers of the loop to images under every condition of the camera, the image and the scene: a table for each of two scenes.
+
+Nothing may be accepted that is wrong. Beyond that, a row states whose camera the answer has to have, whether it has to find that
+the camera moved while the rows were exposed, and the largest error of the pose, whose covariance has to cover the true one; or the
+outcome of an image without a right answer. The confidence, which was fitted to real captures, plays no part.
+"""
+
+from __future__ import annotations
+
+import functools
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+
+from bidnerf_core import SE3, Intrinsics, Localization, Localizer, Outcome, View
+from bidnerf_core.evaluation import faulty
+from bidnerf_core.fields import FieldValues
+from bidnerf_core.localization import Answer, AutoConfig, LandmarkMatcher, LogisticModel, Loop, rig
+from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.registry import registered
+from bidnerf_core.results import pose_error
+from bidnerf_core.testing import CAMERA as GROUND_CAMERA
+from bidnerf_core.testing import POSES as GROUND_POSES
+from bidnerf_core.testing import TexturedGround, textured_map, training_views, unseen
+from bidnerf_core.testing import seen as seen_ground
+from conditions import (
+    COPY,
+    NOT_RENDERED,
+    POSES,
+    QUICK,
+    CountedDetector,
+    centred,
+    ground_landmarks,
+    ground_view,
+    ground_views,
+    part,
+    point_landmarks,
+    point_view,
+    points,
+    resized,
+    scaled,
+    shifted,
+    twice,
+    with_landmarks,
+)
+from landmark_scene import PINHOLE, looking_in
+from localizations import CHI2_999, assert_covered, assert_near, colour_only
+
+LARGEST = 0.05, 2.0
+"""Largest error of any accepted pose: metres and degrees, at distances of 1.7 to 4.4 m."""
+
+
+class Right(NamedTuple):
+    """A right answer."""
+
+    camera: str | None = (
+        "given"  # whose intrinsics it has: the "given" ones, the "map"'s, or "estimated" ones; None: any
+    )
+    moved: bool | None = False  # whether it says that the camera moved; None: either
+    metres: float = 0.0075
+    degrees: float = 0.15
+
+
+MAP, MOVED = Right("map"), Right(moved=True, metres=0.0082)
+ESTIMATED = Right("estimated", metres=0.016, degrees=0.49)
+REJECTED = None  # for any reason
+MAY_BE_REJECTED = "either"
+Expected = Right | Outcome | str | None
+
+MOTION = torch.tensor([0.0, 0.01, 0.0, 0.0, 0.02, 0.015], dtype=torch.float64)  # first row to last
+SLIGHT = torch.tensor([0.0, 0.01, 0.0, 0.0, 0.0, 0.012], dtype=torch.float64)
+
+
+@pytest.fixture(autouse=True)
+def certain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bounds alone decide."""
+    accept = import_module("bidnerf_core.localization.accept")
+    monkeypatch.setattr(accept, "model", lambda: LogisticModel({}, 10.0))
+
+
+def near(T: SE3) -> SE3:
+    return T.retract(torch.tensor([1.0, 0.5, 0.0, 0.1, 0.0, 0.0], dtype=torch.float64))
+
+
+def assert_as_expected(found: Localization, truth: SE3, expected: Expected, true: Intrinsics) -> None:
+    """Compare an answer with the true pose and the ``true`` camera."""
+    error = pose_error(found.T_world_camera, truth)
+    away, turned = float(error.translation), float(error.rotation_deg)
+    largest = (expected.metres, expected.degrees) if isinstance(expected, Right) else LARGEST
+    is_near = away <= largest[0] and turned <= largest[1]
+    assert is_near or not found.converged, f"accepted, and off by {away} m and {turned} degrees"
+    if isinstance(expected, Right):
+        camera = "map" if "(map" in found.reason else "estimated"
+        camera = "given" if found.intrinsics is None else camera
+        moved = "rolling shutter" in found.reason or "moving)" in found.reason
+        assert (found.outcome, camera) == (Outcome.CONVERGED, expected.camera or camera), found.reason
+        assert expected.moved in (None, moved), found.reason
+        assert_covered(found.T_world_camera, truth, found.covariance, CHI2_999)
+        if found.intrinsics is not None:
+            assert found.intrinsics.fx == pytest.approx(true.fx, rel=0.04)
+            assert (found.intrinsics.cx, found.intrinsics.cy) == pytest.approx((true.cx, true.cy), abs=8)
+    elif isinstance(expected, Outcome):
+        assert found.outcome is expected, found.reason
+    elif expected is REJECTED:
+        assert not found.converged, found.reason
+
+
+POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
+    "as stated, 0": ({}, Right()),
+    "as stated, 1": ({"pose": 1}, Right()),
+    "as stated, 2": ({"pose": 2}, Right(metres=0.011, degrees=0.19)),
+    "focal 0.9": ({"stated": scaled(0.9)}, MAP),
+    "focal 0.95": ({"pose": 1, "stated": scaled(0.95)}, MAP),
+    "focal 1.05": ({"stated": scaled(1.05)}, MAP),
+    "focal 1.05, indistinguishable": ({"stated": scaled(1.05), "scatter": 0.1}, REJECTED),
+    "principal point 12, -12": ({"pose": 1, "stated": shifted(12, -12)}, MAP),
+    "lower left corner": (
+        {"true": (corner := part(100, 75, 1, 0)), "stated": centred(corner)}, ESTIMATED._replace(metres=0.0099),
+    ),
+    "left part, 120 columns fewer": (
+        {"true": (half := part(120, 0, 1)), "stated": centred(half)}, Right("estimated", metres=0.03, degrees=1.5),
+    ),
+    "right part, approximate, 35 columns fewer": (
+        {"true": (half := part(35, 0, 0)), "stated": centred(half, 1.05), "approximate": True},
+        Right("estimated", metres=0.03, degrees=1.5),
+    ),
+    "middle": ({"true": part(120, 90)}, Right(metres=0.01, degrees=0.18)),
+    "middle, 120 rows fewer": ({"true": part(0, 120)}, Right(metres=0.01, degrees=0.2)),
+    "resized 0.95": ({"pose": 1, "stated": resized(0.95)}, MAP),
+    "resized 1.33": ({"pose": 1, "stated": resized(1.33)}, MAP),
+    "resized 1.33, unknown cameras": ({"stated": resized(1.33), "known": False}, REJECTED),
+    "resized 0.95, moving rows": (
+        {"stated": resized(0.95), "motion": SLIGHT}, Right("map", None, 0.0082, 0.25),
+    ),
+    "another camera, 5 % narrower, moving rows": (
+        {"true": resized(1.05), "motion": SLIGHT}, Right("given", None, 0.0082),
+    ),
+    "another camera 1.05": ({"pose": 1, "true": scaled(1.05)}, Right()),
+    "focal 1.02, unknown cameras": ({"stated": scaled(1.02), "known": False}, ESTIMATED._replace(camera="given")),
+    "focal 1.2, unknown cameras": ({"stated": scaled(1.2), "known": False}, ESTIMATED),
+    "approximate 0.7, unknown cameras": (
+        {"pose": 1, "stated": scaled(0.7), "approximate": True, "known": False}, Right("estimated", False, 0.031),
+    ),
+    "approximate 1.4, unknown cameras": (
+        {"pose": 1, "stated": scaled(1.4), "approximate": True, "known": False}, Right("estimated", False, 0.031),
+    ),
+    "approximate 1.15": ({"stated": scaled(1.15), "approximate": True}, MAP),
+    "approximate 1.1, most keypoints wrong": (
+        {"stated": scaled(1.1), "approximate": True, "wrong": 0.8}, Right("map", None, 0.02, 0.5),
+    ),
+    "approximate 1.1, most keypoints wrong, unknown cameras": (
+        {"stated": scaled(1.1), "approximate": True, "wrong": 0.8, "known": False},
+        Right("estimated", None, 0.05, 0.8),
+    ),
+    "approximate, another camera 1.2": (
+        {"pose": 1, "true": scaled(1.2), "stated": scaled(1.0), "approximate": True}, Right("estimated", False, 0.026),
+    ),
+    "moving rows": ({"motion": MOTION}, MOVED),
+    "moving rows, focal 0.95": ({"motion": MOTION, "stated": scaled(0.95)}, MOVED._replace(camera="map")),
+    "moving rows, focal 1.05": (
+        {"pose": 1, "motion": MOTION, "stated": scaled(1.05)}, MOVED._replace(camera="map", metres=0.012),
+    ),
+    "two rooms": ({"repeated": 1.0}, Outcome.AMBIGUOUS),
+    "two rooms, rig": ({"repeated": 1.0, "others": POSES[1:2]}, Outcome.AMBIGUOUS),
+    "two rooms, start": ({"pose": 1, "repeated": 1.0, "start": near(POSES[1])}, Right()),
+    "two rooms, start in the other": (
+        {"pose": 1, "repeated": 1.0, "start": near(COPY @ POSES[1]), "elsewhere": True}, Right(),
+    ),
+    "two rooms that share little": ({"repeated": 0.4}, Right()),
+    "two thirds of the keypoints wrong": ({"wrong": 0.67}, Right(metres=0.018, degrees=0.32)),
+    "only wrong keypoints": ({"wrong": 1.0}, REJECTED),
+    "hidden but for the left third": ({"pose": 1, "visible": 0.33}, MAY_BE_REJECTED),
+    "12 keypoints": ({"most": 12}, REJECTED),
+    "30 keypoints": ({"pose": 1, "most": 30}, Right(metres=0.014, degrees=0.27)),
+    "30 keypoints, focal 0.95": ({"pose": 1, "most": 30, "stated": scaled(0.95)}, MAY_BE_REJECTED),
+    "rig": ({"others": POSES[1:2]}, Right()),
+    "rig, focal 0.95": ({"pose": 1, "others": POSES[:1], "stated": scaled(0.95)}, MAP),
+    "poster from near": ({"flat": True, "at": looking_in(0.5)}, MAY_BE_REJECTED),
+    "poster from afar": ({"flat": True, "at": looking_in(0.5, 0.3, 8.0)}, MAY_BE_REJECTED),
+    "lens of the map, not stated": (
+        {"true": (lens := replace(PINHOLE, distortion=(-0.1, 0.0, 0.0, 0.0))), "stated": PINHOLE, "known": False},
+        ESTIMATED,
+    ),
+    "sheared": ({"true": PINHOLE, "sheared": 0.1, "known": False}, REJECTED),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_points(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is rendered."""
+    condition, expected = POINTS[name]
+    usual = {
+        "pose": 0,
+        "flat": False,
+        "known": True,
+        "repeated": 0.0,
+        "others": (),
+        "start": None,
+        "sheared": 0.0,
+    }
+    query = usual | condition
+    flat, pose, start, shear = (query.pop(key) for key in ("flat", "pose", "start", "sheared"))
+    seen, truth = points(flat), query.pop("at", POSES[pose])
+    monkeypatch.setitem(registered, ("features", "points"), seen)
+    landmarks = replace(point_landmarks(flat), features="points")
+    if not query.pop("known"):
+        landmarks = replace(landmarks, cameras=())
+    if scatter := query.pop("scatter", None):
+        apparent = torch.cat([torch.tensor([scatter]).double(), landmarks.calibration_scatter[1:]])
+        landmarks = replace(landmarks, calibration_scatter=apparent)
+    if share := query.pop("repeated"):
+        landmarks = twice(landmarks, share)
+    answered = COPY @ truth if query.pop("elsewhere", False) else truth
+    places = [*query.pop("others"), truth]
+    views = [point_view(seen, T, seed=100 * pose + number, **query) for number, T in enumerate(places)]
+    if shear:
+        across, down = seen.seen[-1].pixels.unbind(-1)
+        moved = torch.stack([across + shear * (down - PINHOLE.cy), down], -1)
+        inside = (moved[:, 0] > 0) & (moved[:, 0] < PINHOLE.width)
+        seen.seen[-1] = replace(seen.seen[-1], pixels=moved)[inside]
+    # Where landmarks do not convince, the ground is searched for what is not there.
+    found = Localizer(with_landmarks(landmarks), config=NOT_RENDERED, warm_up=False)(views, start)
+    assert_as_expected(found, answered, expected, query.get("true", PINHOLE))
+
+
+def noisy(fault: str, depth: bool = False, number: int = 1, *others: int) -> dict[str, Any]:
+    return {"views": ground_views(fault, (*others, number), depth)}
+
+
+def stated(view: View, factor: float) -> list[View]:
+    """Return a photo whose focal length is ``factor`` times the true one as it is stated."""
+    frame = replace(view.frame, intrinsics=scaled(factor, view.frame.intrinsics), depth=None)
+    return [replace(view, frame=frame)]
+
+
+def other_camera(factor: float) -> list[View]:
+    """Return a photo of a camera that is nearly the map's, and says so."""
+    camera = scaled(factor, GROUND_CAMERA)
+    return stated(seen_ground(GROUND_POSES[1], camera), 1.0)
+
+
+def own_correlation() -> LandmarkMap:
+    """Return landmarks of surer cameras, whose keypoints are as correlated as those of the map's images."""
+    built = textured_map().landmarks
+    assert built is not None
+    return replace(ground_landmarks(scatter=0.003), correlation=built.correlation)
+
+
+SHARP = AutoConfig(fused_rays=1024)
+GROUND: dict[str, tuple[Any, Expected]] = {
+    "as stated, RGB": (lambda: noisy("none"), Right(metres=0.0075, degrees=0.18)),
+    "as stated, RGB-D": (lambda: noisy("none", True), Right(metres=0.0075, degrees=0.18)),
+    "focal 0.95, RGB": (lambda: noisy("focal:0.95"), MAP._replace(degrees=0.18)),
+    "focal 0.95, RGB-D": (lambda: noisy("focal:0.95", True), MAP._replace(degrees=0.18)),
+    "occluder, RGB": (lambda: noisy("occluder:0.25"), Right(metres=0.0085, degrees=0.18)),
+    "occluder, RGB-D": (lambda: noisy("occluder:0.25", True), Right(metres=0.0085, degrees=0.18)),
+    "principal point": (lambda: noisy("principal-point:5", False, 2), Right("map", False, 0.012, 0.32)),
+    "stretched": (lambda: noisy("stretch:1.33"), MAP._replace(degrees=0.18)),
+    "nominal, 1.1": (lambda: noisy("nominal+focal:1.1"), Right(None, metres=0.03, degrees=0.5)),
+    "moving rows": (lambda: noisy("rolling-shutter:2"), Right("given", True, 0.022, 0.69)),
+    "mirrored": (lambda: noisy("mirror"), Outcome.MIRRORED),
+    "blurred 1": (lambda: noisy("blur:1"), Right(metres=0.01, degrees=0.21)),
+    "another ground": (lambda: {"views": ground_views("none", seed=5)}, REJECTED),
+    "rig": (lambda: noisy("none", False, 1, 0), Right(metres=0.0058, degrees=0.12)),
+    "depth 5 % too long": (lambda: noisy("depth-scale:1.05", True), Right(metres=0.0077, degrees=0.18)),
+    "focal 0.5, not rendered": (
+        lambda: {"views": stated(unseen(), 0.5), "config": NOT_RENDERED, "landmarks": own_correlation()},
+        MAP._replace(metres=0.03, degrees=1.0),
+    ),
+    "focal 2, not rendered": (
+        lambda: {"views": stated(unseen(), 2.0), "config": NOT_RENDERED, "landmarks": own_correlation()},
+        MAP._replace(metres=0.03, degrees=1.0),
+    ),
+    "focal 1.02, not rendered": (
+        lambda: {"views": stated(unseen(), 1.02), "config": NOT_RENDERED}, Right(None, metres=0.03, degrees=0.5),
+    ),
+    "focal 1.02, rendered": (
+        lambda: {"views": stated(unseen(), 1.02), "config": SHARP}, MAP._replace(metres=0.02),
+    ),
+    "another camera 0.97, rendered": (
+        lambda: {"views": other_camera(0.97), "config": SHARP}, Right(metres=0.02),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GROUND)
+def test_ground(name: str) -> None:
+    make, expected = GROUND[name]
+    query = make()
+    scene = with_landmarks(query.get("landmarks") or ground_landmarks())
+    found = Localizer(scene, config=query.get("config", QUICK), warm_up=False)(query["views"])
+    truth, camera = query["views"][-1].T_ref_camera, GROUND_CAMERA
+    assert_as_expected(found, truth, expected, camera)
+
+
+# What is fused with landmarks, and how it shows
+
+
+TRUTH = unseen().T_ref_camera
+
+
+@functools.cache
+def matcher() -> LandmarkMatcher:
+    return LandmarkMatcher(replace(ground_landmarks(), cameras=()))
+
+
+def solved(*views: View, rays: int = 0, matching: LandmarkMatcher | None = None, **changes: Any) -> Answer:
+    scene = replace(textured_map(surface=True), **changes)
+    matching = (matching or matcher()).for_query()
+    problem = rig(scene, views, None, matcher=matching)
+    found = Loop(problem.views, matching, problem, rays)()
+    assert found is not None
+    return found
+
+
+@functools.cache
+def alone() -> Answer:
+    return solved(colour_only(unseen()))
+
+
+@pytest.mark.parametrize(
+    ("depth", "rays"), [(True, 0), (False, 256), (True, 256)], ids=["depth", "rays", "both"]
+)
+def test_each_further_measurement_brings_the_pose_nearer_and_makes_it_more_certain(
+    depth: bool, rays: int
+) -> None:
+    found = solved(unseen() if depth else colour_only(unseen()), rays=rays)
+    assert ("depth" in found.fused) is depth
+    assert alone().fused == ()
+    before, after = (pose_error(each.T_world_rig, TRUTH).translation for each in (alone(), found))
+    assert after < before
+    assert_covered(found.T_world_rig, TRUTH, found.covariance)
+    for axes in (slice(0, 3), slice(3, 6)):  # position, rotation
+        assert float(found.covariance[axes, axes].trace()) < float(alone().covariance[axes, axes].trace())
+    torch.testing.assert_close(found.covariance, found.covariance.mT)
+    assert float(torch.linalg.eigvalsh(found.covariance)[0]) > 0
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.6])
+def test_another_exposure_does_not_mislead_rendering(gain: float) -> None:
+    """Half of the exposure, or one at which bright colours are clipped."""
+    view = colour_only(unseen())
+    found = solved(
+        replace(view, frame=replace(view.frame, rgb=(gain * view.frame.rgb).clamp(max=1))), rays=256
+    )
+    assert "rendering" in found.fused
+    assert_near(found.T_world_rig, TRUTH, 0.005, 0.1)
+
+
+@pytest.mark.parametrize(("noise", "fused"), [(None, True), (0.04, True), (0.041, False)])
+def test_a_blurred_field_is_not_rendered(noise: float | None, fused: bool) -> None:
+    assert ("rendering" in solved(colour_only(unseen()), rays=256, colour_noise=noise).fused) is fused
+
+
+@pytest.mark.parametrize("scale", [0.001, 0.3048, 0.8, 1.2])
+def test_depth_of_another_unit_does_not_mislead(scale: float) -> None:
+    """Millimetres, or feet, read as metres."""
+    depth = unseen().frame.depth
+    assert depth is not None
+    found = solved(replace(unseen(), frame=replace(unseen().frame, depth=scale * depth)), rays=256)
+    error = pose_error(found.T_world_rig, TRUTH)
+    assert not found.verdict.accepted or float(error.translation) < 0.015
+
+
+def test_errors_of_the_maps_own_poses_do_not_become_smaller_by_fusion() -> None:
+    errors = 1e-4 * torch.eye(6, dtype=torch.float64)
+    known = LandmarkMatcher(replace(matcher().landmarks, pose_covariance=errors))
+    found = solved(unseen(), rays=256, matching=known)
+    assert float(torch.linalg.eigvalsh(found.covariance - errors)[0]) > 0
+
+
+# Poses found by other means
+
+
+def test_a_pose_found_by_other_means_is_confirmed_or_contradicted() -> None:
+    view, matching = colour_only(unseen()), matcher().for_query()
+    problem = rig(textured_map(), [view], None, matcher=matching)
+    loop = Loop(problem.views, matching, problem)
+    near_truth = TRUTH.retract(torch.tensor([0.01, -0.01, 0.01, 0.005, 0.0, 0.005], dtype=torch.float64))
+    there = loop.at(near_truth)
+    assert there is not None
+    assert there.verdict.accepted
+    assert_near(there.T_world_rig, TRUTH, 0.02, 0.5)
+    wrong = loop.at(TRUTH.retract(torch.tensor([0.3, 0.2, 0.0, 0.0, 0.0, 0.8], dtype=torch.float64)))
+    assert wrong is None or not wrong.verdict.accepted
+
+
+# One image, once
+
+
+def test_a_query_detects_its_keypoints_once_and_its_mirror_image_not_at_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    detector = CountedDetector()
+    monkeypatch.setitem(registered, ("features", "counted"), detector)
+    scene = with_landmarks(ground_landmarks("counted"))
+    for fault in ("none", "mirror"):
+        detector.images.clear()
+        Localizer(scene, config=NOT_RENDERED, warm_up=False)(ground_views(fault))
+        assert len(detector.images) == 1
+
+
+class Unrendered(TexturedGround):
+    """A field that must not be rendered."""
+
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        raise AssertionError("rendered")
+
+
+@pytest.mark.parametrize("fault", ["covered", "blank"])
+def test_an_image_that_shows_nothing_is_rejected_without_rendering(fault: str) -> None:
+    blank = torch.full_like(unseen().frame.rgb, 0.5)
+    frame = replace(unseen().frame, rgb=blank, depth=None)
+    view = View(frame, TRUTH) if fault == "blank" else faulty(colour_only(ground_view(1)), "covered", 0)
+    scene = replace(with_landmarks(ground_landmarks()), field=Unrendered())
+    found = Localizer(scene, warm_up=False)(view)
+    assert not found.converged
+    assert found.reason
+
+
+def test_the_same_seed_gives_the_same_answer_in_any_thread() -> None:
+    localize = Localizer(with_landmarks(ground_landmarks()), config=QUICK, warm_up=False)
+    views = [ground_views("none", depth=True), ground_views("occluder:0.25"), ground_views("focal:0.95")]
+    expected = [localize(view, seed=3) for view in views]
+    torch.manual_seed(99)
+    with ThreadPoolExecutor(3) as pool:
+        again = list(pool.map(lambda view: localize(view, seed=3), views * 2))
+    for one, other in zip(expected * 2, again, strict=True):
+        assert torch.equal(one.T_world_camera.matrix(), other.T_world_camera.matrix())
+        assert one.covariance is not None
+        assert other.covariance is not None
+        assert torch.equal(one.covariance, other.covariance)
+        assert (one.outcome, one.reason) == (other.outcome, other.reason)
+
+
+def test_in_a_moved_world_the_answer_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, T = points(), SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
+    view, known = point_view(seen, POSES[0]), point_landmarks()
+    moved = replace(
+        known,
+        positions=T.apply(known.positions.double()).float(),
+        directions=T.rotate(known.directions.double()).float(),
+    )
+    here, there = (Loop([view], LandmarkMatcher(each), features=seen)() for each in (known, moved))
+    assert here is not None
+    assert there is not None
+    assert_near(there.T_world_rig, T @ here.T_world_rig, 1e-3, 0.02)
+
+
+def test_images_of_different_cameras_are_localized_with_the_stated_ones() -> None:
+    first, second = training_views()[0], unseen()
+    other = seen_ground(first.T_ref_camera, scaled(0.8, GROUND_CAMERA))
+    found = Localizer(with_landmarks(ground_landmarks()), config=NOT_RENDERED)(
+        [colour_only(other), colour_only(second)]
+    )
+    assert found.converged, found.reason
+    assert found.intrinsics is None
+    assert_near(found.T_world_camera, TRUTH, 0.01, 0.3)
+
+
+# Degenerate input
+
+
+@dataclass(frozen=True)
+class Degenerate:
+    """Landmarks and keypoints that leave a pose undetermined."""
+
+    keypoints: int | None = None
+    landmarks: int | None = None
+    squeezed: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors of the landmarks' positions
+    far: float = 0.0  # metres: from the landmarks to where they seem to be
+
+
+DEGENERATE = {
+    "no landmarks": Degenerate(landmarks=0),
+    "5 landmarks": Degenerate(landmarks=5),
+    "7 keypoints": Degenerate(keypoints=7),
+    "no keypoints": Degenerate(keypoints=0),
+    "coplanar": Degenerate(squeezed=(1.0, 1.0, 0.0)),
+    "collinear": Degenerate(squeezed=(1.0, 0.0, 0.0)),
+    "one point": Degenerate(squeezed=(0.0, 0.0, 0.0)),
+    "far": Degenerate(far=1e7),
+    "overflowing": Degenerate(squeezed=(0.0, 0.0, 0.0), far=3e38),
+}
+
+
+@pytest.mark.parametrize("start", [None, POSES[0]], ids=["no start", "start"])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_input_has_a_finite_answer_that_is_not_accepted_or_none(
+    name: str, start: SE3 | None
+) -> None:
+    given, seen, known = DEGENERATE[name], points(), point_landmarks()[slice(0, DEGENERATE[name].landmarks)]
+    factors = torch.tensor(given.squeezed)
+    view = point_view(seen, POSES[0], most=given.keypoints)
+    matching = LandmarkMatcher(replace(known, positions=known.positions * factors + given.far))
+    problem = rig(with_landmarks(known), [view], start, matcher=matching)
+    found = Loop(problem.views, matching, problem, features=seen)()
+    if found is None:
+        return
+    assert not found.verdict.accepted or name == "coplanar"
+    assert bool(found.T_world_rig.matrix().isfinite().all())
+    assert bool(found.posterior.probability.isfinite().all())
+    assert not bool(found.covariance.isnan().any())
