@@ -446,7 +446,7 @@ class Loop:
         cells = ((pixels / size * CELLS).long().clamp(0, CELLS - 1) * torch.tensor([1, CELLS])).sum(-1)
         cells = cells + CELLS**2 * query.view[mode.matches.keypoint]
         covariance = HEAVY_TAILS * (found.mixture() + self.landmarks.pose_covariance)
-        position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf))
+        position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf, math.inf))
         row = found.states.row
         agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
         evidence = Evidence(
@@ -457,7 +457,7 @@ class Loop:
             other_place=float(found.probability[found.states.mode != found.mode].sum()),
             credible=float(found.probability[given.credible[row]].sum()),
             replaced=float(found.probability[~given.usual[row]].sum()),
-            precision=position / distance, mass=mass, searched=searched, **others,
+            precision=min(position / distance, 1.0), mass=mass, searched=searched, **others,
         )  # fmt: skip
         verdict = accept(evidence)
         if mode.name == MIRROR:
