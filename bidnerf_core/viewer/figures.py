@@ -34,7 +34,6 @@ MEASURES = {
     "noise_ratio": ("reprojection errors", ".1f", "relative to those of the map's own images; not tested by itself"),
     "on_surface": ("measured points on the surface", ".0%", "share of the measured depth that lies there; not tested by itself"),
     "colour_inliers": ("points with the surface's colour", ".0%", "share that lies there and has its colour; not tested by itself"),
-    "rendered_noise": ("errors of rendered colours", ".1f", "relative to those of the map's own images; not tested by itself"),
 }  # fmt: skip
 """The name, format and meaning of each measure of a pose by landmarks, those with a bound first."""
 OF_SURFACE = {
