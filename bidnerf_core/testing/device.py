@@ -25,13 +25,12 @@ from bidnerf_core.localization import (
     RayStage,
     RayTerms,
     SampledLoss,
-    descend,
     objective_of,
     pivot,
     rig,
     states_at,
 )
-from bidnerf_core.mapping import LandmarkMap, SurfaceMap
+from bidnerf_core.mapping import LandmarkMap, SurfaceMap, descend
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import SCENE_BOUNDS, rgbd_views
 from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere

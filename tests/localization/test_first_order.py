@@ -21,7 +21,6 @@ from bidnerf_core.localization import (
     NO_RIVAL,
     AdamSettings,
     AdamSteps,
-    BidConfig,
     ColourSettings,
     DepthSettings,
     DescentDiagnostics,

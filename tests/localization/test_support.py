@@ -18,7 +18,16 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import NO_RIVAL, AutoConfig, Localization, Outcome, Pivot, Problem, Support, rig
+from bidnerf_core.localization import (
+    NO_RIVAL,
+    AutoConfig,
+    Localization,
+    Outcome,
+    Pivot,
+    Problem,
+    Support,
+    rig,
+)
 
 # Inside: the odds themselves, far from the values at which they decide
 from bidnerf_core.localization.support import log_odds, same_pose, support
