@@ -1,4 +1,4 @@
-"""Fields that find for whole rays what they meet: rendering, derivatives and the contract's check of them."""
+"""Fields that find for whole rays what they meet: rendering and the contract's check of them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,17 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-
-# Inside: the derivatives of single rays are compared with differences; a solver only shows their sum
-from bidnerf_core.localization.costs.linearization import linearize
 from torch import Tensor
 
 from bidnerf_core.fields import (
     FieldValues,
     HitField,
     HitsAroundDepth,
-    Observations,
     RayHits,
     Rays,
     Stratified,
     render,
 )
-from bidnerf_core.geometry import SE3
 from bidnerf_core.testing import check_hits
 
 SOFT = 0.01  # metres: standard deviation of the density about a sheet
@@ -97,38 +92,6 @@ def test_rays_that_meet_nothing_see_the_background() -> None:
     away = replace(rays(), directions=-rays().directions)
     found = render(Sheets(), away, (0.1, 0.2, 0.3))
     assert torch.allclose(found.rgb, torch.tensor([0.1, 0.2, 0.3]).double().expand_as(found.rgb))
-
-
-def test_the_jacobian_of_hits_is_that_of_finite_differences() -> None:
-    start = SE3.exp(torch.tensor([0.1, 0, 0, 0, 0.1, 0], dtype=torch.float64))
-    local = rays()
-    count = len(local.near)
-    observed = Observations(
-        local.origins, local.directions, torch.full((count, 3), 0.5).double(),
-        torch.full((count,), 2.0).double(), torch.ones(count, dtype=torch.bool),
-    )  # fmt: skip
-
-    def moved(T: SE3) -> Rays:
-        return Rays(
-            *(x[None] for x in (T.apply(local.origins), T.rotate(local.directions), local.near, local.far))
-        )
-
-    def residual(rendering: object, seen: Observations) -> Tensor:
-        found = rendering
-        return torch.cat([found.rgb - seen.rgb, (found.distance - seen.distance)[..., None]], dim=-1)  # type: ignore[attr-defined]
-
-    pivot = SE3(start.rotation[None], start.translation[None])
-    exact = linearize(Sheets(), moved(start), observed, residual, pivot, (0.0, 0.0, 0.0))  # type: ignore[arg-type]
-    assert not exact.rgb.requires_grad
-    assert not exact.residuals.requires_grad
-    for axis in range(6):
-        step = torch.zeros(6, dtype=torch.float64)
-        step[axis] = 1e-6
-        ahead, behind = (
-            linearize(Sheets(), moved(start.retract(s)), observed, residual, pivot, (0.0, 0.0, 0.0)).residuals  # type: ignore[arg-type]
-            for s in (step, -step)
-        )
-        assert torch.allclose(exact.jacobian[..., axis], (ahead - behind) / 2e-6, atol=1e-6)
 
 
 def test_hits_around_a_measured_depth() -> None:

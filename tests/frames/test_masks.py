@@ -13,10 +13,6 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from bidnerf_core.localization.acceptance import is_blank
-from bidnerf_core.localization.costs.images import thumbnail
-from bidnerf_core.localization.costs.rendered import blurred
-from bidnerf_core.localization.landmarks.correspondences import query_images
 
 from bidnerf_core import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence, train
 from bidnerf_core.camera import Orientation, Raster
@@ -27,7 +23,10 @@ from bidnerf_core.carving import FreeSpace
 from bidnerf_core.datasets import wholly_hidden, with_all
 from bidnerf_core.fields import RenderedImage
 from bidnerf_core.frames import DRAWERS, DrawerName, MaskFolder, WhollyHidden, masks_sentence, read_mask
-from bidnerf_core.mapping import SIFT, tracked_views
+from bidnerf_core.localization.by_surface import is_blank
+from bidnerf_core.localization.terms.images import Thumbnail
+from bidnerf_core.localization.terms.rays import averaged
+from bidnerf_core.mapping import SIFT, image_keypoints, tracked_views
 from bidnerf_core.maps import rendering_scores
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import RayBank
@@ -263,8 +262,8 @@ INFLUENCED: dict[str, Callable[[View], torch.Tensor]] = {
     "free space": free,
     "scores": scored,
     "measures": measured,
-    "thumbnail": lambda view: thumbnail(view, 12).rgb,
-    "blurred colours": lambda view: blurred(view, 4).frame.rgb[:, 13:],
+    "thumbnail": lambda view: Thumbnail.of(view, 12).rgb,
+    "blurred colours": lambda view: averaged(view.frame, 4)[:, 13:],
     "blankness": lambda view: torch.tensor(is_blank(view.frame)),
 }
 
@@ -302,9 +301,9 @@ def test_no_keypoint_reaches_into_what_is_hidden() -> None:
     view = View(Frame("noise", rgb, camera, hidden=hidden), like.T_ref_camera)
     whole = replace(view, frame=replace(view.frame, hidden=None))
     of_map = tracked_views([view], SIFT).observations.images[0].keypoints
-    of_query = query_images([view], SIFT)[0].keypoints
+    of_query = image_keypoints(view, SIFT).keypoints
     for keypoints in (of_map, of_query):
-        assert 20 < len(keypoints) < 0.8 * len(query_images([whole], SIFT)[0].keypoints)
+        assert 20 < len(keypoints) < 0.8 * len(image_keypoints(whole, SIFT).keypoints)
         u, v = keypoints.pixels.unbind(-1)
         reach = keypoints.sizes / 2 - 1
         inside = (u + reach > 40) & (u - reach < 120) & (v > 30) & (v < 90)

@@ -52,9 +52,9 @@ def lidar() -> Observations:
 def depth_loss(problem: Problem, T: SE3, count: int = 10**6) -> float:
     """The part of the loss that the depth rays add."""
     values = []
-    for counts in (RayCounts(16, count), RayCounts(16, 0)):
+    for own in (count, 0):
         generator = torch.Generator().manual_seed(0)
-        loss = SampledLoss(problem, OBJECTIVE, counts, DescentSettings(), ReachSettings(), generator)
+        loss = SampledLoss(problem, OBJECTIVE, own, DescentSettings(rays=16), ReachSettings(), generator)
         values.append(float(loss(T)))
     return values[0] - values[1]
 

@@ -10,14 +10,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-# Inside: which pixels are an occluder, of which an answer shows no image
-from bidnerf_core.localization.search.occluders import nearest_piece
-
 import baked
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.frames import DRAWERS, Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization
+
+# Inside: which pixels are an occluder, of which an answer shows no image
+from bidnerf_core.localization.occluders import nearest_piece
 from bidnerf_core.results import pose_error
 from problems import localize
 from refusals import refused

@@ -23,7 +23,7 @@ from bidnerf_core.fields import (
     truncated_depth_residual,
 )
 from bidnerf_core.geometry import RobustName
-from bidnerf_core.localization import BidConfig, ColourSettings, DepthSettings, objective_of
+from bidnerf_core.localization import METHODS, BidConfig, ColourSettings, DepthSettings, objective_of
 from bidnerf_core.scenes import GaussianBlobs
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
@@ -104,7 +104,7 @@ def test_views_count_alike_however_many_of_their_pixels_were_measured() -> None:
 def test_the_papers_objective_has_hubers_loss_for_both() -> None:
     """Eq. 5 with ``rho(r) = delta (r - delta / 2)`` for depths that are 0.4 m off, and colours that agree."""
     distance = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
-    default = objective_of(BidConfig().colour, BidConfig().depth)
+    default = objective_of(BidConfig().colour, METHODS["bid"].settings("paper").depth)
     assert float(default.loss(wall(2.4), measured(distance))) == pytest.approx(0.1 * (0.4 - 0.05))
 
 
@@ -129,11 +129,10 @@ def random_rendering() -> Rendering:
 
 @pytest.mark.parametrize("loss", ["huber", "l2", "l1", "cauchy", "geman-mcclure"])
 @pytest.mark.parametrize("free", [0.0, 0.7])
-@pytest.mark.parametrize("miss", [None, 3.0])
-def test_the_loss_is_the_weighted_sum_of_rho(loss: RobustName, free: float, miss: float | None) -> None:
+def test_the_loss_is_the_weighted_sum_of_rho(loss: RobustName, free: float) -> None:
     """Adam takes ``loss``, Levenberg-Marquardt takes residuals, weights and rho: both minimise one function."""
     colour, depth = ColourSettings(loss, 0.2), DepthSettings(2.5, loss, 0.3, free_space_weight=free)
-    whole = objective_of(colour, depth, miss_scales=miss)
+    whole = objective_of(colour, depth)
     pixels, rendering = measured(SOME), random_rendering()
     weights = whole.weights(pixels)
     total = (weights * whole.rho(whole.residuals(rendering, pixels))).sum()
@@ -171,7 +170,7 @@ def test_a_depth_residual_of_ones_own_is_named_by_a_setting(monkeypatch: pytest.
         return (rendering.distance - observed.distance) / 2
 
     monkeypatch.setitem(DEPTH_RESIDUALS, "halved", halved)
-    found = objective_of(ColourSettings(), DepthSettings(depth_residual="halved"))
+    found = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1, depth_residual="halved"))
     pixels = measured(SOME)
     torch.testing.assert_close(
         found.residuals(wall(2.4), pixels)[..., 3], torch.where(SOME > 0, torch.tensor(0.2), 0.0)
@@ -227,7 +226,7 @@ def test_the_first_surface_is_compared_where_there_is_one() -> None:
 
 
 def test_light_that_passes_through_matter_is_penalised() -> None:
-    term = objective_of(ColourSettings("l2"), DepthSettings(0.0, "l2", opacity_weight=2.0))
+    term = objective_of(ColourSettings("l2"), DepthSettings(0.0, "l2", 0.1, opacity_weight=2.0))
     pixels, half = pixel_at(2.0), replace(silhouette(0.9), opacity=torch.full((1,), 0.5, dtype=torch.float64))
     assert term.uses_depth
     assert float(term.loss(half, pixels)) == pytest.approx(2.0 * 0.5 * 0.5**2)

@@ -32,8 +32,6 @@ from bidnerf_core.localization import (
     Problem,
     RayStage,
     RayTerms,
-    States,
-    descend,
     rig,
     states_at,
 )
@@ -50,6 +48,7 @@ from bidnerf_core.localization.terms.images import (
 )
 from bidnerf_core.localization.terms.rays import averaged
 from bidnerf_core.localization.terms.rendering import differentiate
+from bidnerf_core.mapping import States, descend
 from bidnerf_core.scenes import GaussianBlobs, orbit
 from problems import FieldMap
 from tiny import depth_rays_of
@@ -112,7 +111,9 @@ def test_the_gradient_by_rays_is_the_numerical_one(
 ) -> None:
     """Fields are float32, and the intervals that are sampled, which have no derivative, move with the rays."""
     monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
-    terms = RayTerms(ColourSettings("cauchy"), DepthLossSettings(depth_loss="cauchy") if depth else None, exposure)
+    terms = RayTerms(
+        ColourSettings("cauchy"), DepthLossSettings(depth_loss="cauchy") if depth else None, exposure
+    )
     rays = terms.term(problem(field), RayStage(1, 300), 0)
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
@@ -128,7 +129,9 @@ def test_derivatives_of_rays_are_those_of_autograd_ray_by_ray(
 ) -> None:
     monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
     generator = torch.Generator().manual_seed(0)
-    directions = T0.to(torch.float32).rotate(CAMERA.rays(CAMERA.pixel_centres().reshape(-1, 2)[::97])[0].float())
+    directions = T0.to(torch.float32).rotate(
+        CAMERA.rays(CAMERA.pixel_centres().reshape(-1, 2)[::97])[0].float()
+    )
     origins = T0.translation.float() + 0.1 * torch.rand(directions.shape, generator=generator)
     rays = BOUNDS.rays(origins, directions)
     found = differentiate(field, rays, BOUNDS.background, lambda seen, _: seen.rgb)

@@ -65,7 +65,7 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
         found.append(replay is not step)
         return replay
 
-    monkeypatch.setattr("bidnerf_core.localization.solvers.adam.captured", noted)
+    monkeypatch.setattr("bidnerf_core.localization.adam.captured", noted)
     return found
 
 
@@ -78,7 +78,7 @@ def test_replayed_steps_are_those_that_are_launched(
     field = backend.build(backend.config_type(), BOUNDS)
     replayed = descent(field, BOUNDS, method)
     assert captures == [True]
-    monkeypatch.setattr("bidnerf_core.localization.solvers.adam.captured", lambda step, *_: step)
+    monkeypatch.setattr("bidnerf_core.localization.adam.captured", lambda step, *_: step)
     launched = descent(field, BOUNDS, method)
     assert len(replayed) == len(launched) == 51
     torch.testing.assert_close(replayed, launched, rtol=0, atol=1e-4)

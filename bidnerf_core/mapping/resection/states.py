@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.devices import constant
 from bidnerf_core.geometry import SE3
 
 NUISANCES = (
@@ -217,7 +218,7 @@ def rays_by_camera(rays: Float[Tensor, "h m 3"], states: States) -> Float[Tensor
     one, zero = torch.ones_like(flat[..., :1]), torch.zeros_like(flat[..., :1])
     square = flat.square().sum(-1, keepdim=True)
     columns = [
-        flat, torch.cat([one, zero], -1), torch.cat([zero, one], -1), flat * square, flat * flat.new_tensor([0.5, -0.5]),
+        flat, torch.cat([one, zero], -1), torch.cat([zero, one], -1), flat * square, flat * constant((0.5, -0.5), flat),
         torch.cat([flat[..., 1:], zero], -1),
     ]  # fmt: skip
     found = -torch.stack(columns, -1) * states.deviation[:, None, None, CAMERA]
