@@ -67,9 +67,12 @@ BOUNDS = (
 """The bounds of a pose by landmarks, the most serious reason first."""
 
 
-def accept(evidence: Evidence) -> Verdict:
-    """Return the first bound that is not kept, or else whether the pose is likely to be right."""
-    confidence = model().probability(features(evidence))
+def accept(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
+    """Return the first bound that is not kept, or else whether the pose is likely to be right.
+
+    ``log_odds`` are those of the pose before its image was seen, relative to an image that may have been taken anywhere.
+    """
+    confidence = model().probability(features(evidence), log_odds)
     for bound in BOUNDS:
         value = getattr(evidence, bound.measure)
         if bound.measure == "log10_nfa":
@@ -112,9 +115,9 @@ class LogisticModel:
     weights: dict[str, float]
     bias: float
 
-    def probability(self, values: dict[str, float]) -> float:
-        """Return the probability for features by name."""
-        log_odds = self.bias + sum(weight * values[name] for name, weight in self.weights.items())
+    def probability(self, values: dict[str, float], prior: float = 0.0) -> float:
+        """Return the probability for features by name; ``prior`` is added to the log odds."""
+        log_odds = prior + self.bias + sum(weight * values[name] for name, weight in self.weights.items())
         return 1 / (1 + math.exp(-min(max(log_odds, -500), 500)))
 
 

@@ -477,7 +477,7 @@ def test_a_misstated_camera_of_the_map_is_corrected_in_all_frames_and_a_right_on
     tracker, right = Tracker(localizer), flight()[4:6]
     answers = tracked(wrong, tracker)
     assert_right(answers, wrong)
-    assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 0.97] * 4, rel=1e-6)
+    assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 0.97] * 4, rel=1e-4)
     if approximate:  # a stated one is taken for the same camera that has refocused
         answers = tracked(right, tracker)
         assert_right(answers, right)

@@ -103,6 +103,10 @@ TYPICAL_ERRORS = 4.5
 """Maximum standard deviation of a position without colours, in median errors of the map's own images."""
 LEAST_CORNERS, LEAST_SHARE, SIGNIFICANT_NFA = 20, 0.5, -6.0
 """Minimum number and fraction of the corners that agree on a motion, and maximum log10 of its number of false alarms."""
+FOLLOWS = 4.0
+"""Log odds that a pose is right if none of an image was rejected before it: one in fifty is wrong, far more than tracked sequences
+show.
+"""
 LEAST_CHANCE = 0.5
 """Lower limit of the number of points recognised by chance, since it is estimated from few counts."""
 FIRST_FULL_SEARCH = 4
@@ -383,7 +387,7 @@ class Tracker:
             later = CorrectedCamera(frame.intrinsics, found.intrinsics, frame.focal_is_approximate)
             camera = camera.then(later) if camera is not None and camera.applies_to(frame) else later
             frame = later.corrected(frame)
-        state = replace(state, points=Points.none(), camera=camera)
+        state = replace(state, points=Points.none(), camera=camera, searchable=0)
         measured = self.measure(frame, image, state, motion)
         if measured is not None and measured.verdict.accepted:
             reason = f"{reason}; {measured.verdict.reason}"
@@ -561,7 +565,7 @@ class Tracker:
             mass=fused.mass(fit.distance, 0 * covariance, TOLERANCE, ANGLE, one > 0),
             other_place=0.0, credible=1.0, replaced=0.0, searched=True,
         )  # fmt: skip
-        verdict = accept(evidence)
+        verdict = accept(evidence, 0.0 if state.searchable else FOLLOWS)
         if verdict.accepted and not fit.is_recognised and not fit.is_accurate:
             verdict = Verdict(Outcome.AMBIGUOUS, f"{verdict.reason}, hardly better than by chance")
         if fit.is_recognised:
