@@ -58,7 +58,6 @@ from .resection.descend import total as total
 from .resection.descend import unit_of as unit_of
 from .resection.reprojection import LEAST_NOISE as LEAST_NOISE
 from .resection.reprojection import MAD as MAD
-from .resection.reprojection import SCALE as SCALE
 from .resection.reprojection import Landmarks as Landmarks
 from .resection.reprojection import point_variance as point_variance
 from .resection.resection import resections as resections
