@@ -52,13 +52,13 @@ from .resection.descend import Quadratic as Quadratic
 from .resection.descend import Term as Term
 from .resection.descend import damped_solution as damped_solution
 from .resection.descend import descend as descend
+from .resection.descend import log_det as log_det
 from .resection.descend import log_evidence as log_evidence
 from .resection.descend import prior as prior
 from .resection.descend import total as total
 from .resection.descend import unit_of as unit_of
 from .resection.reprojection import LEAST_NOISE as LEAST_NOISE
 from .resection.reprojection import MAD as MAD
-from .resection.reprojection import SCALE as SCALE
 from .resection.reprojection import Landmarks as Landmarks
 from .resection.reprojection import point_variance as point_variance
 from .resection.resection import resections as resections
@@ -71,6 +71,7 @@ from .resection.states import P as P
 from .resection.states import Sights as Sights
 from .resection.states import States as States
 from .resection.states import imaged as imaged
+from .resection.states import jacobian as jacobian
 from .resection.states import pinhole as pinhole
 from .resection.states import project as project
 from .resection.states import rays_by_camera as rays_by_camera

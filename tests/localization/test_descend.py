@@ -11,8 +11,6 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3, skew
 from bidnerf_core.localization import states_at
-
-# Inside: the model of a term, from which a step follows
 from bidnerf_core.mapping import Normal, P, States, descend
 
 GENERATOR = torch.Generator().manual_seed(0)

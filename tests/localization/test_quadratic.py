@@ -13,10 +13,7 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from bidnerf_core import SE3
-from bidnerf_core.mapping import NUISANCES, Normal, Quadratic, States, descend, log_evidence, total
-
-# Inside: determinants of what is not positive, which no evidence shows
-from bidnerf_core.mapping.resection.descend import log_det
+from bidnerf_core.mapping import NUISANCES, Normal, Quadratic, States, descend, log_det, log_evidence, total
 
 P = 6 + len(NUISANCES)
 Term = Callable[[States], Normal]

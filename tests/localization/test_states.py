@@ -27,10 +27,10 @@ from bidnerf_core.mapping import (
     States,
     Surfels,
     imaged,
+    jacobian,
     project,
     rays_through,
 )
-from bidnerf_core.mapping.resection.states import jacobian
 from bidnerf_core.testing import textured_map, training_views, unseen
 
 CAMERA = Intrinsics(310.0, 290.0, 190.0, 160.0, 400, 300, (0.05, -0.02, 0.001, 0.002))

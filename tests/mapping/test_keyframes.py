@@ -11,7 +11,7 @@ import torch
 from bidnerf_core import View
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified
-from bidnerf_core.localization import LandmarkMatcher, propose
+from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
 
 # Inside: the limits on the number and size of keyframes, which a map does not state
@@ -58,9 +58,9 @@ def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
 def test_landmarks_of_keyframes_find_a_photo() -> None:
     """They stand in for the photos of a map that came without."""
     views = rendered_views(ground(), BOUNDS, [(CAMERA, view.T_ref_camera) for view in training_views()[:6]])
-    found = propose(LandmarkMatcher(build_landmarks(views)), [unseen()])
+    found = Loop([unseen()], LandmarkMatcher(build_landmarks(views)))()
     assert found is not None
-    assert_near(found.T_world_camera, unseen().T_ref_camera, 0.02, 0.5)
+    assert_near(found.T_world_rig, unseen().T_ref_camera, 0.02, 0.5)
 
 
 def brighter(views: tuple[View, ...], by: float) -> list[View]:

@@ -23,7 +23,6 @@ EXCEPTIONS = {
     "tests/fields/test_hits.py": "the derivatives of a solver through the layers of a field that only these tests have",
     "tests/frames/test_masks.py": "hides pixels from everything that reads them, in whichever package",
     "tests/frames/test_pixel_store.py": "the memory that reading photos takes, which five packages share",
-    "tests/localization/test_call_counts.py": "counts how often keypoints are detected, in captures as in queries",
     "tests/maps/test_interrupted_saves.py": "interrupts every writer of files, in whichever package",
     "tests/maps/test_map_collections.py": "a worker of the service searches the collection that its maps form",
     "tests/robustness/harness.py": "loads the commands before it forks processes that run them",

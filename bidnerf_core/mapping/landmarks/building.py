@@ -63,9 +63,8 @@ TWO_VIEW_TOLERANCE = 1.5
 def pose_scatter(tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "6 6"]:
     """Return the covariance of the right updates from given to resected poses; zero if there are too few images.
 
-    The points from which an image is resected were triangulated from it as well,
-    so its pose scatters too little: with k views of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image.
-    The updates are rescaled accordingly.
+    The points from which an image is resected were triangulated from it as well, so its pose scatters too little: with k views
+    of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image. The updates are rescaled accordingly.
     """
     return update_scatter(list(pose_updates(tracked, positions).values()))
 

@@ -149,9 +149,12 @@ class Landmarks:
 class UncertainPoints(Protocol):
     """World points (n) with the errors of their positions, as in a ``LandmarkMap``."""
 
-    positions: Float[Tensor, "n 3"]
-    deviations: Float[Tensor, "n 2"]
-    directions: Float[Tensor, "n 3"]
+    @property
+    def positions(self) -> Float[Tensor, "n 3"]: ...
+    @property
+    def deviations(self) -> Float[Tensor, "n 2"]: ...
+    @property
+    def directions(self) -> Float[Tensor, "n 3"]: ...
 
 
 def point_variance(
