@@ -21,7 +21,7 @@ from bidnerf_core.localization.matching import (
     Projected,
     log10_nfa,
 )
-from bidnerf_core.localization.posterior import Posterior, normal_draws
+from bidnerf_core.localization.posterior import Posterior
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
 from bidnerf_core.localization.query import Query
@@ -64,8 +64,6 @@ TOLERANCE, ANGLE = 0.03, 0.05
 """Within which the pose must be: relative to the distance of the scene, and radians."""
 SHARPEST = 0.04
 """Colour noise of a field on its training images above which its rays add nothing to the landmarks."""
-VAGUE, STARTS, COMPARED_RAYS = 1.5, 63, 128
-"""The same in pixels from which poses drawn around the most probable one are compared, and how many, on how many rays."""
 RAYS_BEYOND = 0.6
 """Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them."""
 HEAVY_TAILS = 1.7
@@ -363,11 +361,9 @@ class Loop:
             quadratic = self._linearized(best, terms, given)
             found = self._posterior(quadratic, landmarks, given)
         before = found  # rays about one camera's pose must not decide between cameras
-        blur = self._blur(found, landmarks)
-        if problem is not None and self.rays and found.mode == 0 and blur > RAYS_BEYOND:
+        blurred = self._blur(found, landmarks) > RAYS_BEYOND
+        if problem is not None and self.rays and found.mode == 0 and blurred:
             here = found.chosen
-            if blur > VAGUE:
-                here = self._sharpened(found, problem)
             rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed).fitted(here)
             fused.append("rendering")
             here, _ = descend(here, [*terms, rays], 4)
@@ -384,21 +380,6 @@ class Loop:
         mass = min(self._mass(each, landmarks, given) for each in (found, before))
         answer = self._judged(found, mass, modes, landmarks, given, searched, others)
         return replace(answer, fused=tuple(fused))
-
-    def _sharpened(self, found: Posterior, problem: Problem) -> States:
-        """Return the most probable of some draws from the posterior, by rendered rays too: their basin is narrower than a vague pose."""
-        factor, failed = torch.linalg.cholesky_ex(found.mixture())
-        if int(failed):
-            return found.chosen
-        draws = normal_draws()[:STARTS]
-        steps = torch.cat([torch.zeros_like(draws[:1]), draws @ factor.mT])
-        here = found.chosen
-        many = here[torch.zeros(len(steps), dtype=torch.long)]
-        many = many.retract(torch.cat([steps, torch.zeros_like(many.z)], -1))
-        few = Rays.of(problem.views, problem.field, problem.bounds, COMPARED_RAYS, self.seed).fitted(here)
-        cost = few.independent / (len(few) + few.independent) * few.costs(many).sum(-1)
-        cost[1:] += 0.5 * draws.square().sum(-1)
-        return many[cost.argmin()[None]]
 
     def _mass(self, found: Posterior, term: Landmarks, given: Explanations) -> float:
         """Return the probability that the pose is within the tolerance, and its camera credible."""
