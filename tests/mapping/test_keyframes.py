@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core import View
+from bidnerf_core import SE3, View
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, Loop
@@ -58,7 +58,7 @@ def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
 def test_landmarks_of_keyframes_find_a_photo() -> None:
     """They stand in for the photos of a map that came without."""
     views = rendered_views(ground(), BOUNDS, [(CAMERA, view.T_ref_camera) for view in training_views()[:6]])
-    found = Loop([unseen()], LandmarkMatcher(build_landmarks(views)))()
+    found = Loop([View(unseen().frame, SE3.identity())], LandmarkMatcher(build_landmarks(views)))()
     assert found is not None
     assert_near(found.T_world_rig, unseen().T_ref_camera, 0.02, 0.5)
 
