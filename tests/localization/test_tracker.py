@@ -131,7 +131,7 @@ def test_frames_that_come_slowly_are_all_searched() -> None:
 def test_a_camera_that_is_carried_elsewhere_is_lost_and_found() -> None:
     """The motion cannot be foreseen, so no answer may follow the prediction."""
     elsewhere = [
-        (t, view(flight_pose(n + 60), f"far {n}").frame, flight_pose(n + 60))
+        (t, view(flight_pose(n + 30), f"far {n}").frame, flight_pose(n + 30))
         for n, (t, _, _) in enumerate(flight()[6:10], 6)
     ]
     frames = [*flight()[:6], *elsewhere]

@@ -223,11 +223,10 @@ class Tracker:
         self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None
     ) -> None:
         """Track in the map of ``localizer``, which must have distances. ``start`` is a guess at the first T_world_camera."""
-        if not isinstance(localizer, Localizer):
-            hint = "; Localizer(map) makes one" if isinstance(localizer, SceneMap) else ""
-            raise InputError(
-                f"got a {type(localizer).__name__}", where="Tracker", expected=f"a Localizer{hint}"
-            )
+        given: object = localizer
+        if not isinstance(given, Localizer):
+            hint = "; Localizer(map) makes one" if isinstance(given, SceneMap) else ""
+            raise InputError(f"got a {type(given).__name__}", where="Tracker", expected=f"a Localizer{hint}")
         self.localizer, self.config = localizer, TrackerConfig() if config is None else config
         self._scene = map_with_distances(localizer)
         self._state = TrackerState(Clock(None, self.config.frame_seconds))
@@ -586,17 +585,16 @@ class Tracker:
             View(frame, SE3.identity()),
             _at(predicted.T_world_camera),
         )
-        reach, term = predicted.reach, None
-        covariance = predicted.covariance
+        reach, covariance = predicted.reach, predicted.covariance
+        term: Surface | Rays | None = None
         translation, rotation = covariance.diagonal().split(3)
         off = math.sqrt(float(translation.mean() + rotation.mean() * reach**2))
         if surface is not None:
-            term = Surface.of([view], None, surface, state.frames, self.config.depth_points)
-        if term is not None and image is not None:
-            term = replace(term, colour_weight=1.0)
-        elif term is None and image is not None:
-            drawn = Rays.of([view], self._scene.field, self._scene.bounds, RAYS, state.frames)
-            term = replace(drawn, independent=ALONE)
+            drawn = Surface.of([view], None, surface, state.frames, self.config.depth_points)
+            term = drawn if drawn is None or image is None else replace(drawn, colour_weight=1.0)
+        if term is None and image is not None:
+            rays = Rays.of([view], self._scene.field, self._scene.bounds, RAYS, state.frames)
+            term = replace(rays, independent=ALONE)
         if term is None:
             return None
         if image is None and off > VAGUE * reach:
