@@ -366,7 +366,7 @@ class Loop:
             here = found.chosen
             rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed).fitted(here)
             fused.append("rendering")
-            here, _ = descend(here, [*terms, rays], 4)
+            here, _ = descend(here, [*terms, rays], 8)
             quadratic = self._linearized(States.cat([here, best[1:]]), terms, given)
             # Rays are too expensive to be rendered for all hypotheses.
             by_rays = Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
