@@ -197,7 +197,7 @@ class AutoConfig(Settings):
     refine_steps: Annotated[int, Range(0, 1000)] = 2
     refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for each of these steps
     landmarks: bool = True  # match image features with the map's landmarks first, if it has any
-    # number of rendered rays fused with landmarks; 0: nothing is rendered, for fusion or for comparing cameras or mirror images
+    # number of rendered rays fused with vague poses by landmarks; 0: nothing is rendered
     fused_rays: Annotated[int, Range(0, 10**6)] = 1024
     # the depth sensor: unknown, kinect, realsense, lidar or rendered
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
