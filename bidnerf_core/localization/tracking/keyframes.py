@@ -39,9 +39,6 @@ CELLS = 10
 MOST_IN_VIEW = 4_000
 """Number of landmarks in view, those in most images, that are compared with keypoints regardless of where they project."""
 
-UNCERTAIN = ("positions", "deviations", "directions")
-"""The parts of a landmark that describe its position."""
-
 
 def threshold_of(camera: Intrinsics) -> float:
     """Return the largest reprojection error of an inlier, pixels."""
@@ -193,5 +190,9 @@ class Recognition:
         return None if found is None else found[0].T
 
     def _points(self, matches: Matches) -> Points:
-        parts = (getattr(self.landmarks, name)[matches.landmark].double() for name in UNCERTAIN)
-        return Points(self.query.keypoints.pixels[matches.keypoint], *parts, self.number[matches.landmark])
+        found = self.landmarks
+        positions, deviations, directions = (
+            part[matches.landmark].double() for part in (found.positions, found.deviations, found.directions)
+        )
+        pixels, number = self.query.keypoints.pixels[matches.keypoint], self.number[matches.landmark]
+        return Points(pixels, positions, deviations, directions, number)

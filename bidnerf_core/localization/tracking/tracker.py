@@ -224,10 +224,10 @@ class Tracker:
     ) -> None:
         """Track in the map of ``localizer``, which must have distances. ``start`` is a guess at the first T_world_camera."""
         if not isinstance(localizer, Localizer):
-            hint = "; Localizer(map) makes one" if isinstance(localizer, SceneMap) else ""
             raise InputError(
-                f"got a {type(localizer).__name__}", where="Tracker", expected=f"a Localizer{hint}"
-            )
+                f"got a {type(localizer).__name__}", where="Tracker",
+                expected="a Localizer; Localizer(map) makes one" if isinstance(localizer, SceneMap) else "a Localizer",
+            )  # fmt: skip
         self.localizer, self.config = localizer, TrackerConfig() if config is None else config
         self._scene = map_with_distances(localizer)
         self._state = TrackerState(Clock(None, self.config.frame_seconds))
@@ -586,13 +586,13 @@ class Tracker:
             View(frame, SE3.identity()),
             _at(predicted.T_world_camera),
         )
-        reach, term = predicted.reach, None
-        covariance = predicted.covariance
+        reach, covariance = predicted.reach, predicted.covariance
+        term: Surface | Rays | None = None
         translation, rotation = covariance.diagonal().split(3)
         off = math.sqrt(float(translation.mean() + rotation.mean() * reach**2))
         if surface is not None:
             term = Surface.of([view], None, surface, state.frames, self.config.depth_points)
-        if term is not None and image is not None:
+        if isinstance(term, Surface) and image is not None:
             term = replace(term, colour_weight=1.0)
         elif term is None and image is not None:
             drawn = Rays.of([view], self._scene.field, self._scene.bounds, RAYS, state.frames)
