@@ -172,20 +172,20 @@ def explanations(
         rows.append(("exact", [0.0] * 6, (0.0,) * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
     share_moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving) if single else 0.0
-    names, means, deviations, shares, credible = [], [], [], [], []
+    names, means, deviations, shares, right = list[str](), [], [], [], list[bool]()
     for moves, share in ((False, 1 - share_moving), (True, share_moving))[: 2 if single else 1]:
         motion = [MOVE * distance] * 3 + [TURN] * 3 if moves else [0.0] * 6
-        for name, mean, deviation, odds, good in rows:
+        for name, corrections, freedoms, odds, counts in rows:
             names.append(name + (MOVING if moves else ""))
-            means.append([*mean, *[0.0] * 7])
-            deviations.append([*deviation, *motion, depth_scale])
+            means.append([*corrections, *[0.0] * 7])
+            deviations.append([*freedoms, *motion, depth_scale])
             shares.append(odds * share)
-            credible.append(good)
-    mean, deviation, share = (torch.tensor(x, dtype=torch.float64) for x in (means, deviations, shares))
+            right.append(counts)
+    mean, deviation, prior = (torch.tensor(x, dtype=torch.float64) for x in (means, deviations, shares))
     # Landmarks of this map suggest corrections of right intrinsics, too; see ``calibration_scatter``.
     if query.has_one_camera:
         deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
-    return Explanations(tuple(names), mean, deviation, share.log(), torch.tensor(credible))
+    return Explanations(tuple(names), mean, deviation, prior.log(), torch.tensor(right))
 
 
 def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:
@@ -214,8 +214,8 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
             .unique()
             .tolist()
         )
-        known = [correction_between(stated, cameras[i]) for i in chosen]
-        known = [correction for correction in known if correction is not None]
+        corrections = (correction_between(stated, cameras[i]) for i in chosen)
+        known = [correction for correction in corrections if correction is not None]
         if known:
             agreeing = [correction for correction in known if bool((correction.abs() <= 2 * nearly).all())]
             found.append((agreeing or [known[(len(known) - 1) // 2]])[0])

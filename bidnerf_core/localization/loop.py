@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, accept
 from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Seed, explanations
@@ -234,7 +235,7 @@ class Loop:
                 variance,
                 query.focal[k],
             )
-            fillers = ((0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+            fillers: list[float | tuple[float, ...]] = [(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]
             parts.append([_padded(value, m, fill) for value, fill in zip(values, fillers, strict=True)])
         points, *seen, valid, variance, focal = (torch.stack(part) for part in zip(*parts, strict=True))
         counts = [self.landmarks.correlation_of(len(mode.matches)) for mode in modes]

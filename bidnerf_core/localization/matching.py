@@ -232,7 +232,9 @@ class Projected:
         among: Projected | None = None,
     ) -> None:
         """Project landmarks up to ``margin`` pixels beyond the images' edges, ``among`` those visible from a pose nearby."""
-        self.query, self.landmarks, self.visible, self._parts = query, landmarks, 0, []
+        self.query, self.landmarks, self.visible = query, landmarks, 0
+        # Of each view: its keypoints, the landmarks, its focal length, their expected sizes in pixels, and a tree of their projections.
+        self._parts: list[tuple[Tensor, Tensor, float, Tensor, cKDTree | None]] = []
         nuisances = state.nuisances[0]
         zoom = float(nuisances[0].exp())  # host
         for number, image in enumerate(query.images):

@@ -91,9 +91,11 @@ def consensus(
             pose = poselib.CameraPose()
             pose.R, pose.t = T.rotation.numpy(), T.translation.numpy()
             poses.append(pose)
-        pixels, there, models = (list(x) for x in zip(*data, strict=True))
+        all_pixels, all_points, models = (list(x) for x in zip(*data, strict=True))
         generalized = options | {"progressive_sampling": False}
-        pose, _ = poselib.estimate_generalized_absolute_pose(pixels, there, poses, models, generalized, {})
+        pose, _ = poselib.estimate_generalized_absolute_pose(
+            all_pixels, all_points, poses, models, generalized, {}
+        )
         found.append(_transform(pose).inverse())
     scored = [
         (T, inliers(query, landmarks, matches, States.known(T, camera))) for T in found if bool(T.is_rigid())

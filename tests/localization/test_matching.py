@@ -165,7 +165,9 @@ def test_a_landmark_that_two_keypoints_claim_goes_to_the_more_similar_one() -> N
     before = projected(query(view, seen=seen), landmarks).matches(5.0)
     own = seen.seen[-1]
     nearby = replace(own[slice(0, 20)], pixels=own.pixels[:20] + 1)
-    worse = (nearby.descriptors.int() + 6 * torch.randint(-1, 2, nearby.descriptors.shape)).clamp(0, 255).byte()
+    worse = (
+        (nearby.descriptors.int() + 6 * torch.randint(-1, 2, nearby.descriptors.shape)).clamp(0, 255).byte()
+    )
     parts = [
         torch.cat([getattr(own, n), value])
         for n, value in (("pixels", nearby.pixels), ("sizes", nearby.sizes), ("descriptors", worse))

@@ -20,7 +20,6 @@ REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 EXCEPTIONS = {
     "benchmarks/paper_tables.py": "shows the progress of the command line",
     "tests/conftest.py": "does in this process what a process of a comparison does",
-    "tests/fields/test_hits.py": "the derivatives of a solver through the layers of a field that only these tests have",
     "tests/frames/test_masks.py": "hides pixels from everything that reads them, in whichever package",
     "tests/frames/test_pixel_store.py": "the memory that reading photos takes, which five packages share",
     "tests/maps/test_interrupted_saves.py": "interrupts every writer of files, in whichever package",
