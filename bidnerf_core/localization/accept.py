@@ -13,8 +13,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.settings import Range
 
-ACCEPTED = 0.8
-"""Minimum confidence of an accepted pose."""
+ACCEPTED = 0.5
+"""Minimum confidence of an accepted pose by landmarks: it is more likely right than not."""
 
 
 @dataclass(frozen=True)
