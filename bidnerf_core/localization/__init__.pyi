@@ -63,6 +63,7 @@ from .settings import ReachSettings as ReachSettings
 from .settings import TrackerConfig as TrackerConfig
 from .settings import objective_of as objective_of
 from .support import DISPLACEMENT as DISPLACEMENT
+from .support import DISTINGUISHED as DISTINGUISHED
 from .support import LEAST_EXPLAINED as LEAST_EXPLAINED
 from .support import NO_RIVAL as NO_RIVAL
 from .support import DescentDiagnostics as DescentDiagnostics

@@ -17,10 +17,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import ACCEPTED
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.result import Outcome, Verdict
 
+DISTINGUISHED = 0.8
+"""Least probability of a pose among its rivals."""
 DISPLACEMENT = 0.1
 """Displacement of rivals: a fraction of the distance to the scene, and an angle about it in radians.
 
@@ -64,7 +65,7 @@ class Support:
     def rejection(self, least_explained: float = LEAST_EXPLAINED) -> Verdict | None:
         """Return the reason why the measurements do not support the pose, or None."""
         p = self.confidence
-        if p < ACCEPTED:
+        if p < DISTINGUISHED:
             if self.plain <= min(self.displaced, self.other):
                 return Verdict(Outcome.UNDETERMINED, "a single-colour image fits about as well", p)
             if self.other < self.displaced:

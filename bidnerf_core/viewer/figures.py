@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from bidnerf_core.localization import (
     ACCEPTED,
+    DISTINGUISHED,
     BOUNDS,
     LEAST_EXPLAINED,
     DescentDiagnostics,
@@ -135,4 +136,4 @@ def _of_support(support: Support) -> Iterator[Figure]:
     meaning = (
         "its probability among poses moved a little, the best different pose of the search and a plain image"
     )
-    yield Figure.of(("distinguished from rivals", ".0%", meaning), support.confidence, ACCEPTED)
+    yield Figure.of(("distinguished from rivals", ".0%", meaning), support.confidence, DISTINGUISHED)
