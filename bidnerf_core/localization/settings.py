@@ -54,9 +54,8 @@ class DepthLossSettings(Settings):
 class DepthSettings(Settings):
     """Settings of the depth term of first-order steps, which applies where depth was measured."""
 
-    depth_weight: NotNegative = (
-        1.0  # weight of the depth term, per square metre; the photometric term has weight 1
-    )
+    # weight of the depth term, per square metre; the photometric term has weight 1
+    depth_weight: NotNegative = 1.0
     depth_loss: RobustName = "huber"  # robust loss of depth differences
     # depth difference, metres, at which outliers begin; None: 3.8 % of the scene's mean side
     depth_scale: Positive | None = None

@@ -164,9 +164,9 @@ def test_help_hides_what_experts_need(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_experts_settings_are_parsed_though_they_are_not_shown(bidnerf: Run) -> None:
     method = ["localize", "--method", "bid-lm"]
-    assert "--pivot" not in bidnerf(*method, "--help").out
-    assert "--pivot" in bidnerf(*method, "--help-all").out
-    status, _, err = bidnerf(*method, "--pivot", "camera", "no-map", "no-query")
+    assert "--search-rays" not in bidnerf(*method, "--help").out
+    assert "--search-rays" in bidnerf(*method, "--help-all").out
+    status, _, err = bidnerf(*method, "--search-rays", "64", "no-map", "no-query")
     assert status == 1
     assert "needs a start" in err
 
