@@ -393,10 +393,22 @@ def answers(records: Records) -> str:
     for name in (name for name, some in now.items() if "all" in some):
         cells = [counts[name]["all"] for counts in (before, now)]
         row: list[object] = [*name.split(", "), cells[0]["n"]]
-        row += [" / ".join(str(cell[column]) for cell in cells) for column in ("right", "strict", "accepted", "silent")]
+        row += [
+            " / ".join(str(cell[column]) for cell in cells)
+            for column in ("right", "strict", "accepted", "silent")
+        ]
         row.append(" / ".join(_seconds(cell["median_s"]) for cell in cells))
         rows.append(row)
-    head = ("scene", "input", "answers", "right", "within 1°, 0.02", "accepted", "accepted but wrong", "median CPU time")
+    head = (
+        "scene",
+        "input",
+        "answers",
+        "right",
+        "within 1°, 0.02",
+        "accepted",
+        "accepted but wrong",
+        "median CPU time",
+    )
     return _table(head, rows, records)
 
 
