@@ -722,7 +722,7 @@ def basin(records: Records) -> str:
     neutral = {"blur": "0", "box weight": "0", "candidates": "1", "free space weight": "0", "opacity weight": "0",
                "samples": "0", "wide": "1"}  # fmt: skip
     variants: list[dict[str, str]] = [
-        {}, {"wide": "2"}, {"samples": "48"}, {"opacity weight": "0.3"}, {"free space weight": "1"},
+        {}, {"wide": "2"}, {"opacity weight": "0.3"}, {"free space weight": "1"},
         {"candidates": "3"}, {"box weight": "1"}, {"box weight": "1", "candidates": "3"},
     ]  # fmt: skip
     name, sizes = "bid_reach_blender_lego", ("0.9", "1.7", "3.4")
