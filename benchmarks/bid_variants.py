@@ -53,10 +53,7 @@ SCHEDULE: dict[str, Settings] = {
 REACH: dict[str, Settings] = {
     "as is": {},
     "pixels on matter": {"candidates": 3},
-    "occupancy ignored": {"samples": 48},
     "wide": {"wide": 2.0},
-    "wide, occupancy ignored": {"wide": 2.0, "samples": 64},
-    "blurred, occupancy ignored": {"blur": 0.2, "samples": 48},
     "opacity": {"opacity_weight": 0.3},
     "free space": {"free_space_weight": 1.0},
     "points in the box": {"box_weight": 1.0},

@@ -153,24 +153,21 @@ def to_flat(settings: Any) -> dict[str, Any]:
     return flat
 
 
-def from_flat(
-    base: S | type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None
-) -> S:
+def from_flat(base: S | type[S], values: dict[str, Any], where: str) -> S:
     """Return the settings ``base`` (an instance, or a class for its defaults) updated with ``values`` by flat
     name.
 
-    ``renamed`` maps names used by earlier versions to the current ones. Raises ``InputError``, whose message
-    begins with ``where``, for an unknown name, a value of the wrong type, and a value out of range.
+    Raises ``InputError``, whose message begins with ``where``, for an unknown name, a value of the wrong type, and a value out of
+    range.
     """
     default: S = base() if isinstance(base, type) else base
     known = to_flat(default)
-    given = {(renamed or {}).get(name, name): value for name, value in values.items()}
-    for name in given:
+    for name in values:
         if name not in known:
             hint = spelling_hint(name, known)
             found = f"{type(default).__name__} has no setting {name!r}{hint}"
             raise InputError(found, where=where, expected=None if hint else f"any of {', '.join(known)}")
-    return _with_values(default, given, where)
+    return _with_values(default, values, where)
 
 
 def _with_values(default: S, flat: dict[str, Any], where: str) -> S:

@@ -386,6 +386,33 @@ def risk(records: Records) -> str:
 
 
 @table
+def answers(records: Records) -> str:
+    """The same images and maps before and after the localizer became one loop."""
+    before, now = records["answers_before"]["counts"], records["answers"]["counts"]
+    rows = []
+    for name in (name for name, some in now.items() if "all" in some):
+        cells = [counts[name]["all"] for counts in (before, now)]
+        row: list[object] = [*name.split(", "), cells[0]["n"]]
+        row += [
+            " / ".join(str(cell[column]) for cell in cells)
+            for column in ("right", "strict", "accepted", "silent")
+        ]
+        row.append(" / ".join(_seconds(cell["median_s"]) for cell in cells))
+        rows.append(row)
+    head = (
+        "scene",
+        "input",
+        "answers",
+        "right",
+        "within 1°, 0.02",
+        "accepted",
+        "accepted but wrong",
+        "median CPU time",
+    )
+    return _table(head, rows, records)
+
+
+@table
 def conditions(records: Records) -> str:
     """Queries that differ from the images of the map."""
     titles = {
@@ -695,7 +722,7 @@ def basin(records: Records) -> str:
     neutral = {"blur": "0", "box weight": "0", "candidates": "1", "free space weight": "0", "opacity weight": "0",
                "samples": "0", "wide": "1"}  # fmt: skip
     variants: list[dict[str, str]] = [
-        {}, {"wide": "2"}, {"samples": "48"}, {"opacity weight": "0.3"}, {"free space weight": "1"},
+        {}, {"wide": "2"}, {"opacity weight": "0.3"}, {"free space weight": "1"},
         {"candidates": "3"}, {"box weight": "1"}, {"box weight": "1", "candidates": "3"},
     ]  # fmt: skip
     name, sizes = "bid_reach_blender_lego", ("0.9", "1.7", "3.4")

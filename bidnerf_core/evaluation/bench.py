@@ -31,7 +31,7 @@ from bidnerf_core.evaluation.trials import (
 )
 from bidnerf_core.frames import INVERTED, HiddenColour
 from bidnerf_core.io import to_plain
-from bidnerf_core.localization import RENAMED, find_method, require_use_of_depth
+from bidnerf_core.localization import find_method, require_use_of_depth
 from bidnerf_core.progress import Cancel, Progress, ProgressCallback
 from bidnerf_core.scenes import ClosedFormData
 from bidnerf_core.settings import Range, WholeNumbers, to_flat
@@ -264,9 +264,8 @@ def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
     their defaults.
     """
     usual = to_flat(find_method(trial.method).config_type())
-    found = {RENAMED.get(name, name): value for name, value in known.settings.items()}
     for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
-        before = found.get(name, usual[name])
+        before = known.settings.get(name, usual[name])
         if before != value:
             raise InputError(message.format(name, before, value))
 

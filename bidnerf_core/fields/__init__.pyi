@@ -51,10 +51,8 @@ from .residuals import free_space_term as free_space_term
 from .residuals import masked_mean as masked_mean
 from .residuals import opacity_term as opacity_term
 from .residuals import truncated_depth_residual as truncated_depth_residual
-from .sampling import AroundDepth as AroundDepth
 from .sampling import Concentrated as Concentrated
 from .sampling import HierarchicalField as HierarchicalField
-from .sampling import HitsAroundDepth as HitsAroundDepth
 from .sampling import Importance as Importance
 from .sampling import OccupiedOnly as OccupiedOnly
 from .sampling import Resampled as Resampled

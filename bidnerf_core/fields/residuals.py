@@ -131,7 +131,6 @@ class Term:
     robust: Robust
     weight: float
     applies: Callable[[Observations], Bool[Tensor, "*p"]]  # which rays it is defined for
-    channels: int = 1
 
     def loss(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*k"]:
         """Return the weighted mean of rho over the rays (last axis) that the term applies to, summed over channels."""
@@ -152,42 +151,10 @@ class Objective:
         """
         return torch.stack([term.loss(rendering, observed) for term in self.terms]).sum(0).mean()
 
-    def residuals(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
-        """Return the residuals of all terms side by side; undefined where ``weights`` is 0."""
-        return torch.cat([term.residual(rendering, observed) for term in self.terms], -1)
-
-    def weights(self, observed: Observations) -> Float[Tensor, "k p c"]:
-        """Return the weight of each residual in the objective, for rays of shape (K images, rays); 0 excludes it."""
-        parts = []
-        for term in self.terms:
-            mask = term.applies(observed)
-            weight = term.weight * mask / (len(mask) * mask.sum(-1, keepdim=True).clamp(min=1))
-            parts.append(weight[..., None].expand(*mask.shape, term.channels))
-        return torch.cat(parts, -1)
-
-    def rho(self, residuals: Float[Tensor, "*p c"]) -> Float[Tensor, "*p c"]:
-        """Return the robust loss of each residual."""
-        return self._by_term(residuals, lambda term, part: term.robust(part))
-
-    def robust_weights(self, residuals: Float[Tensor, "*p c"]) -> Float[Tensor, "*p c"]:
-        """Return ``rho'(r) / r`` of each residual, the factors of iteratively reweighted least squares."""
-        return self._by_term(residuals, lambda term, part: term.robust.weight(part))
-
-    @property
-    def scales(self) -> list[float]:
-        """The residual of each channel above which it counts as an outlier."""
-        return [term.robust.scale for term in self.terms for _ in range(term.channels)]
-
     @property
     def uses_depth(self) -> bool:
         """Whether any term needs measured distances."""
         return any(term.applies is measured for term in self.terms)
-
-    def _by_term(
-        self, residuals: Float[Tensor, "*p c"], function: Callable[[Term, Tensor], Tensor]
-    ) -> Float[Tensor, "*p c"]:
-        parts = residuals.split([term.channels for term in self.terms], -1)
-        return torch.cat([function(term, part) for term, part in zip(self.terms, parts, strict=True)], -1)
 
 
 def coloured(observed: Observations) -> Bool[Tensor, "*p"]:
@@ -201,8 +168,8 @@ def measured(observed: Observations) -> Bool[Tensor, "*p"]:
 
 
 def colour_term(robust: Robust) -> Term:
-    """Return the photometric term, with weight 1 and three channels."""
-    return Term(colour_residual, robust, 1.0, coloured, channels=3)
+    """Return the photometric term, with weight 1."""
+    return Term(colour_residual, robust, 1.0, coloured)
 
 
 def depth_term(

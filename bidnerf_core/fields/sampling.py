@@ -66,53 +66,6 @@ class Stratified:
         return RaySamples(distances[..., :-1], distances[..., 1:], valid)
 
 
-@dataclass(frozen=True, eq=False)
-class AroundDepth:
-    """``count`` equal intervals within ``reach`` metres of the distance measured along each ray.
-
-    With a nearly correct pose they contain all matter on the ray; with a wrong one they are empty. Rays
-    without a measurement (distance 0) are sampled by ``otherwise``.
-    """
-
-    distance: Float[Tensor, "*r"]  # metres along the rays to be sampled
-    reach: float
-    count: int
-    otherwise: RaySampler
-
-    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        measured, window = self.distance > 0, _around(rays, self.distance, self.reach)
-        rest = replace(
-            rays, far=torch.where(measured, rays.near, rays.far)
-        )  # empty where a distance was measured
-        return either(measured, Stratified(self.count)(window, jitter), self.otherwise(rest, jitter))
-
-
-def _around(rays: Rays, distance: Float[Tensor, "*r"], reach: float) -> Rays:
-    """Limit rays to ``reach`` metres about the measured ``distance``; those without a measurement stay as they are."""
-    near = torch.where(distance > 0, torch.maximum(rays.near, distance - reach), rays.near)
-    far = torch.where(distance > 0, torch.minimum(rays.far, distance + reach), rays.far)
-    return replace(rays, near=near, far=torch.maximum(near, far))
-
-
-@dataclass(frozen=True, eq=False)
-class HitsAroundDepth:
-    """A field restricted to hits within ``reach`` metres of the distance measured along each ray, see ``AroundDepth``."""
-
-    field: HitField
-    distance: Float[Tensor, "*r"]  # metres along the rays to be rendered; 0 where nothing was measured
-    reach: float
-
-    @property
-    def sampler(self) -> RaySampler:
-        return self.field.sampler
-
-    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        return self.field.query(positions, directions)
-
-    def hits(self, rays: Rays) -> RayHits:
-        return self.field.hits(_around(rays, self.distance, self.reach))
-
-
 @dataclass(frozen=True)
 class OccupiedOnly:
     """The samples of another sampler, valid only in cells that may hold matter."""

@@ -23,7 +23,6 @@ from .loop import Answer as Answer
 from .loop import Loop as Loop
 from .matching import LandmarkMatcher as LandmarkMatcher
 from .methods import METHODS as METHODS
-from .methods import RENAMED as RENAMED
 from .methods import USUAL_METHOD as USUAL_METHOD
 from .methods import BidConfig as BidConfig
 from .methods import BidLmConfig as BidLmConfig

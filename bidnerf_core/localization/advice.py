@@ -41,7 +41,7 @@ ADVICE = {
         "Add depth or views.",
     ),
     Outcome.NOT_SETTLED: Advice(
-        "Newly drawn rays still ask for a step of more than 0.02.",
+        "Newly drawn rays still ask for a step of more than 0.01.",
         "Localize again from the pose, or raise `--fine-steps` and `--fine-rays`.",
     ),
     Outcome.HIGH_LOSS: Advice(

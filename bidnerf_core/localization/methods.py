@@ -105,9 +105,6 @@ METHODS: Plugins[Method] = Plugins("methods", _defects, first=("auto", "bid", "i
 USUAL_METHOD = "auto"
 """The name of the default method."""
 
-RENAMED = {"play": "surface_sigma"}
-"""Current names of renamed settings, by the names under which earlier versions stored them."""
-
 
 def find_method(name: str) -> Method:
     """Return a method by name. Raises ``PluginError`` (an ``InputError``) for an unknown name or a broken plugin."""
@@ -148,7 +145,7 @@ def settings_of(method: str, values: dict[str, Any], where: str = "config", pres
 
     Raises ``InputError``, prefixed with ``where``, for an unknown method or name, or a value that is not allowed.
     """
-    return from_flat(find_method(method).settings(preset), values, where, RENAMED)
+    return from_flat(find_method(method).settings(preset), values, where)
 
 
 # First-order methods.

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 from bidnerf_core.localization import (
     ACCEPTED,
-    DISTINGUISHED,
     BOUNDS,
+    DISTINGUISHED,
     LEAST_EXPLAINED,
     DescentDiagnostics,
     Evidence,

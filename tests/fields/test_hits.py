@@ -13,7 +13,6 @@ from torch import Tensor
 from bidnerf_core.fields import (
     FieldValues,
     HitField,
-    HitsAroundDepth,
     RayHits,
     Rays,
     Stratified,
@@ -92,16 +91,6 @@ def test_rays_that_meet_nothing_see_the_background() -> None:
     away = replace(rays(), directions=-rays().directions)
     found = render(Sheets(), away, (0.1, 0.2, 0.3))
     assert torch.allclose(found.rgb, torch.tensor([0.1, 0.2, 0.3]).double().expand_as(found.rgb))
-
-
-def test_hits_around_a_measured_depth() -> None:
-    field, along = Sheets(), rays()
-    whole = field.hits(along)
-    measured = whole.distance[:, 0].clone()
-    measured[0] = 0  # nothing was measured: the whole ray counts
-    near = HitsAroundDepth(field, measured, 0.1).hits(along)
-    assert near.valid.sum(-1).tolist() == [2, *[1] * (len(measured) - 1)]
-    assert torch.equal(near.distance[1:, 0], whole.distance[1:, 0])
 
 
 def test_the_contract_accepts_them_and_tells_what_is_wrong() -> None:

@@ -10,7 +10,6 @@ import torch
 from torch import Generator
 
 from bidnerf_core.fields import (
-    AroundDepth,
     Concentrated,
     FieldValues,
     Importance,
@@ -167,30 +166,6 @@ def test_a_surface_is_seen_where_it_is(name: str) -> None:
     errors = [float((found.distance - exact.distance).abs()[hit].median()) for found in seen]
     assert errors[0] < share * errors[1]
     assert float((seen[0].opacity - exact.opacity).abs().mean()) < 0.05
-
-
-def test_around_a_measured_depth_there_is_all_that_a_ray_meets() -> None:
-    """A ball of which the front is measured: colour and opacity as with ten times the samples on the whole ray."""
-    ball = HomogeneousBall(0.5, 200.0)
-    origins = torch.tensor([[0.0, 0, -3], [0.1, 0, -3], [0, 0.9, -3], [0.2, 0.1, -3]])
-    rays = BOUNDS.rays(origins, torch.tensor([0.0, 0, 1]).expand(4, 3))
-    front = ball.chord(rays)[0]
-    distance = torch.where(torch.tensor([True, True, False, False]), front, 0)
-    sampler = AroundDepth(distance, 0.06, 16, Stratified(640))
-    near = render(Resampled(ball, sampler), rays)
-    whole = render(Resampled(ball, Stratified(640)), rays)
-    torch.testing.assert_close(near.rgb, whole.rgb, rtol=0, atol=2e-2)
-    torch.testing.assert_close(near.distance, whole.distance, rtol=0, atol=2e-2)
-    samples = near.samples
-    assert samples.valid.sum(-1).tolist() == [16, 16, 640, 640]
-    assert bool(((samples.middles[:2] - front[:2, None]).abs()[samples.valid[:2]] < 0.06).all())
-
-
-def test_a_window_that_misses_the_scene_has_no_samples() -> None:
-    rays = BOUNDS.rays(torch.tensor([[0.0, 0, -3], [0, 0, -3]]), torch.tensor([0.0, 0, 1]).expand(2, 3))
-    samples = AroundDepth(torch.tensor([0.5, 60.0]), 0.1, 8, Stratified(4))(rays)
-    assert not bool(samples.valid.any())
-    assert bool((samples.ends >= samples.starts).all())
 
 
 # Concentration.

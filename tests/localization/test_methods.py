@@ -12,7 +12,6 @@ import torch
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, Outcome, View
 from bidnerf_core.evaluation import perturb
-from bidnerf_core.fields import Stratified
 from bidnerf_core.localization import METHODS, settings_of
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.results import pose_error
@@ -171,25 +170,16 @@ def test_an_image_of_another_exposure() -> None:
     assert not found_by("bid-lm", darker, start).converged
 
 
-def test_a_window_about_the_measured_depth_serves_as_well() -> None:
-    seen = photograph(field=replace(FIELD, sampler=Stratified(64)))  # as finely as in the window
-    start = perturb(TRUTH, 0.2, 5.0, seed=7)
-    found = found_by("bid-lm", seen, start, depth_window=0.5, window_samples=24)
-    assert off(found.T_world_camera) < 0.03
-
-
 SENSELESS = {
     "auto": {"points": 10, "hypotheses": 0, "rounds": 1000},
     "bid": {"stop_step": -1.0, "stop_loss": math.nan, "colour_scale": 0.0, "rays": 0},
     "inerf": {"stop_step": math.inf, "stop_loss": -1.0, "colour_scale": 0.0, "rays": 0},
     "bid-lm": {
-        "poses": 0, "fine_rays": 6, "coarse_steps": 0, "blur": 0, "colour_scale": 0.0, "least_weight": 1.0,
-        "surface_sigma": -1.0, "stop_step": -1e-9, "depth_scale": 0.0, "depth_window": -0.1, "centring": -1,
-        "window_samples": 0, "depth_rays": -1,
+        "poses": 0, "fine_rays": 6, "coarse_steps": 0, "blur": 0, "colour_scale": 0.0, "depth_scale": 0.0,
     },
     "inerf-lm": {
         "poses": 0, "search_poses": 0, "middle_steps": 0, "width": 3, "spread_rotation": -1.0, "fine_rays": 6,
-        "coarse_steps": 0, "colour_scale": 0.0, "least_weight": 1.0, "surface_sigma": -1.0,
+        "coarse_steps": 0, "colour_scale": 0.0,
     },
 }  # fmt: skip
 

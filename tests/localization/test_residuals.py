@@ -117,46 +117,6 @@ def test_weight_zero_uses_no_depth() -> None:
 SOME = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
 
 
-def random_rendering() -> Rendering:
-    """Return a rendering of (2, 3) rays that differs from anything measured; float64."""
-    generator = torch.Generator().manual_seed(3)
-    middles = torch.rand((2, 3, 4), generator=generator, dtype=torch.float64).cumsum(-1)
-    weights = 0.25 * torch.rand((2, 3, 4), generator=generator, dtype=torch.float64)
-    samples = RaySamples(middles, middles, torch.ones(2, 3, 4, dtype=torch.bool))
-    rgb = torch.rand((2, 3, 3), generator=generator, dtype=torch.float64)
-    return Rendering(rgb, (weights * middles).sum(-1), weights.sum(-1), weights, samples)
-
-
-@pytest.mark.parametrize("loss", ["huber", "l2", "l1", "cauchy", "geman-mcclure"])
-@pytest.mark.parametrize("free", [0.0, 0.7])
-def test_the_loss_is_the_weighted_sum_of_rho(loss: RobustName, free: float) -> None:
-    """Adam takes ``loss``, Levenberg-Marquardt takes residuals, weights and rho: both minimise one function."""
-    colour, depth = ColourSettings(loss, 0.2), DepthSettings(2.5, loss, 0.3, free_space_weight=free)
-    whole = objective_of(colour, depth)
-    pixels, rendering = measured(SOME), random_rendering()
-    weights = whole.weights(pixels)
-    total = (weights * whole.rho(whole.residuals(rendering, pixels))).sum()
-    assert float(total) == pytest.approx(float(whole.loss(rendering, pixels)), rel=1e-6)
-    assert weights.shape[-1] == len(whole.scales) == (5 if free else 4)
-
-
-@pytest.mark.parametrize("loss", ["huber", "l2", "cauchy", "geman-mcclure"])
-def test_the_robust_weights_are_the_derivative_of_rho_over_the_residual(loss: RobustName) -> None:
-    whole = objective(loss, loss, 1.0, free_space_weight=1.0)
-    residuals = torch.linspace(-0.9, 0.95, 35, dtype=torch.float64).reshape(7, 5).requires_grad_()
-    (slope,) = torch.autograd.grad(whole.rho(residuals).sum(), residuals)
-    expected = whole.robust_weights(residuals.detach()) * residuals.detach()
-    torch.testing.assert_close(slope, expected)
-
-
-def test_weights_of_what_was_not_measured_are_zero() -> None:
-    """Each view's mean over its measured rays, and the mean over the views (eq. 6)."""
-    found = objective("l2", "l2", 3.0).weights(measured(SOME))
-    torch.testing.assert_close(found[..., :3], torch.full((2, 3, 3), 1 / 6))
-    torch.testing.assert_close(found[..., 3], 3 * torch.tensor([[0.5, 0.0, 0.0], [1 / 6] * 3]))
-    assert not bool(objective("l2", "l2", 3.0).weights(measured(torch.zeros(2, 3)))[..., 3].any())
-
-
 def test_a_ray_that_meets_nothing_is_off_by_the_miss() -> None:
     pixels = measured(torch.full((2, 3), 2.0))
     torch.testing.assert_close(depth_residual(wall(2.4, 0.0), pixels, 0.3), torch.full((2, 3), 0.3))
@@ -173,7 +133,7 @@ def test_a_depth_residual_of_ones_own_is_named_by_a_setting(monkeypatch: pytest.
     found = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1, depth_residual="halved"))
     pixels = measured(SOME)
     torch.testing.assert_close(
-        found.residuals(wall(2.4), pixels)[..., 3], torch.where(SOME > 0, torch.tensor(0.2), 0.0)
+        found.terms[1].residual(wall(2.4), pixels)[..., 0], torch.where(SOME > 0, torch.tensor(0.2), 0.0)
     )
 
 

@@ -26,7 +26,6 @@ from bidnerf_core.mapping import (
     States,
     Surfels,
     imaged,
-    jacobian,
     project,
     rays_through,
 )

@@ -136,16 +136,6 @@ def test_messages_name_settings_as_users_do_and_not_the_groups_that_hold_them() 
         settings_of("auto", {"fine_rays": "x"}, "here")
 
 
-def test_settings_of_earlier_versions_are_renamed() -> None:
-    renamed = {"old_share": "share"}
-    assert from_flat(Outer, {"old_share": 0.1}, "here", renamed) == Outer(Inner(share=0.1))
-    for method in ("auto", "bid-lm", "inerf-lm"):
-        assert settings_of(method, {"play": 0.002}).__class__ is find_method(method).config_type
-        assert to_flat(settings_of(method, {"play": 0.002}))["surface_sigma"] == 0.002
-    with refused(found="BidConfig has no setting"):
-        settings_of("bid", {"play": 0.002})
-
-
 def test_settings_for_experts_are_marked() -> None:
     assert is_expert(Inner, "scale")
     assert not is_expert(Inner, "share")
