@@ -68,7 +68,7 @@ from bidnerf_core.evaluation import VERSIONS, RowStore, faulty, provenance, rand
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import write_file
-from bidnerf_core.localization import Evidence
+from bidnerf_core.localization import Evidence, Outcome, accept
 
 SEED = 0
 FRAMES = 24
@@ -547,11 +547,20 @@ def compare(paths: Sequence[Path]) -> None:
     )
 
 
+def judged_anew(row: Row) -> Row:
+    """Return an answer by landmarks with the verdict of the stored model: a new fit of it needs no new answers."""
+    if row.get("evidence") is None or row["outcome"] not in (Outcome.CONVERGED, Outcome.UNCERTAIN):
+        return row
+    found = accept(Evidence(**row["evidence"]))
+    return row | {"converged": found.accepted, "outcome": str(found.outcome), "confidence": found.confidence}
+
+
 def keep(paths: Sequence[Path]) -> None:
-    """Join files of rows into the record, and summarise it."""
+    """Join files of rows into the record, with verdicts of the stored model, and summarise it."""
     rows: dict[tuple[str, ...], Row] = {}
     for path in paths:
         rows |= read_rows(path)
+    rows = {key: judged_anew(row) for key, row in rows.items()}
     lines = (json.dumps({"key": json.dumps(key), "row": rows[key]}) + "\n" for key in sorted(rows))
     write_file(RESULTS / "answers.rows.jsonl.xz", lzma.compress("".join(lines).encode(), preset=9))
     answers = answers_of(rows)

@@ -69,7 +69,7 @@ def calibrated(rows: Sequence[Row]) -> Thresholds:
 
 
 def examples(paths: Iterable[Path]) -> tuple[list[Row], int]:
-    """Return each accepted answer that has a confidence once, and the number of accepted answers without one."""
+    """Return each accepted answer by landmarks once, and the number of the other accepted answers."""
     rows = {}
     for path in paths:
         for text in path.read_text().splitlines():
@@ -78,7 +78,7 @@ def examples(paths: Iterable[Path]) -> tuple[list[Row], int]:
                 names = dict(zip(("scene", "mode", "fault", "frame"), key, strict=True))
                 rows[tuple(key)] = stored["row"] | names | {"diagnostics": stored["row"].get("evidence")}
     accepted = [row for row in rows.values() if row["converged"]]
-    known = [row for row in accepted if row.get("confidence") is not None]
+    known = [row for row in accepted if row["diagnostics"] is not None and row["confidence"] is not None]
     return known, len(accepted) - len(known)
 
 

@@ -16,7 +16,7 @@ import torch
 from bidnerf_core.depth import find_depth_sensor
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import least_confidence
+from bidnerf_core.localization.accept import Evidence, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
 from bidnerf_core.localization.loop import Answer, Loop
 from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
@@ -170,12 +170,12 @@ def _descended(problem: Problem, seed: int, why: str) -> Localization:
 
 
 def within_risk(found: Localization, risk: float) -> Localization:
-    """Return the answer, rejected as ``uncertain`` if its confidence is unknown or lower than the risk requires."""
+    """Return the answer, rejected as ``uncertain`` if landmarks did not find it, or its confidence is lower than the risk requires."""
     least = least_confidence(risk)
-    if not found.converged or (found.confidence is not None and found.confidence >= least):
+    known = found.confidence if isinstance(found.diagnostics, Evidence) else None
+    if not found.converged or (known is not None and known >= least):
         return found
-    known = "unknown" if found.confidence is None else f"{found.confidence:.3f}"
-    why = f"the confidence is {known}, a risk of {risk:g} requires {least:.3f}"
+    why = f"the confidence is {'unknown' if known is None else format(known, '.3f')}, a risk of {risk:g} requires {least:.3f}"
     return found.rejected(Verdict(Outcome.UNCERTAIN, why, found.confidence))
 
 
