@@ -16,12 +16,13 @@ import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.files import read_file
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _T = TypeVar("_T")
 
@@ -152,6 +153,12 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
+def _is_tensor(value: Any) -> TypeGuard[Tensor]:
+    """Return whether a value is a tensor, without importing torch, which commands that compute nothing do without."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
 def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = None) -> Any:
     """Convert dataclasses to dicts and tuples to lists. Raises ``InputError`` for values that strict JSON
     cannot represent.
@@ -166,7 +173,7 @@ def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = No
         return {_key(key, where): to_plain(item, _inside(where, key), tensors) for key, item in value.items()}
     if isinstance(value, tuple | list):
         return [to_plain(item, f"{where}[{place}]", tensors) for place, item in enumerate(value)]
-    if isinstance(value, Tensor) and tensors is not None:
+    if _is_tensor(value) and tensors is not None:
         tensors[where] = value
         return {"tensor": where}
     if isinstance(value, float) and not math.isfinite(value):
@@ -243,7 +250,7 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 def converted(kind: Any, value: Any, where: str) -> Any:
     """Convert ``value``, as read from JSON, to the type ``kind``. Errors begin with ``where``."""
     origin, arguments, is_dataclass = _form(kind)
-    if kind is Any or (isinstance(value, Tensor) and isinstance(value, kind)):
+    if kind is Any or (_is_tensor(value) and isinstance(value, kind)):
         return value
     if origin is typing.Literal and any(type(value) is type(known) and value == known for known in arguments):
         return value
@@ -306,7 +313,7 @@ def _name(kind: Any) -> str:
 
 def _shown(value: Any) -> str:
     """Return a value as text on one line, truncated if it is long."""
-    text = f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else repr(value)
+    text = f"{value.dtype} {list(value.shape)}" if _is_tensor(value) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
