@@ -68,7 +68,7 @@ from bidnerf_core.evaluation import VERSIONS, RowStore, faulty, provenance, rand
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import write_file
-from bidnerf_core.localization import Evidence, Outcome, accept
+from bidnerf_core.localization import Evidence, Outcome, judge
 
 SEED = 0
 FRAMES = 24
@@ -551,7 +551,7 @@ def judged_anew(row: Row) -> Row:
     """Return an answer by landmarks with the verdict of the stored model: a new fit of it needs no new answers."""
     if row.get("evidence") is None or row["outcome"] not in (Outcome.CONVERGED, Outcome.UNCERTAIN):
         return row
-    found = accept(Evidence(**row["evidence"]))
+    found = judge(Evidence(**row["evidence"]))
     return row | {"converged": found.accepted, "outcome": str(found.outcome), "confidence": found.confidence}
 
 

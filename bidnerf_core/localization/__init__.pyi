@@ -4,6 +4,7 @@ from .accept import Bound as Bound
 from .accept import Evidence as Evidence
 from .accept import LogisticModel as LogisticModel
 from .accept import features as features
+from .accept import judge as judge
 from .adam import AdamSteps as AdamSteps
 from .adam import captured as captured
 from .advice import ADVICE as ADVICE

@@ -67,7 +67,7 @@ BOUNDS = (
 """The bounds of a pose by landmarks, the most serious reason first."""
 
 
-def accept(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
+def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     """Return the first bound that is not kept, or else whether the pose is likely to be right.
 
     ``log_odds`` are those of the pose before its image was seen, relative to an image that may have been taken anywhere.

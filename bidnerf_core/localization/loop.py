@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import Evidence, accept
+from bidnerf_core.localization.accept import Evidence, judge
 from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Seed, explanations
 from bidnerf_core.localization.matching import (
     STRONGEST,
@@ -456,7 +456,7 @@ class Loop:
             replaced=float(found.probability[~given.usual[row]].sum()),
             precision=min(position / distance, 1.0), mass=mass, searched=searched, **others,
         )  # fmt: skip
-        verdict = accept(evidence)
+        verdict = judge(evidence)
         if mode.name == MIRROR and verdict.outcome is not Outcome.TOO_FEW_MATCHES:
             verdict = Verdict(
                 Outcome.MIRRORED, f"the mirror image has {count} landmark inliers", verdict.confidence

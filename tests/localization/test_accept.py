@@ -24,7 +24,7 @@ from bidnerf_core.localization import (
 )
 
 # Inside: the verdict of a record of evidence, and the model without any answer
-from bidnerf_core.localization.accept import accept, least_confidence
+from bidnerf_core.localization.accept import judge, least_confidence
 from bidnerf_core.localization.auto import within_risk
 from localizations import answer
 from refusals import refused
@@ -52,7 +52,7 @@ def beyond(bound: Bound, by: float) -> Evidence:
 
 
 def test_what_keeps_all_bounds_is_accepted() -> None:
-    found = accept(SOUND)
+    found = judge(SOUND)
     assert found.outcome is Outcome.CONVERGED
     assert found.reason == "200 landmark inliers"
 
@@ -60,7 +60,7 @@ def test_what_keeps_all_bounds_is_accepted() -> None:
 @pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.measure)
 def test_each_bound_alone_rejects_with_its_outcome_and_reason(bound: Bound) -> None:
     step = 1 if bound.measure == "inliers" else 1e-3 * abs(bound.limit)
-    within, out = accept(beyond(bound, -step)), accept(beyond(bound, step))
+    within, out = judge(beyond(bound, -step)), judge(beyond(bound, step))
     assert within.accepted, within.reason
     assert out.outcome is bound.outcome
     first, last = (part.strip() for part in (bound.reason.split("{")[0], bound.reason.split("}")[-1]))
@@ -72,7 +72,7 @@ def test_each_bound_alone_rejects_with_its_outcome_and_reason(bound: Bound) -> N
 def test_what_is_not_a_number_is_not_accepted(bound: Bound) -> None:
     if bound.measure != "inliers":
         name = "by_chance" if bound.measure == "above_chance" else bound.measure
-        assert not accept(replace(SOUND, **{name: math.nan})).accepted
+        assert not judge(replace(SOUND, **{name: math.nan})).accepted
 
 
 def test_of_several_reasons_the_most_serious_is_stated() -> None:
@@ -83,12 +83,12 @@ def test_of_several_reasons_the_most_serious_is_stated() -> None:
             for field in fields(Evidence)
             if getattr(part, field.name) != getattr(SOUND, field.name)
         }
-        assert accept(replace(SOUND, **both)).outcome is one.outcome
+        assert judge(replace(SOUND, **both)).outcome is one.outcome
 
 
 def test_a_pose_that_landmarks_only_confirm_needs_no_matches_by_descriptors() -> None:
-    assert not accept(replace(SOUND, log10_nfa=0.0)).accepted
-    assert accept(replace(SOUND, log10_nfa=0.0, searched=False)).accepted
+    assert not judge(replace(SOUND, log10_nfa=0.0)).accepted
+    assert judge(replace(SOUND, log10_nfa=0.0, searched=False)).accepted
 
 
 # Confidence
@@ -96,7 +96,7 @@ def test_a_pose_that_landmarks_only_confirm_needs_no_matches_by_descriptors() ->
 
 def test_an_unlikely_answer_is_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(import_module("bidnerf_core.localization.accept"), "model", lambda: UNSURE)
-    found = accept(SOUND)
+    found = judge(SOUND)
     assert found.outcome is Outcome.UNCERTAIN
     assert found.confidence == pytest.approx(1 / (1 + math.e))
     assert found.confidence is not None

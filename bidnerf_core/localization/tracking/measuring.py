@@ -14,7 +14,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import DepthSensorModel
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
-from bidnerf_core.localization.accept import Evidence, accept
+from bidnerf_core.localization.accept import Evidence, judge
 from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, STATED, TURN
 from bidnerf_core.localization.loop import ANGLE, TOLERANCE
 from bidnerf_core.localization.matching import log10_nfa
@@ -366,7 +366,7 @@ class Measurer:
             mass=fused.mass(fit.distance, 0 * covariance, TOLERANCE, ANGLE, one > 0),
             other_place=0.0, credible=1.0, replaced=0.0, searched=True,
         )  # fmt: skip
-        verdict = accept(evidence, 0.0 if state.searchable else FOLLOWS)
+        verdict = judge(evidence, 0.0 if state.searchable else FOLLOWS)
         if verdict.accepted and not fit.is_recognised and not fit.is_accurate:
             verdict = Verdict(Outcome.AMBIGUOUS, f"{verdict.reason}, hardly better than by chance")
         if fit.is_recognised:
