@@ -169,17 +169,16 @@ def levels(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_largest_calibrated_risk_below_the_tolerated_one_counts(risk: float, least: float) -> None:
     assert least_confidence(risk) == least
     assert AutoConfig(risk=risk).risk == risk
-    assert within_risk(answer(confidence=least), risk).converged
-    unsure = within_risk(answer(confidence=least - 0.001), risk)
+    assert within_risk(replace(answer(confidence=least), diagnostics=SOUND), risk).converged
+    unsure = within_risk(replace(answer(confidence=least - 0.001), diagnostics=SOUND), risk)
     assert unsure.outcome is Outcome.UNCERTAIN
     assert unsure.confidence == least - 0.001
 
 
 @pytest.mark.usefixtures("levels")
-def test_an_answer_without_a_confidence_is_not_accepted_at_any_risk_and_a_rejection_stays_what_it_is() -> (
-    None
-):
-    assert within_risk(answer(), 0.1).outcome is Outcome.UNCERTAIN
+def test_an_answer_without_landmarks_is_not_accepted_at_any_risk_and_a_rejection_stays_what_it_is() -> None:
+    for found in (answer(), answer(confidence=0.99)):
+        assert within_risk(found, 0.1).outcome is Outcome.UNCERTAIN
     found = answer(outcome=Outcome.MIRRORED, confidence=0.99)
     assert within_risk(found, 0.1) is found
 
