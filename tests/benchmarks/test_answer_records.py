@@ -50,7 +50,7 @@ def answered(T: SE3, converged: bool = True) -> Any:
     covariance = torch.eye(6, dtype=torch.float64) / 3
     return SimpleNamespace(
         T_world_camera=T, covariance=covariance, converged=converged, outcome="converged", reason="said so",
-        confidence=0.9,
+        confidence=0.9, diagnostics=None,
     )  # fmt: skip
 
 
