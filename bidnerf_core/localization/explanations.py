@@ -161,7 +161,7 @@ def explanations(
             share *= TRUST_AS_MAP if as_map and name != "exact" else 1
             rows.append((name, [0.0] * 6, (focal, centre, centre, k1, aspect, skew), share, credible))
         for c in known:
-            if bool((c.abs() > nearly).any()):
+            if query.approximate or bool((c.abs() > nearly).any()):
                 similar = bool((c.abs() <= torch.tensor(SIMILAR)).all())
                 odds = ODDS_OF_MAP if similar else ODDS_OF_OTHER
                 for name, focal, centre, k1, aspect, skew, share in OF_MAP:
