@@ -106,7 +106,7 @@ def _by_own_landmarks(
     found = {}
     for number, update in updates.items():
         own = scatter * max(1.0, usual / float(count[number]))
-        deviations = float((update @ torch.linalg.solve(own, update)).clamp(min=0).sqrt())
+        deviations = float((update @ torch.linalg.pinv(own, hermitian=True) @ update).clamp(min=0).sqrt())
         distance = float(depth[image == number].median())
         found[number] = Relocation(update, deviations, image_motion(update, views[number], distance))
     return found

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import StoredCamera
@@ -41,7 +42,10 @@ def open_ground(
     """Let commands open the ground, whatever folder they name. ``assumed``: the landmarks' cameras, if given."""
     known = textured_map(surface=True)
     assert known.landmarks is not None
-    landmarks = replace(known.landmarks, cameras=assumed) if assumed else known.landmarks
+    landmarks = known.landmarks
+    if assumed:  # as if trial photos by that camera had been localized in the map
+        scatter = torch.full((4,), 0.001, dtype=torch.float64)
+        landmarks = replace(landmarks, cameras=assumed, calibration_scatter=scatter)
     ground = StoredGround(known.field, known.bounds, landmarks, known.surface, cameras=tuple(cameras))
     for command in ("localize", "track"):
         patch.setattr(f"bidnerf_core.cli.{command}.load_map", lambda folder: ground)
