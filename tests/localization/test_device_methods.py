@@ -53,7 +53,8 @@ def same(here: Localization, there: Localization, tolerance: float = 1e-6) -> No
     torch.testing.assert_close(
         there.T_world_camera.matrix(), here.T_world_camera.matrix(), rtol=0, atol=tolerance
     )
-    assert (there.outcome, there.steps) == (here.outcome, here.steps)
+    assert there.outcome is here.outcome
+    assert abs(there.steps - here.steps) <= 1  # rounding may end a descent a step earlier
     tensors = (there.losses, there.poses.matrix(), there.covariance)
     assert all(part is None or part.device == torch.device("cpu") for part in tensors)
 
