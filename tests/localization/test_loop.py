@@ -260,7 +260,7 @@ GROUND: dict[str, tuple[Any, Expected]] = {
     "occluder, RGB-D": (lambda: noisy("occluder:0.25", True), Right(metres=0.0085, degrees=0.18)),
     "principal point": (lambda: noisy("principal-point:5", False, 2), Right("map", False, 0.012, 0.32)),
     "stretched": (lambda: noisy("stretch:1.33"), MAP._replace(degrees=0.18)),
-    "nominal, 1.1": (lambda: noisy("nominal+focal:1.1"), Right(None, metres=0.03, degrees=0.5)),
+    "nominal, 1.1": (lambda: noisy("nominal+focal:1.1"), Right(None, metres=0.04, degrees=0.6)),
     "moving rows": (lambda: noisy("rolling-shutter:2"), Right("given", True, 0.022, 0.69)),
     "mirrored": (lambda: noisy("mirror"), Outcome.MIRRORED),
     "blurred 1": (lambda: noisy("blur:1"), Right(metres=0.01, degrees=0.21)),
@@ -276,7 +276,7 @@ GROUND: dict[str, tuple[Any, Expected]] = {
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 1.02, not rendered": (
-        lambda: {"views": stated(unseen(), 1.02), "config": NOT_RENDERED}, Right(None, metres=0.03, degrees=0.5),
+        lambda: {"views": stated(unseen(), 1.02), "config": NOT_RENDERED}, Right(None, metres=0.04, degrees=0.6),
     ),
     "focal 1.02, rendered": (
         lambda: {"views": stated(unseen(), 1.02), "config": SHARP}, MAP._replace(metres=0.02),
