@@ -99,13 +99,16 @@ def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
     large = bn.load_map(map_folder).scaled(2.0)
     old = [replace(v, frame=replace(v.frame, depth=None), T_ref_camera=bn.SE3(v.T_ref_camera.rotation, 2 * v.T_ref_camera.translation))
            for v in training_views()[:7]]  # fmt: skip
-    after = bn.extend(large, training_views()[7:8], old, steps=STEPS, config=BAKE)
+    new = training_views()[7]
+    assert new.frame.depth is not None
+    new = replace(new, frame=replace(new.frame, depth=2 * new.frame.depth))
+    after = bn.extend(large, [new], old, steps=STEPS, config=BAKE)
     assert len(after.info.cameras) == 8
     assert after.folder is None
     truth = training_views()[7].T_ref_camera.translation
     assert float((after.info.cameras[7].pose.translation - 2 * truth).norm()) < 0.06
     with refused(where="map in memory", found="none of the images that the map was built from"):
-        bn.extend(large, training_views()[7:8], [replace(old[0], frame=replace(old[0].frame, name="z"))])
+        bn.extend(large, [new], [replace(old[0], frame=replace(old[0].frame, name="z"))])
 
 
 def test_photos_that_cannot_be_read_are_left_out(
@@ -140,7 +143,7 @@ def test_what_is_no_photo_is_refused(stored: Path, photos: object, found: str, e
 def test_the_command(bidnerf: Run, map_folder: Path, tmp_path: Path) -> None:
     bn.write_transforms(
         tmp_path / "new",
-        {"train": [replace(v, frame=replace(v.frame, depth=None)) for v in training_views()[7:9]]},
+        {"train": list(training_views()[7:9])},
     )
     status, out, err = bidnerf("extend", map_folder, tmp_path / "new", "--steps", STEPS)
     assert status == 0, err

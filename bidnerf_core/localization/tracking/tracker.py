@@ -17,7 +17,7 @@ from bidnerf_core.localization.auto import localization_of, unrecognized, within
 from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
 from bidnerf_core.localization.loop import Loop
-from bidnerf_core.localization.problem import SceneMap, unit_of
+from bidnerf_core.localization.problem import SceneMap, origin_of, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey
@@ -65,7 +65,8 @@ class Tracker:
         self.localizer, self.config = localizer, TrackerConfig() if config is None else config
         self._scene = map_with_distances(localizer)
         self._state = TrackerState(Clock(None, self.config.frame_seconds))
-        self._start = None if start is None else start_pose(start)
+        self._origin = origin_of(self._scene)
+        self._start = None if start is None else start_pose(start).translated(-self._origin)
         matcher = localizer.matcher if localizer.matches_landmarks else None
         self._landmarks = None if matcher is None else matcher.landmarks
         features = None if matcher is None else strongest(matcher.features, self.config.keypoints)
@@ -106,7 +107,7 @@ class Tracker:
         answer = replace(
             answer, method=METHOD, seconds=clocks.perf_counter() - began, focal_factor=1.0, intrinsics=None,
             unit=unit_of(self._scene),
-        )  # fmt: skip
+        ).translated(self._origin)  # fmt: skip
         return answer if state.camera is None else state.camera.stated_in(answer, stated)
 
     def save(self, path: str | Path) -> None:
@@ -272,7 +273,7 @@ class Tracker:
             if found.converged or not due or self._scene.surface is None or not shows_shape(frame):
                 return found
         try:
-            return self.localizer(frame, predicted, seed=seed)
+            return self.localizer.solved(self.localizer.problem(frame, predicted), seed)
         except InputError:
             if lost:  # the sequence has begun, so the frame is at fault, not the map or the settings
                 return None
