@@ -97,7 +97,8 @@ def _on_surface(
         found = _uncertain_camera(found, problem)
         if found.converged:
             return found
-        best = best or found
+        if best is None or best.outcome is Outcome.TOO_FEW_MATCHES:  # a pose by chance
+            best = found
     assert best is not None
     return best
 
