@@ -387,7 +387,7 @@ def risk(records: Records) -> str:
 
 @table
 def answers(records: Records) -> str:
-    """The same images and maps before and after the localizer became one loop."""
+    """Answers to the same images in the same maps, before and after the localizer became one loop."""
     before, now = records["answers_before"]["counts"], records["answers"]["counts"]
     rows = []
     for name in (name for name, some in now.items() if "all" in some):

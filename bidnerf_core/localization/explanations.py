@@ -38,13 +38,13 @@ APPROXIMATE = (
     ("cropped", 0.2, 0.1, 0.03, 0.001, 0.0, 0.03, True),
     ("unlike", 0.3, 0.3, 0.1, 0.1, 0.1, 0.01, False),
 )
-"""The same for a focal length that is stated to be approximate."""
+"""What may be true of a camera whose focal length is stated to be approximate, in the columns of ``STATED``."""
 # fmt: on
 OF_MAP = (
     ("map", 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.6),
     ("map, about", 0.005, 0.005, 0.005, 0.001, 0.0, 0.4),
 )
-"""The same about the camera of the map's images, with shares of its odds."""
+"""Standard deviations about the camera of the map's images, as in ``STATED``, with shares of its odds."""
 ODDS_OF_MAP, ODDS_OF_OTHER = 0.5, 0.05
 """Prior odds that the image is from the map's camera, if the stated one is similar but different, and if it differs much."""
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)

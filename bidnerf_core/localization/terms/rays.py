@@ -24,7 +24,7 @@ RAYS = 1024
 INDEPENDENT = 300.0
 """Largest number of independent measurements among rendered rays, as far as their own noise is concerned."""
 ALONE = 10.0
-"""The same without other measurements, at a pose that may be far off."""
+"""Largest number of independent rays without other measurements, at a pose that may be far off."""
 FIELD_ERRORS = 10.0
 """Variance of the rays' gradients relative to that by their noise: neighbouring rays share the errors of the field."""
 GAIN_PRIOR = 0.001
