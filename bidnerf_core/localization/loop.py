@@ -65,6 +65,11 @@ TOLERANCE, ANGLE = 0.03, 0.05
 """Within which the pose must be: relative to the distance of the scene, and radians."""
 SHARPEST = 0.04
 """Colour noise of a field on its training images above which its rays add nothing to the landmarks."""
+LEAST_ON_SURFACE = 0.1
+"""Least fraction of the measured points on the surface; with fewer, depth is in another unit or of another scene, and is left out.
+
+No pose on record with fewer was right, nor would any have been accepted without depth.
+"""
 RAYS_BEYOND = 0.6
 """Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them."""
 HEAVY_TAILS = 1.7
@@ -354,8 +359,11 @@ class Loop:
         others: dict[str, float | None] = {}
         if problem is not None and problem.surface is not None and problem.has_depth:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
-        if points is not None and found.mode == 0:
+        if points is not None:
             points = points.fitted_noise(found.chosen)
+            if float(points.inliers(found.chosen)[0].mean()) < LEAST_ON_SURFACE:
+                points = None
+        if points is not None and found.mode == 0:
             terms.append(points)
             fused.append("depth")
             best, _ = descend(best, terms, 5)
