@@ -102,7 +102,7 @@ class Sights:
     rotation: Float[Tensor, "*h m 3 3"]  # T_camera_rig
     translation: Float[Tensor, "*h m 3"]
 
-    def __getitem__(self, index: Tensor) -> Sights:
+    def __getitem__(self, index: Tensor | slice) -> Sights:
         return Sights(self.image[index], self.times[index], self.rotation[index], self.translation[index])
 
 
