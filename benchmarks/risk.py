@@ -2,7 +2,7 @@ r"""Calibrate the confidence that method ``auto`` requires for a tolerated risk,
 
     python benchmarks/risk.py ROWS.jsonl [...] [--write]
 
-The risk is the share of wrong answers among the accepted ones. The rows are those of ``benchmarks/answers.py`` on frames that
+The risk is the share of wrong answers among the accepted ones. The rows should be those of ``benchmarks/answers.py`` on frames that
 the confidence was not fitted to; answers that are accepted without a tolerated risk are the examples. For each risk, the least
 confidence is sought whose upper confidence bound of the share of wrong answers (Clopper and Pearson 1934) is at most the risk.
 The thresholds are tested in a fixed order, so that all tests together err with probability ``ERROR`` at most (Learn then Test,

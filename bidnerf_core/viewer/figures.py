@@ -46,7 +46,7 @@ OF_SURFACE = {
         "lines of sight through the surface", ".0%", "share that meets the surface well before the point that was measured"
     ),
 }  # fmt: skip
-"""The same for a pose on the surface."""
+"""Label, format and meaning of each measure of a pose on the surface."""
 
 
 @dataclass(frozen=True)
