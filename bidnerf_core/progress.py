@@ -33,47 +33,62 @@ Cancel: TypeAlias = Callable[[], bool]
 """Returns whether the work should stop, such as ``threading.Event().is_set``."""
 
 
-def check_cancelled(cancel: Cancel | None, stage: str) -> None:
-    """Raise ``Cancelled`` if the work should stop, and ``InputError`` if ``cancel`` is not callable (an event
-    itself, say).
+@dataclass(frozen=True)
+class Job:
+    """Who receives the progress of the work at hand, and who may stop it."""
+
+    progress: ProgressCallback | None = None
+    cancel: Cancel | None = None
+
+
+_JOB: ContextVar[Job] = ContextVar("job", default=Job())  # noqa: B039 (it is frozen)
+
+
+@contextmanager
+def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None = None) -> Iterator[None]:
+    """Set who receives the progress of this thread's work within the block, and who may stop it.
+
+    Functions that take ``progress`` and ``cancel`` from users open this block once; what they call reports by ``counter`` and
+    stops by ``check_cancelled``. What is None remains as the enclosing block has it. Raises ``InputError`` if ``cancel`` is not callable
+    (an event itself, say).
     """
     if cancel is not None and not callable(cancel):
         raise InputError(
             f"cancel is a {type(cancel).__name__}", expected="a function, such as the is_set of an event"
         )
-    if cancel is not None and cancel():
-        raise Cancelled(f"cancelled during stage {stage!r}")
-
-
-_STOP: ContextVar[Cancel | None] = ContextVar("stop", default=None)
-
-
-@contextmanager
-def stopped_by(cancel: Cancel) -> Iterator[None]:
-    """Let localizations and renderings of this thread within the block raise ``Cancelled`` soon after ``cancel`` returns True."""
-    token = _STOP.set(cancel)
+    outer = _JOB.get()
+    token = _JOB.set(Job(progress or outer.progress, cancel or outer.cancel))
     try:
         yield
     finally:
-        _STOP.reset(token)
+        _JOB.reset(token)
 
 
-def check_stopped() -> None:
-    """Raise ``Cancelled`` if this thread's work should stop, see ``stopped_by``. Called once per iteration of a long loop."""
-    check_cancelled(_STOP.get(), "localization")
+def check_cancelled(stage: str = "localization", cancel: Cancel | None = None) -> None:
+    """Raise ``Cancelled`` if this thread's work should stop, see ``job_context``. Called once per iteration of a long loop."""
+    cancel = cancel or _JOB.get().cancel
+    if cancel is not None and cancel():
+        raise Cancelled(f"cancelled during stage {stage!r}")
 
 
 def counter(
     stage: str, unit: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None
 ) -> Callable[[int, int], None]:
-    """Return a function of (done, total) that reports progress and raises ``Cancelled`` on request."""
+    """Return a function of (done, total) that reports progress to the current job and raises ``Cancelled`` if it should stop."""
 
     def count(done: int, total: int) -> None:
-        if progress is not None:
-            progress(Progress(stage, done, total, unit))
-        check_cancelled(cancel, stage)
+        with job_context(progress, cancel):
+            report_progress(Progress(stage, done, total, unit))
 
     return count
+
+
+def report_progress(progress: Progress) -> None:
+    """Report to the current job, see ``job_context``, and raise ``Cancelled`` if it should stop."""
+    receive = _JOB.get().progress
+    if receive is not None:
+        receive(progress)
+    check_cancelled(progress.stage)
 
 
 def duration_text(seconds: float) -> str:

@@ -111,7 +111,7 @@ def compare_maps(
         processes = [stack.enter_context(TrialProcess()) if scene is None else None for scene in scenes]
         for number, trials in enumerate(starts):
             for place, (process, trial) in enumerate(zip(processes, trials, strict=True)):
-                check_cancelled(cancel, "comparison")
+                check_cancelled("comparison", cancel)
                 done[place].append(process.run(trial) if process else measured(trial, scenes[place]))
                 if progress is not None:
                     count = number * len(labels) + place + 1

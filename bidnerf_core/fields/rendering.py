@@ -24,7 +24,7 @@ from bidnerf_core.fields.contract import (
     device_of,
 )
 from bidnerf_core.geometry import SE3
-from bidnerf_core.progress import check_stopped
+from bidnerf_core.progress import check_cancelled
 
 PICTURE_CONTRAST = 0.12
 """Difference of neighbours (of colours and opacity; of distances, as a share) beyond which pictures are rendered pixel by pixel."""
@@ -312,7 +312,7 @@ def _rendered(
     times = exposure_times(pixels, intrinsics).to(T.translation).split(chunk)
     parts = []
     for directions, when in zip(ray.to(device).split(chunk), times, strict=True):
-        check_stopped()
+        check_cancelled()
         at = T if motion is None else T @ poses_of_rows(when, motion)
         turned = at.rotate(directions)
         rendering = render(field, bounds.rays(at.translation.expand_as(turned), turned), bounds.background)

@@ -22,7 +22,7 @@ from bidnerf_core.devices import constant, moved, noted, without_waiting
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.settings import AdamSettings, AnswerName
-from bidnerf_core.progress import check_stopped
+from bidnerf_core.progress import check_cancelled
 
 WINDOW = 20
 """Steps over which the noisy loss of a few rays is averaged."""
@@ -203,7 +203,7 @@ def follow_gradient(
     steps = AdamSteps(loss, pivot, config, history.T.to(device))
     take: Callable[[], None] = steps
     for first in range(0, config.max_steps, WINDOW):
-        check_stopped()
+        check_cancelled()
         count = min(WINDOW, config.max_steps - first)
         with without_waiting():
             for step in range(count):

@@ -29,7 +29,7 @@ from bidnerf_core.localization.terms.images import (
 )
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import States, SurfaceMap, Term, cast, descend
-from bidnerf_core.progress import check_stopped
+from bidnerf_core.progress import check_cancelled
 
 RIVALS = 3
 """Maximum number of other poses with which the best one is compared."""
@@ -82,7 +82,7 @@ def halve(
     poses, losses, margin, scores = [states.T[None]], list[Tensor](), math.inf, states.noise
     rivals = before = states[:0]
     for stage in stages:
-        check_stopped()
+        check_cancelled()
         path: list[tuple[SE3, Tensor]] = []
         before = states[:1]
         with without_waiting():

@@ -197,7 +197,7 @@ class MapCollection:
         count = counter("reading", "maps", progress, cancel)
         landmarks: dict[str, LandmarkMap] = {}
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
-            check_cancelled(cancel, "reading maps")
+            check_cancelled("reading maps", cancel)
             found = _landmarks(scene, self._infos[name])
             if found is not None and len(found):
                 landmarks[name] = found

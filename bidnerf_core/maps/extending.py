@@ -142,7 +142,7 @@ def locate(
     count = counter("locating", "photos", progress, cancel)
     views, left_out, known = list[View](), list(unread), list[str]()
     for number, frame in enumerate(frames, start=1):
-        check_cancelled(cancel, "extending")
+        check_cancelled("extending", cancel)
         try:
             found = localizer.solved(localizer.problem(frame))
         except InputError as error:
@@ -281,7 +281,7 @@ def _extended(
     )  # fmt: skip
     whole = replace(scene, info=info, field=in_map_frame(field, info), folder=None, record=scene.capture)
     surface = _surface(whole, [*old, *new] if complete else new, config, progress, cancel)
-    check_cancelled(cancel, "extending")
+    check_cancelled("extending", cancel)
     if complete:
         baked = bake_landmarks(info, whole.field, [*old, *new], where, tracked, progress, cancel, whole.up)
         landmarks, record = baked.landmarks or scene.landmarks, baked.capture
@@ -297,7 +297,7 @@ def _extended(
         return grown
     if load_info(scene.folder).weights != scene.info.weights:
         raise InputError("was retrained meanwhile; extend it again", where=where)
-    check_cancelled(cancel, "extending")
+    check_cancelled("extending", cancel)
     state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
     here = grown.to("cpu")
     stored = save_map(scene.folder, info, state, here.surface, here.landmarks, record, "kept")

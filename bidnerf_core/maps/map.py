@@ -250,13 +250,13 @@ class Map:
 
         ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if known.
         """
-        check_cancelled(cancel, "baking")
+        check_cancelled("baking", cancel)
         surface = surface or bake_surface(self.info, self.field, views, config, self.name, progress, cancel)
         scene = self.with_surface(surface)
         if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
             log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
             return replace(scene, landmarks=kept)
-        check_cancelled(cancel, "baking")
+        check_cancelled("baking", cancel)
         found = bake_landmarks(self.info, self.field, views, self.name, tracked, progress, cancel, scene.up)
         return scene._with_landmarks(found)
 

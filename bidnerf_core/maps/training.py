@@ -136,7 +136,7 @@ def train(
                 f"{read.place}: the photos are from one place and do not determine distances; the map's"
                 " depth will be arbitrary, and localization in it will give directions, but no positions"
             )
-        check_cancelled(cancel, "training")
+        check_cancelled("training", cancel)
         bounds = estimate_bounds(taken.views, read.background)
         info = MapInfo(
             backend, to_plain(settings, "config"), bounds, 0, False, read.source, cameras=taken.cameras,

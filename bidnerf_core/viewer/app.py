@@ -30,7 +30,7 @@ from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.localization import Localizer
 from bidnerf_core.maps import Map
-from bidnerf_core.progress import stopped_by
+from bidnerf_core.progress import job_context
 from bidnerf_core.service import (
     SAFE,
     Access,
@@ -227,7 +227,7 @@ async def _view(request: Request) -> Response:
             return None
         scene = state.shown.map
         try:
-            with stopped_by(cancelled.is_set):
+            with job_context(cancel=cancelled.is_set):
                 return jpeg(quick_image(scene, camera, T) if quick else field_image(scene, camera, T))
         except Cancelled:
             return None

@@ -13,7 +13,7 @@ from bidnerf_core.datasets import Query
 from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, SearchRecord
-from bidnerf_core.progress import stopped_by
+from bidnerf_core.progress import job_context
 from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.viewer.answer import ShownAnswer
 from bidnerf_core.viewer.view import localized
@@ -91,7 +91,7 @@ class Jobs:
 
         job.state = "searching"
         try:
-            with stopped_by(self._closed.is_set):
+            with job_context(cancel=self._closed.is_set):
                 job.answer = localized(self._localizer, read(), begun=begun, found_pose=found_pose)
         except Cancelled:
             job.answer = ShownAnswer(job.name, "stopped", False, "the viewer was closed")

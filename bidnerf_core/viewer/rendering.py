@@ -12,7 +12,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import SceneMap, surface_renderer
 
 PIXELS_AT_A_TIME = 4096
-"""Number of pixels between two checks whether a rendering is still wanted, see ``stopped_by``."""
+"""Number of pixels between two checks whether a rendering is still wanted, see ``job_context``."""
 
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:

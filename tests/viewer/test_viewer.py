@@ -31,7 +31,7 @@ from bidnerf_core.localization import (
     recorded,
 )
 from bidnerf_core.mapping import States
-from bidnerf_core.progress import stopped_by
+from bidnerf_core.progress import job_context
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.viewer import ShownAnswer, shown_trajectory
 
@@ -400,7 +400,7 @@ def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted(room: Map) ->
 
     in_pieces = field_image(scene, camera, pose)
     torch.testing.assert_close(in_pieces, whole, atol=1e-5, rtol=0)
-    with pytest.raises(Cancelled), stopped_by(wanted_twice):
+    with pytest.raises(Cancelled), job_context(cancel=wanted_twice):
         field_image(scene, camera, pose)
     assert len(asked) == 3
     assert quick_image(scene, camera, pose).shape == whole.shape
