@@ -12,6 +12,7 @@ from .masked import MaskedDataset as MaskedDataset
 from .masked import wholly_hidden as wholly_hidden
 from .open import open_dataset as open_dataset
 from .open import open_sequence as open_sequence
+from .options import DatasetOptions as DatasetOptions
 from .points import read_depth_points as read_depth_points
 from .pose_rows import pose_of_rows as pose_of_rows
 from .queries import DatasetFrames as DatasetFrames
