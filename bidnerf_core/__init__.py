@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 import os
-from importlib.metadata import entry_points
 
 from lazy_loader import attach_stub
 
 # OpenMP threads that wait should sleep. On cores shared with other work, spinning made training more than ten times
 # slower in measurements. It has to be set before torch is loaded; a user's own setting is kept.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-# When they are imported, torch and typeguard (which the command line's parser uses) look for plugins among all entry
-# points, and fail if any package has a malformed file. Where there is such a file, they are imported without plugins.
-try:
-    entry_points(group="bidnerf.backends")
-except Exception:
-    os.environ.setdefault("TORCH_DEVICE_BACKEND_AUTOLOAD", "0")
-    os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 # Modules are imported on first use (PEP 562): importing torch takes seconds, and ``bidnerf --help`` does not need it.
 __getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

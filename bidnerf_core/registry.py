@@ -1,29 +1,22 @@
-"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers,
-importers and exporters.
+"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers, importers
+and exporters.
 
 A distribution provides an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones are
-provided in the same way. A script or a notebook adds one with ``register``. Listing reads only metadata and
-source text, so a broken plugin cannot break the list: the failure surfaces when that plugin is loaded, in an
-error that names the plugin, its distribution and the cause.
+provided in the same way. A script or a notebook adds one with ``register``. Listing reads only metadata, so a
+broken plugin cannot break the list: the failure surfaces when that plugin is loaded, in an error that names
+the plugin, its distribution and the cause.
 """
 
 from __future__ import annotations
 
-import ast
+import contextlib
 import dataclasses
-import importlib
-import importlib.util
+import functools
 import inspect
-import os
 import re
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from email import message_from_string
-from functools import reduce
-from importlib.machinery import ModuleSpec, PathFinder
-from importlib.metadata import EntryPoint, distribution, distributions
-from itertools import pairwise
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from bidnerf_core.errors import InputError, spelling_hint, unknown_name
@@ -41,20 +34,12 @@ GROUPS: Mapping[str, str] = {
 """The kinds of object that can be registered, and the noun for each. The entry-point group has the prefix
 ``bidnerf.``."""
 
-ONLY_STRANGERS = frozenset({"importers"})
-"""Groups without bundled plugins."""
-
 BUNDLED = "bidnerf"
 """The distribution whose plugins are bundled."""
-UNREADABLE = "?"
-"""Placeholder for the name of entry points that cannot be read."""
 NAME = re.compile(r"[\w.-]+")
 
 Defects: TypeAlias = Callable[[Any], Iterator[str]]
 """A function that yields the reasons why an object is not of its kind, the most informative one first."""
-AnyDistribution: TypeAlias = Any
-"""A distribution of ``importlib.metadata``, left open: once anything imports the backport ``importlib_metadata``, look-ups
-return its own classes, which are not subclasses of the standard library's."""
 
 Plugin = TypeVar("Plugin")
 
@@ -70,19 +55,32 @@ class PluginError(InputError):
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """Information about a plugin that is available without importing it."""
+    """Information about a plugin that is available without importing it, but for the summary of a bundled one."""
 
     group: str
     name: str
     value: str  # "module:object", as declared; the object's type if it was registered in this process
     distribution: str
     version: str
-    summary: str = ""
+    about: str = ""  # the distribution's own summary
     fault: str | None = None  # why it cannot be loaded, as far as the metadata shows
 
     @property
     def is_bundled(self) -> bool:
-        return _normalized(self.distribution) == BUNDLED
+        return self.distribution == BUNDLED
+
+    @property
+    def summary(self) -> str:
+        """One line that describes the plugin: its own if it is bundled or registered in this process, else its distribution's.
+
+        A bundled plugin is imported for it.
+        """
+        if self.fault is None and (self.is_bundled or not self.version):
+            with contextlib.suppress(PluginError):  # reported when the plugin is loaded for use
+                plugin = load_plugin(self.group, self.name)
+                text = getattr(plugin, "summary", None) or inspect.getdoc(plugin) or ""
+                return str(text).strip().partition("\n")[0]
+        return self.about
 
     def __str__(self) -> str:
         origin = f"from {self.distribution} {self.version}" if self.version else "registered in this process"
@@ -97,7 +95,6 @@ def register(group: str, name: str, value: Any, replace: bool = False) -> None:
     that name, whether registered before, installed or bundled. Raises ``InputError`` for an unknown group, an
     invalid name, and a name that is taken.
     """
-    _check_group(group)
     if not (isinstance(name, str) and NAME.fullmatch(name)):
         raise InputError(f"name is {name!r}", where="register", expected="letters, digits, '.', '-' and '_'")
     taken = [info for info in list_plugins(group) if info.name == name]
@@ -133,12 +130,39 @@ def list_plugins(group: str) -> list[PluginInfo]:
 
     A name declared by two distributions is listed twice, with a fault: neither can be loaded.
     """
-    _check_group(group)
-    own = [_registered_info(group, name) for of, name in list(registered) if of == group]
+    if group not in GROUPS:
+        raise unknown_name("group of plugins", group, GROUPS)
+    own = [PluginInfo(of, name, type(value).__name__, "this process", "")
+           for (of, name), value in list(registered.items()) if of == group]  # fmt: skip
     replaced = {info.name for info in own}
-    sources: dict[str, ast.Module | None] = {}
-    found = [_described_info(info, sources) for info in _declared(group) if info.name not in replaced]
-    return sorted([*own, *found], key=lambda info: (info.name, info.distribution, info.value))
+    declared = [info for info in _declared(group) if info.name not in replaced]
+    return sorted([*own, *declared], key=lambda info: (info.name, info.distribution, info.value))
+
+
+@functools.cache
+def _declared(group: str) -> tuple[PluginInfo, ...]:
+    """Return what installed distributions declare in a group. Of several versions of one, the first on ``sys.path`` counts."""
+    try:
+        points = entry_points(group=f"bidnerf.{group}")
+        infos = [PluginInfo(group, p.name, p.value, *_name_version_summary(p.dist)) for p in points]
+    except Exception as error:  # one malformed file stops all look-ups, also those of other programs
+        raise PluginError(
+            f"the metadata of an installed package cannot be read ({_described(error)}); reinstall or remove it"
+        ) from error
+    found = []
+    for info in infos:
+        rivals = [x for x in infos if x.name == info.name and x is not info]
+        claims = ", ".join(f"{x.distribution} {x.version} ({x.value})" for x in rivals)
+        fault = f"the name is also claimed by {claims}; uninstall one of them" if rivals else None
+        if not EntryPoint.pattern.match(info.value):
+            fault = "expected a value of the form 'module:object'"
+        found.append(replace(info, fault=fault))
+    return tuple(found)
+
+
+@functools.cache  # a look-up parses the metadata anew
+def _name_version_summary(dist: Any) -> tuple[str, str, str]:
+    return dist.name, dist.version, dist.metadata.get("Summary", "")
 
 
 def plugin_names(group: str, first: Sequence[str] = ()) -> tuple[str, ...]:
@@ -146,11 +170,11 @@ def plugin_names(group: str, first: Sequence[str] = ()) -> tuple[str, ...]:
 
     The last two parts are sorted alphabetically. Names in ``first`` that no plugin has are omitted.
     """
-    _check_group(group)
-    known = {info.name: info.is_bundled for info in _declared(group) if info.name != UNREADABLE}
-    known |= {name: known.get(name, False) for of, name in list(registered) if of == group}
     ranks = {name: rank for rank, name in enumerate(first)}
-    return tuple(sorted(known, key=lambda name: (ranks.get(name, len(ranks)), not known[name], name)))
+    infos = sorted(
+        list_plugins(group), key=lambda x: (ranks.get(x.name, len(ranks)), not x.is_bundled, x.name)
+    )
+    return tuple(dict.fromkeys(info.name for info in infos))
 
 
 def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by: str = "") -> Any:
@@ -158,10 +182,40 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
 
     Raises ``PluginError``, which names the plugin and, if given, what needs it (``wanted_by``).
     """
+    infos = list_plugins(group)
+    info = next((info for info in infos if info.name == name), None)
+    if info is None:
+        raise PluginError(_unknown(group, name, infos), where=wanted_by)
+    where = f"{wanted_by}: {info}" if wanted_by else info
+    if info.fault is not None:
+        raise PluginError(info.fault, where=where)
+    kind = f"{'an' if GROUPS[group][0] in 'aeiou' else 'a'} {GROUPS[group]}"
+    doing = "cannot be imported"
     try:
-        return _loaded(group, name, defects)
-    except PluginError as error:
-        raise PluginError(error, where=wanted_by) from error.__cause__
+        point = EntryPoint(name, info.value, group)
+        plugin = registered[group, name] if (group, name) in registered else point.load()
+        doing = f"not {kind}"
+        wrong = None if defects is None else next(defects(plugin), None)
+    except KeyboardInterrupt:
+        raise  # the user interrupted the import
+    except (
+        BaseException
+    ) as error:  # a plugin may raise anything, even SystemExit, which must not end the caller's program
+        raise PluginError(f"{doing}: {_described(error)}", where=where) from error
+    if wrong is not None:
+        raise PluginError(f"not {kind}: {wrong}", where=where)
+    return plugin
+
+
+def _unknown(group: str, name: str, infos: Sequence[PluginInfo]) -> str:
+    noun, names = GROUPS[group], sorted({info.name for info in infos})
+    if not any(info.is_bundled for of in GROUPS for info in _declared(of)):
+        return f"no {noun} {name!r}: the metadata of bidnerf lists no plugins at all; reinstall bidnerf"
+    return f"no {noun} {name!r}{spelling_hint(str(name).lower(), names)}; installed: {', '.join(names) or 'none'}"
+
+
+def _described(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 class Plugins(Mapping[str, Plugin], Generic[Plugin]):
@@ -191,231 +245,6 @@ class Plugins(Mapping[str, Plugin], Generic[Plugin]):
         return self.load(name)
 
 
-def _loaded(group: str, name: str, defects: Defects | None) -> Any:
-    _check_group(group)
-    if (group, name) in registered:
-        return _checked(_registered_info(group, name), registered[group, name], defects)
-    found = [info for info in _declared(group) if info.name == name and name != UNREADABLE]
-    if not found:
-        raise PluginError(_unknown(group, name))
-    info = _described_info(found[0], {})
-    if info.fault is not None:
-        raise PluginError(info.fault, where=info)
-    return _checked(info, _imported(info), defects)
-
-
-def _check_group(group: str) -> None:
-    if group not in GROUPS:
-        raise unknown_name("group of plugins", group, GROUPS)
-
-
-def _registered_info(group: str, name: str) -> PluginInfo:
-    value = registered[group, name]
-    summary = getattr(value, "summary", None) or inspect.getdoc(value) or ""
-    return PluginInfo(group, name, _type_name(value), "this process", "", str(summary).partition("\n")[0])
-
-
-# Reading metadata. Any metadata file of any distribution may be malformed.
-
-_cache: tuple[object, dict[str, tuple[PluginInfo, ...]]] = (None, {})
-
-
-def _declared(group: str) -> tuple[PluginInfo, ...]:
-    """Return what installed distributions declare in a group; re-read whenever a folder of ``sys.path`` has
-    changed.
-    """
-    global _cache
-    key = tuple((path, _modified(path)) for path in sys.path)
-    if _cache[0] != key:
-        found = [info for dist in _installed() for info in _entries(dist)]
-        _cache = key, {of: tuple(_with_rivals([i for i in found if i.group == of])) for of in GROUPS}
-    return _cache[1][group]
-
-
-def _modified(path: str) -> int:
-    try:
-        return os.stat(path or os.curdir).st_mtime_ns
-    except OSError:
-        return 0
-
-
-def _installed() -> Iterator[AnyDistribution]:
-    """Yield the distributions related to bidnerf; of several versions, only the one that ``import`` would
-    use.
-    """
-    seen = set()
-    for dist in distributions():
-        if "bidnerf." not in _text(dist, "entry_points.txt"):
-            continue
-        name = _label(dist)
-        if _normalized(name) not in seen and not _is_hidden(dist, name):
-            seen.add(_normalized(name))
-            yield dist
-
-
-def _is_hidden(dist: AnyDistribution, name: str) -> bool:
-    try:
-        first = distribution(name)
-    except Exception:  # it has no name by which it could be hidden
-        return False
-    return [_text(first, f) for f in ("METADATA", "entry_points.txt")] != [
-        _text(dist, f) for f in ("METADATA", "entry_points.txt")
-    ]
-
-
-def _entries(dist: AnyDistribution) -> Iterator[PluginInfo]:
-    about = PluginInfo(
-        "", UNREADABLE, UNREADABLE, _label(dist), _metadata(dist, "Version") or "of unknown version"
-    )
-    about = replace(about, summary=_metadata(dist, "Summary") or "")
-    for group in GROUPS:
-        try:
-            for point in dist.entry_points.select(group=f"bidnerf.{group}"):
-                yield replace(about, group=group, name=point.name, value=point.value)
-        except Exception as error:
-            if f"bidnerf.{group}" in _text(dist, "entry_points.txt"):
-                fault = f"entry_points.txt cannot be read ({_described(error)})"
-                yield replace(about, group=group, summary="", fault=fault)
-
-
-def _with_rivals(infos: list[PluginInfo]) -> Iterator[PluginInfo]:
-    """Yield plugins, with a fault for each name that is declared more than once and therefore ambiguous."""
-    for info in infos:
-        rivals = [x for x in infos if x.name == info.name and x is not info]
-        if rivals and info.name != UNREADABLE:
-            also = ", ".join(f"{x.distribution} {x.version} ({x.value})" for x in rivals)
-            yield replace(info, fault=f"the name is also claimed by {also}; uninstall one of them")
-        else:
-            yield info
-
-
-def _text(dist: AnyDistribution, file: str) -> str:
-    try:
-        return dist.read_text(file) or ""
-    except Exception:
-        return ""
-
-
-def _metadata(dist: AnyDistribution, key: str) -> str | None:
-    try:
-        head, _, readme = _text(dist, "METADATA").partition("\n\n")
-        # The README after the headers would take nearly all of the parsing time.
-        values = (message_from_string(head) if readme else dist.metadata).get_all(key)
-    except Exception:
-        return None
-    return str(values[0]) if values else None
-
-
-def _label(dist: AnyDistribution) -> str:
-    return _metadata(dist, "Name") or f"unnamed distribution {getattr(dist, '_path', id(dist))}"
-
-
-def _normalized(name: str) -> str:
-    return name.lower().replace("-", "_").replace(".", "_")
-
-
-# Summaries: the first line of a docstring, from the source as text.
-
-
-def _described_info(info: PluginInfo, sources: dict[str, ast.Module | None]) -> PluginInfo:
-    """Return the information from an entry point's module: its summary, or why it cannot be resolved."""
-    if info.name == UNREADABLE:
-        return info
-    point = EntryPoint(info.name, info.value, "")
-    try:
-        module = point.module  # fails unless the value has the form module:object
-    except Exception:
-        return replace(info, fault=info.fault or "expected a value of the form 'module:object'")
-    try:
-        spec = _spec(module)
-    except Exception as error:
-        return replace(info, fault=info.fault or f"module '{module}' cannot be found ({_described(error)})")
-    if spec is None:
-        return replace(info, fault=info.fault or f"module '{module}' is not installed")
-    if module not in sources:
-        sources[module] = _parsed(spec)
-    return replace(info, summary=_summary(sources[module], point.attr) or info.summary)
-
-
-def _spec(module: str) -> ModuleSpec | None:
-    """Return the spec of a module. ``find_spec`` alone would import the parents of a dotted name."""
-    top, *rest = module.split(".")
-    spec = importlib.util.find_spec(top)
-    for part in rest:
-        if spec is None or spec.submodule_search_locations is None:
-            return None
-        spec = PathFinder.find_spec(f"{spec.name}.{part}", spec.submodule_search_locations)
-    return spec
-
-
-def _parsed(spec: ModuleSpec) -> ast.Module | None:
-    read = getattr(spec.loader, "get_source", None)
-    try:
-        return ast.parse(read(spec.name) or "") if read else None
-    except Exception:  # the source is not valid Python, which loading the plugin will report
-        return None
-
-
-def _summary(tree: ast.Module | None, attr: str | None) -> str:
-    """Return the first line of the docstring of the object an entry point names, or else of its module.
-
-    The docstring of an assigned object is the text below the assignment, or ``summary="..."`` in the call
-    that creates it.
-    """
-    if tree is None:
-        return ""
-    own: str | None = None
-    for node, below in pairwise([*tree.body, ast.Pass()]):
-        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == attr:
-            own = ast.get_docstring(node)
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            if any(isinstance(target, ast.Name) and target.id == attr for target in targets):
-                words = node.value.keywords if isinstance(node.value, ast.Call) else []
-                given = [word.value for word in words if word.arg == "summary"]
-                own = next(filter(None, map(_constant_text, [*given, getattr(below, "value", None)])), None)
-    return _first_line(own) or _first_line(ast.get_docstring(tree))
-
-
-def _constant_text(node: Any) -> str | None:
-    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else None
-
-
-def _first_line(text: str | None) -> str:
-    return text.strip().splitlines()[0] if text and text.strip() else ""
-
-
-# Loading.
-
-
-def _imported(info: PluginInfo) -> Any:
-    point = EntryPoint(info.name, info.value, "")
-    try:
-        module = importlib.import_module(point.module)
-    except KeyboardInterrupt:
-        raise  # the user interrupted the import
-    except (
-        BaseException
-    ) as error:  # including SystemExit and the like, which must not end the caller's program
-        raise PluginError(f"cannot be imported: {_described(error)}", where=info) from error
-    try:
-        return reduce(getattr, filter(None, (point.attr or "").split(".")), module)
-    except Exception as error:
-        raise PluginError(f"there is no such object: {_described(error)}", where=info) from error
-
-
-def _checked(info: PluginInfo, plugin: Any, defects: Defects | None) -> Any:
-    noun = GROUPS[info.group]
-    kind = f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
-    try:
-        wrong = None if defects is None else next(defects(plugin), None)
-    except Exception as error:  # a property may raise anything
-        raise PluginError(f"not {kind}: {_described(error)}", where=info) from error
-    if wrong is not None:
-        raise PluginError(f"not {kind}: {wrong}", where=info)
-    return plugin
-
-
 def interface_defects(
     plugin: Any, attributes: Sequence[str], methods: Mapping[str, Sequence[str]]
 ) -> Iterator[str]:
@@ -427,7 +256,7 @@ def interface_defects(
     """
     missing = [name for name in (*attributes, *methods) if not hasattr(plugin, name)]
     if missing:
-        who = f"class {plugin.__name__}" if isinstance(plugin, type) else _type_name(plugin)
+        who = f"class {plugin.__name__}" if isinstance(plugin, type) else type(plugin).__name__
         yield f"{who} has no {', '.join(missing)}"
         return
     if isinstance(plugin, type):
@@ -437,8 +266,13 @@ def interface_defects(
     if "config_type" in attributes:
         yield from _config_defects(plugin.config_type)
     for name, parameters in methods.items():
-        if not _accepts(plugin if name == "__call__" else getattr(plugin, name), len(parameters)):
+        method = plugin if name == "__call__" else getattr(plugin, name)
+        try:
+            inspect.signature(method).bind(*[None] * len(parameters))
+        except TypeError:  # it does not take them, or is no function
             yield f"{'it' if name == '__call__' else name} does not take ({', '.join(parameters)})"
+        except ValueError:  # compiled code may have no signature
+            pass
 
 
 def _config_defects(config_type: Any) -> Iterator[str]:
@@ -452,36 +286,3 @@ def _config_defects(config_type: Any) -> Iterator[str]:
     bare = [field.name for field in fields if field.default is field.default_factory is nothing]
     if bare:
         yield f"config_type {config_type.__name__} has no default for {', '.join(bare)}"
-
-
-def _accepts(method: Any, count: int) -> bool:
-    if not callable(method):
-        return False
-    try:
-        inspect.signature(method).bind(*[None] * count)
-    except TypeError:
-        return False
-    except ValueError:  # compiled code may have no signature
-        return True
-    return True
-
-
-def _type_name(value: Any) -> str:
-    return type(value).__name__
-
-
-def _described(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
-
-
-def _unknown(group: str, name: str) -> str:
-    infos, noun = _declared(group), GROUPS[group]
-    names = plugin_names(group)
-    if group not in ONLY_STRANGERS and not any(info.is_bundled for info in infos):
-        return (
-            f"no {noun} {name!r}: the metadata of the installed bidnerf lists no {group}; reinstall bidnerf"
-        )
-    hint = spelling_hint(str(name).lower(), names)
-    message = f"no {noun} {name!r}{hint}; installed: {', '.join(sorted(names)) or 'none'}"
-    unread = [f"{x.distribution} {x.version}: {x.fault}" for x in infos if x.name == UNREADABLE]
-    return "; ".join([message, *unread])

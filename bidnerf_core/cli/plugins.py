@@ -9,7 +9,7 @@ from rich.table import Table
 
 from bidnerf_core.cli.options import Flag, option, parse
 from bidnerf_core.cli.output import print_json, print_table
-from bidnerf_core.registry import GROUPS, PluginError, PluginInfo, list_plugins, load_plugin
+from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins
 
 
 def run(arguments: list[str]) -> None:
@@ -40,7 +40,7 @@ def print_infos(infos: list[PluginInfo], with_group: bool = False) -> None:
     for info in infos:
         fault = [info.fault or ""] if faults else []
         of = [info.group] if with_group else []
-        table.add_row(*of, info.name, summary(info), info.distribution, info.version, *fault)
+        table.add_row(*of, info.name, info.summary, info.distribution, info.version, *fault)
     print_table(table)
 
 
@@ -48,19 +48,9 @@ def plain(info: PluginInfo) -> dict[str, str | None]:
     """Return a plugin's description as JSON values."""
     return {
         "name": info.name,
-        "summary": summary(info),
+        "summary": info.summary,
         "distribution": info.distribution,
         "version": info.version,
         "value": info.value,
         "fault": info.fault,
     }
-
-
-def summary(info: PluginInfo) -> str:
-    """Return the summary from the docstring or the metadata or, failing these, from the imported plugin itself."""
-    if info.summary or info.fault:
-        return info.summary
-    try:
-        return str(getattr(load_plugin(info.group, info.name), "summary", ""))
-    except PluginError:
-        return ""  # the fault is reported when the plugin is loaded for use

@@ -23,10 +23,9 @@ from bidnerf_core.localization import find_method
 from bidnerf_core.mapping import FEATURES, find_features
 from bidnerf_core.registry import (
     GROUPS,
-    ONLY_STRANGERS,
-    UNREADABLE,
     PluginError,
     PluginInfo,
+    _declared,
     list_plugins,
     load_plugin,
     register,
@@ -66,6 +65,7 @@ class Site:
         self.folder = folder
 
     def module(self, path: str, source: str) -> None:
+        _declared.cache_clear()
         file = self.folder / path
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(source, encoding="utf-8")
@@ -101,6 +101,7 @@ def new_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callab
         return Site(folder)
 
     yield make
+    _declared.cache_clear()
     for name in set(sys.modules) - before:
         if name.startswith("stranger"):
             del sys.modules[name]
@@ -137,12 +138,9 @@ def test_a_strangers_backend_is_listed_and_loaded(site: Site, value: str) -> Non
     for path in ("stranger_fog.py", "stranger_pkg/sub/kind.py"):
         site.module(path, FOG)
     site.plugin("fog", value, version="2.3")
-    shown = value.partition(" ")[0]
     (info,) = listed("fog")
-    assert replace(info, value=shown) == PluginInfo(
-        "backends", "fog", shown, "stranger", "2.3", "A field of fog."
-    )
-    assert info.value in (shown, value)
+    assert info == PluginInfo("backends", "fog", value, "stranger", "2.3", "Made for a test")
+    assert info.summary == "Made for a test"
     assert not {"stranger_fog", "stranger_pkg"} & set(sys.modules)
     backend = load_backend("fog")
     assert isinstance(backend, Backend)
@@ -158,21 +156,6 @@ def test_a_module_may_itself_be_the_backend(site: Site) -> None:
     assert load_backend("module").summary == "a module"
 
 
-@pytest.mark.parametrize("source", ["", "x = 1\n", "def broken(:\n", "'''  '''\n", "\0"])
-def test_without_a_docstring_the_distribution_speaks(site: Site, source: str) -> None:
-    site.backend(source)
-    assert listed("fog")[0].summary == "Made for a test"
-
-
-def test_summaries_come_from_what_the_entry_point_names(site: Site) -> None:
-    source = '"""A module."""\n\ndef f():\n    """A function.\n\n    More."""\n\n\nclass C:\n    """A class."""\n\n\nmade = C()\n"""Made."""\n'
-    site.module("stranger_four.py", source + "called = C(summary='called')\nbare = C()\n")
-    said = {"f": "A function.", "C": "A class.", "made": "Made.", "called": "called", "bare": "A module."}
-    points = "\n".join(f"{name} = stranger_four:{name}" for name in said)
-    site.metadata("stranger", "1.0", f"[bidnerf.faults]\n{points}\n")
-    assert {i.name: i.summary for i in list_plugins("faults") if i.distribution == "stranger"} == said
-
-
 def test_listing_imports_nothing(site: Site) -> None:
     """The listing runs in a process of its own, where an import of any of the modules would show, whether it fails or not."""
     site.module("stranger_loud/__init__.py", "raise SystemExit('imported')")
@@ -181,7 +164,8 @@ def test_listing_imports_nothing(site: Site) -> None:
     program = (
         "import json, sys\n"
         "from bidnerf_core.registry import list_plugins\n"
-        "infos = {i.name: i.summary for i in list_plugins('backends')}\n"
+        "infos = {i.name: i.summary if i.name == 'loud' else None for i in list_plugins('backends')}\n"
+        "infos = {name: infos[name] for name in ('loud', 'hashgrid')}\n"
         "foreign = [m for m in sys.modules if m.startswith(('stranger', 'bidnerf_')) and 'core' not in m]\n"
         "print(json.dumps([infos, foreign]))"
     )
@@ -190,19 +174,8 @@ def test_listing_imports_nothing(site: Site) -> None:
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     infos, foreign = json.loads(done.stdout)
-    assert infos["loud"] == "A field of fog."
-    assert "hashgrid" in infos
+    assert infos == {"loud": "Made for a test", "hashgrid": None}
     assert foreign == []
-
-
-def test_the_backport_may_answer_in_place_of_the_library() -> None:
-    """Some packages import ``importlib_metadata``, which then finds all distributions, with classes of its own."""
-    pytest.importorskip("importlib_metadata")
-    code = (
-        "import importlib_metadata, bidnerf_core as bn; print(*(b.name for b in bn.list_plugins('backends')))"
-    )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert {"adanerf", "hashgrid", "vanilla"} <= set(shown.split())
 
 
 # Groups.
@@ -215,7 +188,7 @@ def test_every_group_is_listed_loaded_and_refused_alike(site: Site, group: str) 
     points = "thing = stranger_thing:thing\nbroken = stranger_broken:thing"
     site.metadata("stranger", "1.0", f"[bidnerf.{group}]\n{points}\n")
     (info,) = listed("thing", group)
-    assert (info.summary, info.fault) == ("Something that is registered.", None)
+    assert (info.summary, info.fault) == ("Made for a test", None)
     assert "stranger_thing" not in sys.modules
     assert type(load_plugin(group, "thing")) is object
     where = "'broken' (stranger_broken:thing, from stranger 1.0)"
@@ -223,7 +196,7 @@ def test_every_group_is_listed_loaded_and_refused_alike(site: Site, group: str) 
         load_plugin(group, "broken")
 
 
-@pytest.mark.parametrize("group", [group for group in GROUPS if group not in ONLY_STRANGERS])
+@pytest.mark.parametrize("group", [group for group in GROUPS if group != "importers"])
 def test_bundled_plugins_are_registered_as_a_strangers_are_and_their_names_are_taken(
     site: Site, group: str
 ) -> None:
@@ -235,10 +208,9 @@ def test_bundled_plugins_are_registered_as_a_strangers_are_and_their_names_are_t
         assert load_plugin(group, info.name) is not None
     site.module("stranger_thing.py", ANYTHING)
     site.plugin(infos[0].name, "stranger_thing:thing", group=group)
-    where = f"{infos[0].name!r} (stranger_thing:thing, from stranger 1.0)"
-    with refused(where=where, found="also claimed by bidnerf", error=PluginError) as caught:
+    found = "also claimed by stranger 1.0 (stranger_thing:thing)"
+    with refused(where=infos[0], found=found, error=PluginError):
         load_plugin(group, infos[0].name)
-    assert re.search(r"\bbidnerf \d", caught.error.found)
     assert "stranger_thing" not in sys.modules
 
 
@@ -319,26 +291,17 @@ def test_an_object_that_is_no_backend_is_told_what_it_lacks(
     ("value", "fault"),
     [
         ("not a module!", "'module:object'"),
-        ("stranger_absent:backend", "'stranger_absent' is not installed"),
-        ("stranger_absent.sub:backend", "'stranger_absent.sub' is not installed"),
-        ("json.stranger:backend", "'json.stranger' is not installed"),
-        ("sys.stranger:backend", "'sys.stranger' is not installed"),
-        ("sys.json:backend", "'sys.json' is not installed"),
+        ("stranger_absent:backend", "No module named 'stranger_absent'"),
+        ("json.stranger:backend", "No module named 'json.stranger'"),
+        ("json:bakend", "no attribute 'bakend'"),
     ],
 )
 def test_a_value_that_leads_nowhere_is_a_fault_of_that_backend_alone(
     site: Site, value: str, fault: str
 ) -> None:
     site.plugin("nowhere", value)
-    assert fault in (listed("nowhere")[0].fault or "")
     assert fault in refusal("nowhere")
-    assert listed("hashgrid")[0].fault is None
-
-
-def test_a_missing_object_is_told(site: Site) -> None:
-    site.module("stranger_fog.py", FOG)
-    site.plugin("fog", "stranger_fog:bakend")
-    assert "no attribute 'bakend'" in refusal("fog")
+    assert load_backend("hashgrid").summary
 
 
 def test_a_name_claimed_twice_is_nobodys(site: Site) -> None:
@@ -367,41 +330,14 @@ def test_of_two_versions_the_first_on_the_path_wins_as_for_import(
     assert listed("mist") == []  # which only the hidden version has
 
 
-@pytest.mark.parametrize("text", ["[console_scripts]\nnonsense\n", "nonsense\n[", "\udcff"])
-def test_malformed_metadata_of_others_breaks_nothing(site: Site, text: str) -> None:
-    info = site.metadata("unrelated", "1.0", "")
-    (info / "entry_points.txt").write_bytes(text.encode("utf-8", "surrogateescape"))
-    (site.folder / "nameless-1.0.dist-info").mkdir()
-    (site.folder / "garbage-1.0.dist-info").mkdir()
-    (site.folder / "garbage-1.0.dist-info" / "METADATA").write_bytes(b"\xff\xfe\x00")
-    site.module("odd.egg-info", "Name")
-    assert listed("hashgrid")[0].fault is None
-    assert isinstance(load_backend("hashgrid"), Backend)
-    assert listed(UNREADABLE) == []
-
-
-def test_malformed_metadata_that_names_our_group_is_reported(site: Site) -> None:
-    site.metadata("stranger-fog", "1.0", "[bidnerf.backends]\nfog\n")
-    (info,) = listed(UNREADABLE)
-    assert info.distribution == "stranger-fog"
-    assert "entry_points.txt" in (info.fault or "")
-    assert "stranger-fog 1.0" in refusal("fog")
-    assert "no backend" in refusal(UNREADABLE)
-    assert listed("hashgrid")[0].fault is None
-
-
-def test_distributions_without_a_name_do_not_hide_each_other(site: Site) -> None:
-    site.module("stranger_fog.py", FOG)
-    for name in ("fog", "mist"):
-        points = f"[bidnerf.backends]\n{name} = stranger_fog:backend\n"
-        site.module(f"{name}-1.0.dist-info/entry_points.txt", points)
-    assert all("unnamed distribution" in listed(name)[0].distribution for name in ("fog", "mist"))
-    assert isinstance(load_backend("mist"), Backend)
+def test_malformed_metadata_is_reported_in_one_line(site: Site) -> None:
+    site.metadata("unrelated", "1.0", "[console_scripts]\nnonsense\n")
+    assert "metadata of an installed package cannot be read" in refusal("hashgrid")
 
 
 def test_metadata_without_the_bundled_plugins_is_to_be_renewed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bidnerf_core.registry._declared", lambda group: ())
-    with refused(found="lists no methods; reinstall bidnerf", error=PluginError):
+    with refused(found="lists no plugins at all; reinstall bidnerf", error=PluginError):
         find_method("auto")
 
 
