@@ -17,7 +17,7 @@ from numbers import Real
 from typing import Annotated, Any, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.io import LARGEST_NUMBER, converted, to_plain
+from bidnerf_core.io import LARGEST_NUMBER, from_plain, to_plain
 
 S = TypeVar("S")
 
@@ -179,7 +179,7 @@ def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
         if dataclasses.is_dataclass(value):
             values[field.name] = _with_values(value, flat, where)
         elif field.name in flat:
-            values[field.name] = converted(hints[field.name], flat[field.name], f"{where}: {field.name}")
+            values[field.name] = from_plain(hints[field.name], flat[field.name], f"{where}: {field.name}")
         else:
             values[field.name] = value
     try:

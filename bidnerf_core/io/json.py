@@ -11,9 +11,7 @@ import functools
 import json
 import math
 import sys
-import types
-import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
@@ -22,12 +20,21 @@ from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.files import read_file
 
 if TYPE_CHECKING:
+    from pydantic_core import SchemaValidator
     from torch import Tensor
 
 _T = TypeVar("_T")
 
 LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
 LARGEST_INTEGER = 2**63 - 1  # the largest that tensors and files can hold
+MEMBER = "(member)"
+"""The part of an error's path that stands for a member of a union, and is no key."""
+EXPECTED = {
+    "bool_type": "bool", "int_type": "int", "float_type": "float", "finite_number": "float", "string_type": "str",
+    "dict_type": "an object", "list_type": "a list", "tuple_type": "a list", "missing": "a longer list",
+    "greater_than_equal": "an integer of at most 64 bits", "less_than_equal": "an integer of at most 64 bits",
+}  # fmt: skip
+"""What messages expect, by the type of pydantic's error; pydantic's own text for others."""
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -199,116 +206,100 @@ def with_tensors(plain: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
 
 
 def from_plain(kind: type[_T], value: Any, where: str) -> _T:
-    """Build an instance of the dataclass ``kind``; missing keys take their defaults. Errors begin with
-    ``where``.
+    """Convert ``value``, as read from JSON, to the type ``kind``: a dataclass, or a list, tuple or dict of these and of plain values.
 
-    Raises ``InputError`` for an unknown key, a missing required key, a value of the wrong type, and values
-    that ``kind`` itself rejects.
+    Missing keys take their defaults, and lists become tuples where ``kind`` says so. Raises ``InputError``, which begins with
+    ``where``, for an unknown key, a missing required key, a value of the wrong type, and values that ``kind`` itself
+    rejects.
     """
-    if not isinstance(value, dict):
-        raise InputError(
-            f"found {_shown(value)}", where=where, expected=f"an object with the fields of {kind.__name__}"
-        )
-    _check_keys(kind, value, where)
-    hints = _hints(typing.cast(Any, kind))
-    fields = {key: converted(hints[key], item, f"{where}: {key}") for key, item in value.items()}
+    from pydantic import ValidationError  # imported here, since many commands read no JSON
+
     try:
-        return kind(**fields)
-    except (TypeError, ValueError) as error:
+        found: _T = _validator(kind).validate_python([value])[0]
+    except ValidationError as error:
+        raise _first_error(error.errors(include_url=False), where) from None
+    except (TypeError, OverflowError) as error:  # raised by a dataclass itself
         raise InputError(error, where=where) from error
+    return found
 
 
 @functools.cache
-def _hints(kind: Any) -> dict[str, Any]:
-    return typing.get_type_hints(kind)
+def _validator(kind: Any) -> SchemaValidator:
+    """Return what validates a list of values of type ``kind``: pydantic takes a configuration for dataclasses within others only."""
+    from pydantic import ConfigDict, TypeAdapter
+    from pydantic_core import SchemaValidator
+
+    config = ConfigDict(arbitrary_types_allowed=True)
+    return SchemaValidator(_strict(TypeAdapter(list[kind], config=config).core_schema))
 
 
-@functools.cache
-def _form(kind: Any) -> tuple[Any, tuple[Any, ...], bool]:
-    """Return the origin and the arguments of a type, and whether it is a dataclass."""
-    return typing.get_origin(kind) or kind, typing.get_args(kind), dataclasses.is_dataclass(kind)
+def _strict(node: Any) -> Any:
+    """Return a schema of pydantic in which numbers and text are of their own type, and only lists may stand for tuples.
+
+    Integers have at most 64 bits, numbers are finite, and a dataclass checks its keys itself.
+    """
+    if isinstance(node, list):
+        return [_strict(part) for part in node]
+    if not isinstance(node, dict):
+        return node
+    given = ("default", "expected", "metadata", "config")  # values of ours rather than parts of the schema
+    found = {key: part if key in given else _strict(part) for key, part in node.items()}
+    match found.get("type"):
+        case "bool" | "str":
+            found["strict"] = True
+        case "float":
+            found |= {"strict": True, "allow_inf_nan": False}
+        case "int":
+            found |= {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER}
+        case "union":
+            found["choices"] = [(choice, MEMBER) for choice in found["choices"]]
+        case "literal":
+            found = {"type": "function-plain", "function": _function(_known, found["expected"])}
+        case "dataclass":
+            reference = {"ref": found.pop("ref")} if "ref" in found else {}
+            check = _function(_checked_keys, found["cls"])
+            found = {"type": "function-before", "schema": found, "function": check, **reference}
+    return found
 
 
-def _check_keys(kind: type, value: dict[str, Any], where: str) -> None:
-    known = {f.name: _is_required(f) for f in dataclasses.fields(kind) if f.init}
+def _function(check: Callable[[Any, Any], Any], given: Any) -> dict[str, Any]:
+    return {"type": "no-info", "function": functools.partial(check, given)}
+
+
+def _known(known: Sequence[Any], value: Any) -> Any:
+    """Return ``value`` if it is one of ``known``, where 1 is not True."""
+    if any(type(value) is type(one) and value == one for one in known):
+        return value
+    raise InputError(f"found {_shown(value)}", expected=" or ".join(map(repr, known)))
+
+
+def _checked_keys(kind: type, value: Any) -> Any:
+    """Return ``value``. Raises ``InputError`` if it is a dictionary without the keys of the dataclass ``kind``."""
+    if not isinstance(value, dict):
+        raise InputError(f"found {_shown(value)}", expected=f"an object with the fields of {kind.__name__}")
+    known = {f.name: f for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in known:
             hint = spelling_hint(key, known)
             expected = None if hint else f"any of {', '.join(known)}"
-            raise InputError(f"{kind.__name__} has no field {key!r}{hint}", where=where, expected=expected)
-    missing = [key for key, required in known.items() if required and key not in value]
-    if missing:
-        raise InputError(
-            f"{', '.join(map(repr, missing))} missing", where=where, expected=f"all fields of {kind.__name__}"
-        )
+            raise InputError(f"{kind.__name__} has no field {key!r}{hint}", expected=expected)
+    nothing = dataclasses.MISSING
+    required = [name for name, f in known.items() if f.default is f.default_factory is nothing]
+    if missing := [repr(name) for name in required if name not in value]:
+        raise InputError(f"{', '.join(missing)} missing", expected=f"all fields of {kind.__name__}")
+    return value
 
 
-def _is_required(field: dataclasses.Field[Any]) -> bool:
-    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-
-
-def converted(kind: Any, value: Any, where: str) -> Any:
-    """Convert ``value``, as read from JSON, to the type ``kind``. Errors begin with ``where``."""
-    origin, arguments, is_dataclass = _form(kind)
-    if kind is Any or (_is_tensor(value) and isinstance(value, kind)):
-        return value
-    if origin is typing.Literal and any(type(value) is type(known) and value == known for known in arguments):
-        return value
-    if is_dataclass:
-        return from_plain(typing.cast(type, kind), value, where)
-    if origin in (typing.Union, types.UnionType):
-        return _first_fit(arguments, value, where)
-    if origin in (tuple, list) and isinstance(value, list | tuple):
-        if all(one is float for one in arguments) and len(arguments) == len(value) and _are_numbers(value):
-            return origin(value)  # the rows of matrices, of which a map may have a million
-        kinds = _kinds_of_items(origin, arguments, len(value))
-        if len(kinds) == len(value):
-            return origin(converted(k, v, where) for k, v in zip(kinds, value, strict=True))
-    elif origin is dict and isinstance(value, dict):
-        inner = arguments[1] if arguments else Any
-        return {key: converted(inner, item, f"{where}.{key}") for key, item in value.items()}
-    elif kind is float and type(value) in (int, float):
-        if abs(value) <= LARGEST_NUMBER:
-            return float(value)
-    elif kind is int and type(value) is int:
-        if abs(value) <= LARGEST_INTEGER:
-            return value
-        raise InputError(f"found {_shown(value)}", where=where, expected="an integer of at most 64 bits")
-    elif type(value) is kind or (value is None and kind is type(None)):
-        return value
-    raise InputError(f"found {_shown(value)}", where=where, expected=_name(kind))
-
-
-def _are_numbers(values: list[Any] | tuple[Any, ...]) -> bool:
-    return all(type(value) is float and math.isfinite(value) for value in values)
-
-
-def _kinds_of_items(origin: type, arguments: tuple[Any, ...], count: int) -> tuple[Any, ...]:
-    if not arguments:
-        return (Any,) * count
-    return arguments[:1] * count if origin is list or arguments[-1:] == (Ellipsis,) else arguments
-
-
-def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
-    records = [kind for kind in kinds if _form(kind)[2]]
-    if isinstance(value, dict) and len(records) == 1 and dict not in (_form(kind)[0] for kind in kinds):
-        return from_plain(records[0], value, where)  # whose message says what is wrong inside
-    for kind in sorted(
-        kinds, key=lambda kind: type(value) is not kind
-    ):  # an exact match comes first: 1 is an int
-        try:
-            return converted(kind, value, where)
-        except InputError:
-            continue
-    raise InputError(f"found {_shown(value)}", where=where, expected=" or ".join(map(_name, kinds)))
-
-
-def _name(kind: Any) -> str:
-    if typing.get_origin(kind) is typing.Literal:
-        return " or ".join(map(repr, typing.get_args(kind)))
-    if kind is type(None):
-        return "null"
-    return kind.__name__ if isinstance(kind, type) else str(kind)
+def _first_error(errors: Sequence[Any], where: str) -> InputError:
+    """Return the first of pydantic's errors, with all types of a union that the value is not of."""
+    first = errors[0]
+    path = [part for part in first["loc"] if isinstance(part, str) and part != MEMBER]
+    place = ": ".join([where, *path])
+    if "error" in first.get("ctx", {}):  # what a dataclass or a check above raised
+        return InputError(first["ctx"]["error"], where=place)
+    texts = {e["type"]: e["msg"].removeprefix("Input should be ") for e in errors if e["loc"] == first["loc"]}
+    expected = dict.fromkeys(EXPECTED.get(kind, text) for kind, text in texts.items())
+    return InputError(f"found {_shown(first['input'])}", where=place, expected=" or ".join(expected))
 
 
 def _shown(value: Any) -> str:

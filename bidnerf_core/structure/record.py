@@ -21,7 +21,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import frame_entry
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import converted, from_plain, read_json, to_plain, write_file
+from bidnerf_core.io import from_plain, read_json, to_plain, write_file
 from bidnerf_core.structure.keypoints import DETECTOR, ListedPhoto
 from bidnerf_core.structure.library import from_colmap
 
@@ -166,7 +166,7 @@ def stored_rows(file: Path, kind: type[Row]) -> list[Row] | None:
     if not file.exists():
         return None
     try:
-        rows: list[Row] = converted(list[kind], read_json(file, "a list"), str(file))  # type: ignore[valid-type]
+        rows: list[Row] = from_plain(list[kind], read_json(file, "a list"), str(file))  # type: ignore[valid-type]
     except InputError as error:
         log.info(f"{error}; recreating it")
         return None
