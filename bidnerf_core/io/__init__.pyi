@@ -17,6 +17,7 @@ from .images import Background as Background
 from .images import ImageSource as ImageSource
 from .images import background_colour as background_colour
 from .images import decode as decode
+from .images import is_heif as is_heif
 from .images import looks_like_image as looks_like_image
 from .images import open_image as open_image
 from .images import over as over
@@ -42,6 +43,7 @@ from .json import to_plain as to_plain
 from .json import with_tensors as with_tensors
 from .memory import available_memory as available_memory
 from .ply import PlyHeader as PlyHeader
+from .ply import check_ply_size as check_ply_size
 from .ply import read_ply as read_ply
 from .ply import read_ply_header as read_ply_header
 from .rows import LARGEST_ROWS as LARGEST_ROWS

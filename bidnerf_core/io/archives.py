@@ -11,15 +11,18 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io.files import PackedFile, open_binary
 
 LARGEST_MEMBER = 256 * 2**20
-"""Largest size of an unpacked member in bytes. A small archive can hold members that unpack to any size."""
+"""Bytes that an unpacked member has at most, unless stated otherwise. A small archive can hold members that unpack to any size."""
 MOST_MEMBERS = 1_000_000
 
 
 class Archive:
     """The members of a zip archive by name. Raises ``InputError`` if the file is not a complete zip archive."""
 
-    def __init__(self, path: Path, expected: str = "a zip archive") -> None:
-        self.path, self._expected = path, expected
+    def __init__(
+        self, path: Path, expected: str = "a zip archive", largest_member: int = LARGEST_MEMBER
+    ) -> None:
+        """``largest_member``: the largest size of an unpacked member in bytes."""
+        self.path, self._expected, self._largest = path, expected, largest_member
         with open_binary(path, expected) as file:
             begins = file.read(2)
         try:
@@ -40,6 +43,11 @@ class Archive:
         """The names of the members, in the order of the archive."""
         return list(self._members)
 
+    @property
+    def unpacked_size(self) -> int:
+        """The bytes of all members together, once they are unpacked."""
+        return sum(member.file_size for member in self._zip.infolist())
+
     def __contains__(self, name: str) -> bool:
         return name in self._members
 
@@ -54,11 +62,11 @@ class Archive:
             raise InputError(
                 f"not found in the archive, which holds {amount(len(self._members), 'file')}", where=where
             )
-        if member.file_size > LARGEST_MEMBER:
+        if member.file_size > self._largest:
             raise self._too_large(where, member.file_size)
         try:
             with self._zip.open(member) as file:
-                content = file.read(LARGEST_MEMBER + 1)
+                content = file.read(self._largest + 1)
         except (
             zipfile.BadZipFile,
             zlib.error,
@@ -69,10 +77,10 @@ class Archive:
             ValueError,
         ) as error:
             raise InputError(f"cannot be unpacked ({error})", where=where, expected=self._expected) from error
-        if len(content) > LARGEST_MEMBER:
+        if len(content) > self._largest:
             raise self._too_large(where, len(content))
         return content
 
     def _too_large(self, where: str, size: int) -> InputError:
-        found, most = (f"{count / 2**20:,.0f} MiB" for count in (size, LARGEST_MEMBER))
+        found, most = (f"{count / 2**20:,.0f} MiB" for count in (size, self._largest))
         return InputError(f"unpacks to {found}", where=where, expected=f"at most {most}")

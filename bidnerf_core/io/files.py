@@ -8,16 +8,14 @@ import os
 import re
 import secrets
 import stat
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from bidnerf_core.errors import InputError
+from filelock import lock_descriptor
 
-if sys.platform != "win32":
-    import fcntl
+from bidnerf_core.errors import InputError
 
 LARGEST_TEXT = 128 * 2**20
 """Bytes. Parsed text takes ten times as much memory as its file, so the size is checked before reading."""
@@ -147,36 +145,27 @@ def locked(path: Path) -> Iterator[None]:
     except FileNotFoundError as error:
         raise used from error
     try:
-        if not (take_lock(number) and _is_still(path, number)):
+        try:
+            taken = take_lock(number) and os.path.samestat(os.fstat(number), path.stat())
+        except FileNotFoundError:  # the process that held the lock removed the folder
+            taken = False
+        if not taken:
             raise used
         yield
     finally:
         os.close(number)
 
 
-def _is_still(path: Path, number: int) -> bool:
-    """Return whether a path still names the file of an open descriptor."""
-    try:
-        return os.path.samestat(os.fstat(number), path.stat())
-    except FileNotFoundError:
-        return False
-
-
 def take_lock(number: int) -> bool:
-    """Lock the file of an open descriptor until it is closed; return False if another process holds the lock.
+    """Lock the file or folder of an open descriptor until it is closed; return False if another process holds the lock.
 
-    The system releases the lock even if the process is killed. On Windows, and on file systems without locks, nothing is
-    locked and the result is True.
+    The system releases the lock even if the process is killed. On file systems without locks, nothing is locked and the result
+    is True.
     """
-    if sys.platform == "win32":
-        return True
     try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        pass
-    return True
+        return lock_descriptor(number, blocking=False)
+    except OSError:
+        return True
 
 
 def _sync_folder(folder: Path) -> None:

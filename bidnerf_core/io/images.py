@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -51,6 +52,11 @@ CONVERTED = ("CMYK", "YCbCr", "HSV")
 # filter is set once and with the lowest precedence: filters belong to the whole process, so threads that
 # changed and restored them while reading images would leave each other's filters behind.
 warnings.filterwarnings("ignore", module=r"PIL\.", append=True)
+SEGMENT = re.compile(rb"\xff([\xc0-\xcf\xd8-\xfe])")
+"""The beginning of a segment of a JPEG file; within a scan, 0xff is followed by 0 or a restart marker."""
+MOST_SCANS, MOST_SEGMENTS = 100, 1000
+"""Scans and segments in a JPEG file. Each scan goes through the whole image, and libjpeg's usual script has ten of them;
+of segments, the depth map that a phone stores with a photo takes a few hundred."""
 FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
 COLOUR_ROUNDING = 1e-3
 """Tolerance by which a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
@@ -83,19 +89,15 @@ def read_image(
     result are in memory. Raises ``InputError`` if the file is not a complete image with 1 to 4 channels of 8
     or 16 bits, or is too large.
     """
-    rgb, alpha = None, None
+    rgb, alpha = _Rows(), _Rows()
     with open_image(path) as image:
         height, width = image.height, image.width if size is None else size[0]
-        for top, strip, full in _scaled_strips(path, image):
+        for strip, full in _strips(path, image):
             colour, cover = channels(strip, f"{path}: image decodes to", full)
-            laid = over(colour, cover, background)
-            if width != image.width:
-                laid = reduced(laid, width, len(strip))
-                cover = None if cover is None else reduced(cover, width, len(strip))
-            rgb = _placed(rgb, laid.numpy(), top, height)
-            alpha = None if cover is None else _placed(alpha, cover.numpy(), top, height)
-    assert rgb is not None  # every image has rows
-    found, mask = torch.from_numpy(rgb), None if alpha is None else torch.from_numpy(alpha)
+            for rows, part in ((rgb, over(colour, cover, background)), (alpha, cover)):
+                if part is not None:
+                    rows.add(part if width == image.width else reduced(part, width, len(strip)), height)
+    found, mask = rgb.whole(), None if cover is None else alpha.whole()
     if size is None or size[1] == height:
         return found, mask
     return reduced(found, *size), None if mask is None else reduced(mask, *size)
@@ -110,31 +112,33 @@ def read_compact_image(
     Images downscaled to ``size`` (width, height) have bytes as well; a JPEG file is decoded no larger than
     needed.
     """
-    if size is not None:
-        return _read_reduced(path, background, size)
-    rgb = None
+    pixels = _Rows()
     with open_image(path) as image:
         if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
-            for top, strip in _strips(path, image):
-                colours = strip if strip.ndim == 3 else np.repeat(strip[..., None], 3, axis=2)
-                rgb = _placed(rgb, colours, top, image.height)
-    return read_image(path, background) if rgb is None else (torch.from_numpy(rgb), None)
-
-
-def _read_reduced(
-    path: ImageSource, background: Sequence[float], size: tuple[int, int]
-) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
-    with open_image(path) as image:
-        if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
-            _decode_smaller(image, size)
-            pixels = None
-            for top, strip in _strips(path, image):
-                pixels = _placed(pixels, strip, top, image.height)
-            assert pixels is not None  # every image has rows
-            small = reduced(torch.from_numpy(pixels), *size)
-            return (small if small.ndim == 3 else small[..., None].expand(*small.shape, 3).contiguous()), None
+            if size is not None:
+                _decode_smaller(image, size)
+            for strip, _ in _strips(path, image):
+                pixels.add(torch.from_numpy(strip), image.height)
+            found = pixels.whole() if size is None else reduced(pixels.whole(), *size)
+            return (found if found.ndim == 3 else found[..., None].repeat(1, 1, 3)), None
     rgb, alpha = read_image(path, background, size)
-    return (rgb * FULL_SCALE["uint8"]).round_().to(torch.uint8), alpha
+    return rgb if size is None else (rgb * FULL_SCALE["uint8"]).round_().to(torch.uint8), alpha
+
+
+class _Rows:
+    """An image that is put together from strips, from top to bottom; its memory is allocated for the first one."""
+
+    def __init__(self) -> None:
+        self._image, self._count = torch.empty(0), 0
+
+    def add(self, strip: Shaped[Tensor, "n w *c"], height: int) -> None:
+        if self._count == 0:
+            self._image = strip.new_empty((height, *strip.shape[1:]))
+        self._image[self._count : self._count + len(strip)] = strip
+        self._count += len(strip)
+
+    def whole(self) -> Shaped[Tensor, "h w *c"]:
+        return self._image
 
 
 def _decode_smaller(image: Image.Image, size: tuple[int, int]) -> None:
@@ -266,18 +270,20 @@ def decode(path: ImageSource) -> np.ndarray:
     Raises ``InputError`` if the file is not a complete image, and for colour spaces other than grey and RGB.
     """
     with open_image(path) as image:
-        return _decoded(path, image)
+        return _pixels(path, image)
 
 
-def _scaled_strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.ndarray, int | None]]:
-    """Yield strips like ``_strips``, each with the value of white; None is the largest of its type."""
-    if not _is_deep(image):
-        yield from ((top, strip, None) for top, strip in _strips(path, image))
-        return
-    whole = _decoded(path, image)
-    full = _used_range(whole)
+def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray, int | None]]:
+    """Yield the pixels of strips of an open image, from top to bottom, and the value of white if it is not that of the type."""
+    whole = _pixels(path, image) if _is_deep(image) else None
+    full = None if whole is None else _used_range(whole)
     rows = max(1, STRIP // image.width)
-    yield from ((top, whole[top : top + rows], full) for top in range(0, image.height, rows))
+    for top in range(0, image.height, rows):
+        last = min(top + rows, image.height)
+        if whole is None:
+            yield _pixels(path, image.crop((0, top, image.width, last))), full
+        else:
+            yield whole[top:last], full
 
 
 def _used_range(pixels: np.ndarray) -> int:
@@ -304,57 +310,24 @@ def _is_deep_colour(image: Image.Image) -> bool:
     return image.mode in ("LA", "RGB", "RGBA") and isinstance(raw, str) and ";16" in raw
 
 
-def _decoded(path: ImageSource, image: Image.Image) -> np.ndarray:
-    """Return the pixels of an open image as stored."""
-    pixels = None
-    if _is_deep_colour(image):
-        return _deep_colours(path)
-    for top, strip in _strips(path, image):
-        pixels = _placed(pixels, strip, top, image.height)
-    assert pixels is not None  # every image has rows
-    return pixels
-
-
-def _deep_colours(path: ImageSource) -> np.ndarray:
-    """Decode an image with 16 bits per channel using OpenCV."""
-    import cv2  # imported here, since most images have 8 bits
-
-    with open_binary(path, "an image file") as file:
-        found = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
-    if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
-        raise InputError(
-            "not readable as an image with 16 bits per channel", where=path, expected="a complete image file"
-        )
-    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
-
-
-def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the first row and the pixels of each strip of an open image, from top to bottom."""
+def _pixels(path: ImageSource, image: Image.Image) -> np.ndarray:
+    """Return the pixels of an image as stored, (h, w) or (h, w, channels)."""
     if image.mode == "LAB":
         raise InputError(f"image is {image.mode}", where=path, expected="grey, RGB, RGBA or CMYK")
-    rows = max(1, STRIP // image.width)
-    for top in range(0, image.height, rows):
-        last = min(top + rows, image.height)
-        strip = image if rows >= image.height else image.crop((0, top, image.width, last))
-        if strip.mode in ("P", "PA"):
-            strip = strip.convert("RGBA" if image.has_transparency_data else "RGB")
-        elif strip.mode in CONVERTED:
-            strip = strip.convert("RGB")
-        pixels = np.array(strip)
-        sixteen_bits = image.format == "PNG" and pixels.dtype == np.int32  # Pillow before 11.3
-        yield top, pixels.astype(np.uint16) if sixteen_bits else pixels
+    if _is_deep_colour(image):
+        import cv2  # imported here, since most images have 8 bits
 
-
-def _placed(whole: np.ndarray | None, strip: np.ndarray, top: int, height: int) -> np.ndarray:
-    """Write a strip, starting at row ``top``, into an array of ``height`` rows, which is allocated for the
-    first strip.
-    """
-    if len(strip) == height:
-        return strip
-    if whole is None:
-        whole = np.empty((height, *strip.shape[1:]), strip.dtype)
-    whole[top : top + len(strip)] = strip
-    return whole
+        with open_binary(path, "an image file") as file:
+            deep = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
+        if deep is None or deep.ndim != 3 or deep.shape[2] not in (3, 4):
+            found = "not readable as an image with 16 bits per channel"
+            raise InputError(found, where=path, expected="a complete image file")
+        return cv2.cvtColor(deep, cv2.COLOR_BGR2RGB if deep.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+    if image.mode in ("P", "PA", *CONVERTED):
+        image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+    pixels = np.array(image)
+    # Pillow before 11.3 has 32 bits for a PNG of 16; other formats have them themselves, and are refused.
+    return pixels.astype(np.uint16) if image.format == "PNG" and pixels.dtype == np.int32 else pixels
 
 
 @contextlib.contextmanager
@@ -368,14 +341,17 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
         if is_heif(file.read(12)):
             _register_heif(path)
         file.seek(0)
+        _check_segments(path, file)
         try:
             with Image.open(file, formats=_formats()) as image:
-                _check_pixels(path, image.width, image.height)
+                if image.width * image.height > LARGEST_IMAGE:
+                    megapixels = image.width * image.height / 1e6
+                    raise _too_large(path, f"{image.width}x{image.height}, {megapixels:.0f} megapixels")
                 yield image
         except InputError:
             raise
         except Image.DecompressionBombError as error:
-            raise _too_large(path, "more than 178 megapixels") from error
+            raise _too_large(path, f"more than {LARGEST_IMAGE // 10**6} megapixels") from error
         except Exception as error:  # decoders may raise anything, even SyntaxError
             raise InputError(
                 f"not readable as an image ({_why_unreadable(file, error)})",
@@ -400,9 +376,21 @@ def _why_unreadable(file: BinaryIO, error: Exception) -> str:
     return reason(error)
 
 
-def _check_pixels(path: ImageSource, width: int, height: int) -> None:
-    if width * height > LARGEST_IMAGE:
-        raise _too_large(path, f"{width}x{height}, {width * height / 1e6:.0f} megapixels")
+def _check_segments(path: ImageSource, file: BinaryIO) -> None:
+    """Raise ``InputError`` for a JPEG file whose decoding takes far longer than its size suggests; rewind others."""
+    content = file.read() if file.read(2) == b"\xff\xd8" else b""
+    file.seek(0)
+    at, scans, segments = 0, 0, 0
+    while marker := SEGMENT.search(content, at):
+        code, segments = marker[1], segments + 1
+        scans += code == b"\xda"
+        if code == b"\xd9":  # the end of the image, after which phones store videos
+            return
+        if scans > MOST_SCANS or segments > MOST_SEGMENTS:
+            found = f"has more than {MOST_SCANS} scans or {MOST_SEGMENTS} segments"
+            raise InputError(found, where=path, expected="a JPEG file of fewer")
+        length = content[marker.end() : marker.end() + 2]
+        at = marker.end() + (0 if code == b"\xd8" else max(2, int.from_bytes(length, "big")))
 
 
 def _too_large(path: ImageSource, size: str) -> InputError:
@@ -410,7 +398,7 @@ def _too_large(path: ImageSource, size: str) -> InputError:
 
 
 def is_heif(head: bytes) -> bool:
-    """Return whether the first 12 bytes of a file identify it as HEIF, such as an iPhone's HEIC, whatever its name."""
+    """Return whether the first 12 bytes of a file, or more, identify it as HEIF, such as an iPhone's HEIC, whatever its name."""
     return head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS
 
 

@@ -5,8 +5,8 @@ allocated.
 from __future__ import annotations
 
 import io
-import os
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -44,7 +44,7 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The header of a file."""
+    """The header of a PLY file: the elements that it declares, and how their numbers are written."""
 
     order: str  # byte order, in NumPy's notation; "=" for a text file
     elements: tuple[PlyElement, ...]
@@ -69,27 +69,30 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
     """
     with open_binary(path, expected) as file:
         header = _header(file, path, expected)
-        left = os.fstat(file.fileno()).st_size - header.length
+        check_ply_size(path, header)
         found: dict[str, np.ndarray] = {}
-        for element in header.elements:
-            if element.has_lists:
-                break
+        for element in itertools.takewhile(lambda element: not element.has_lists, header.elements):
             kind = np.dtype([(name, header.order + of) for name, of in element.properties])
-            is_text = header.order == "="
-            size = SHORTEST_NUMBER * len(element.properties) if is_text else kind.itemsize
-            if element.count * size > left + is_text:
-                raise InputError(
-                    f"declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of data"
-                    " are too few for them; is the file truncated?",
-                    where=path,
-                )
-            found[element.name] = (
-                _text_rows(file, element.count, kind, path)
-                if is_text
-                else np.frombuffer(file.read(element.count * size), dtype=kind)
-            )
-            left -= element.count * size
+            if header.order == "=":
+                found[element.name] = _text_rows(file, element.count, kind, path)
+            elif kind.itemsize:
+                found[element.name] = np.frombuffer(file.read(element.count * kind.itemsize), dtype=kind)
         return found
+
+
+def check_ply_size(path: Path, header: PlyHeader) -> None:
+    """Raise ``InputError`` if a file is too small for the elements that its header declares."""
+    left = path.stat().st_size - header.length
+    for element in header.elements:
+        binary = sum(np.dtype(of).itemsize for _, of in element.properties)
+        size = SHORTEST_NUMBER * len(element.properties) if header.order == "=" else binary
+        if element.count * (size + element.has_lists) > left + 1:  # the last line of a text may lack its end
+            raise InputError(
+                f"declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of data"
+                " are too few for them; is the file truncated?",
+                where=path,
+            )
+        left -= element.count * (size + element.has_lists)
 
 
 def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
@@ -132,13 +135,10 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
 
 def _with_property(element: PlyElement, words: list[str]) -> PlyElement:
     if words[1] == "list":
-        return PlyElement(element.name, element.count, element.properties, True)
-    name = words[2]
-    if name in element.names:
+        return replace(element, has_lists=True)
+    if words[2] in element.names:
         raise ValueError
-    return PlyElement(
-        element.name, element.count, (*element.properties, (name, TYPES[words[1]])), element.has_lists
-    )
+    return replace(element, properties=(*element.properties, (words[2], TYPES[words[1]])))
 
 
 def _text_rows(file: BinaryIO, count: int, kind: np.dtype, path: Path) -> np.ndarray:

@@ -6,7 +6,6 @@ import io
 import math
 import os
 import struct
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -17,6 +16,7 @@ from safetensors.torch import load as tensors_from_bytes
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.archives import Archive
 from bidnerf_core.io.files import open_binary
 from bidnerf_core.io.json import parse_json
 
@@ -44,20 +44,12 @@ def read_array(path: Path, expected: str) -> np.ndarray:
 
 def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, np.ndarray]:
     """Read those of the arrays ``names`` that a ``.npz`` file holds. Raises ``InputError`` as ``read_array`` does."""
-    with open_binary(path, expected) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                held = {name: f"{name}.npy" for name in names if f"{name}.npy" in archive.namelist()}
-                return {name: _member(archive, member) for name, member in held.items()}
-        except Exception as error:  # as above; zipfile also raises errors of its own
-            raise _unreadable(path, error, expected) from error
-
-
-def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    size = archive.getinfo(name).file_size
-    if size > LARGEST_ARRAY:
-        raise ValueError(f"{name} has {size / 2**20:,.0f} MiB")
-    return _array(io.BytesIO(archive.read(name)), size)
+    archive = Archive(path, expected, LARGEST_ARRAY)
+    found = {name: archive.read(f"{name}.npy") for name in names if f"{name}.npy" in archive}
+    try:
+        return {name: _array(io.BytesIO(content), len(content)) for name, content in found.items()}
+    except Exception as error:  # as above
+        raise _unreadable(path, error, expected) from error
 
 
 def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.archives import Archive
 
 CODE = re.compile(r"GLOBAL ([\w.]+)")
 """How torch names the object that a file tried to call."""
@@ -51,16 +52,24 @@ def outline_of(path: Path, expected: str) -> Any:
 
     Files in the format of torch before version 1.6, which are not zip archives, cannot be mapped and are read.
     """
-    return _read(path, expected, mapped=zipfile.is_zipfile(path))
+    return _read(path, expected, mapped=True)
 
 
 def _read(path: Path, expected: str, mapped: bool) -> Any:
     if not path.is_file():
         raise InputError("no such file", where=path, expected=expected)
     path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
+    archive = Archive(path, expected) if zipfile.is_zipfile(path) else None
+    if archive is not None and archive.unpacked_size > path.stat().st_size:
+        found = f"unpacks to {archive.unpacked_size / 2**20:,.0f} MiB"
+        raise InputError(
+            found, where=path, expected=f"{expected} that is not compressed, as torch.save writes it"
+        )
     try:
         with torch.serialization.safe_globals([(_Ignored, name) for name in STAND_INS]):
-            found = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+            found = torch.load(
+                path, map_location="cpu", weights_only=True, mmap=mapped and archive is not None
+            )
     except Exception as error:  # each kind of damage raises a different exception
         code = CODE.search(str(error))
         if isinstance(error, pickle.UnpicklingError) and code:

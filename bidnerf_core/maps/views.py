@@ -205,8 +205,7 @@ def useful_size(frame: Frame, count: int) -> int:
 
     It is ``USEFUL_SIDE``, or less if the images would not fit into memory, but not less than ``LEAST_SIDE``.
     """
-    available = available_memory()
-    most = MOST_BYTES if available is None else min(MOST_BYTES, available // 4)
+    most = min(MOST_BYTES, available_memory() // 4)
     longer = max(frame.intrinsics.width, frame.intrinsics.height)
     fitting = int(longer * (most / (count * bytes_of(frame))) ** 0.5)
     return min(USEFUL_SIDE, max(LEAST_SIDE, fitting))

@@ -11,10 +11,10 @@ from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import Photos
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Background, read_array, read_header
+from bidnerf_core.io import Background, is_heif, read_array, read_header
 from bidnerf_core.results import read_pose
 
-NUMPY, HEIF_BRANDS = b"\x93NUMPY", (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"heim", b"heis")
+NUMPY = b"\x93NUMPY"
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Upload:
 def _written(folder: Path, name: str, content: bytes) -> Path:
     """Write an image under a name with the extension that readers expect."""
     ending = ".npy" if content.startswith(NUMPY) else ""
-    if content[4:8] == b"ftyp" and content[8:12] in HEIF_BRANDS:
+    if is_heif(content):
         ending = ".heic"
     file = folder / f"{name}{ending}"
     file.write_bytes(content)

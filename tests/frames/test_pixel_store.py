@@ -31,7 +31,6 @@ from bidnerf_core.frames import (
     storage,
 )
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import memory
 from bidnerf_core.mapping.landmarks import tracks
 from bidnerf_core.maps import read_views
 from bidnerf_core.maps import views as views_of_map
@@ -189,7 +188,6 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
     assert "2 images of 192x120 read at 96x60, 0 MB; --largest (largest=) sets another size" in caplog.text
     monkeypatch.setattr(views_of_map, "MOST_BYTES", 10_000)
     monkeypatch.setattr(views_of_map, "LEAST_SIDE", 20)
-    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
     frame = open_dataset(tmp_path).views("train", ["1"])[0].frame
     for count in (1, 10, 1000):
         side = views_of_map.useful_size(frame, count)

@@ -304,7 +304,7 @@ def test_an_archive_that_unpacks_to_more_than_an_image_is_refused(
 ) -> None:
     monkeypatch.setattr("bidnerf_core.io.tensors.LARGEST_ARRAY", 10**6)
     np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**5, 3)))
-    with pytest.raises(InputError, match=r"points\.npy has 2 MiB"):
+    with pytest.raises(InputError, match=r"points\.npy: unpacks to 2 MiB"):
         read_depth_points(tmp_path / "a.npz")
 
 

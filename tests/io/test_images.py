@@ -252,6 +252,29 @@ def test_a_large_image_that_is_reduced_takes_little_memory(tmp_path: Path) -> No
     tracemalloc.stop()
 
 
+@READERS
+@pytest.mark.parametrize(
+    "repeated",
+    [b"\xff\xe1\x00\x04ab", b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00\x00"],
+    ids=["segments", "scans"],
+)
+def test_a_jpeg_of_endless_segments_or_scans_is_refused(
+    tmp_path: Path, read: Callable[[Path], object], repeated: bytes
+) -> None:
+    path = tmp_path / "a.jpg"
+    image = Image.fromarray(noise(40, 60))
+    image.save(
+        path, progressive=True, comment=b"\xff\xda" * 300, exif=b"Exif\0\0" + b"\xff\xe1\xff\xd9" * 3000
+    )
+    read(path)  # nothing within a segment counts
+    content = path.read_bytes()
+    path.write_bytes(content + repeated * 5000)  # nor what follows the image, where phones store a video
+    read(path)
+    path.write_bytes(content[:2] + repeated * 5000 + content[2:])
+    with refused(where=path, found="more than 100 scans or 1000 segments"):
+        read(path)
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
 def test_every_cut_of_a_file_is_one_line(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"

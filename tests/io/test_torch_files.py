@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -101,3 +102,15 @@ def test_a_number_that_stands_for_many(saved: Saved) -> None:
         path = saved({"a": [large]})
         with refused(where=path, found="has only", expected="a checkpoint"):
             check_sizes(path, read_saved(path, "a checkpoint"), "a checkpoint")
+
+
+def test_an_archive_that_unpacks_to_more_than_its_size_is_not_unpacked(saved: Saved) -> None:
+    path = saved({"a": torch.zeros(2**20)})
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    for read in (read_saved, outline_of):
+        with refused(where=path, found="unpacks to 4 MiB", expected="a checkpoint that is not compressed"):
+            read(path, "a checkpoint")

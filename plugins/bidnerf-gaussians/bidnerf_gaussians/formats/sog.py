@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import warnings
-import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import parse_json, read_file
+from bidnerf_core.io import Archive, parse_json, read_file
 from bidnerf_gaussians.formats.parts import gaussians_of, logit, smallest_three
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 
@@ -42,21 +40,19 @@ def read(path: Path) -> Gaussians:
     """Read the Gaussians of a folder or archive of version 2. Raises ``InputError`` for other versions, and
     if it is damaged.
     """
-    with _opened(path) as member:
-        meta = parse_json(member(META), f"{path}: {META}", EXPECTED)
-        try:
-            return _decoded(meta, member, path)
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError, OSError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"is damaged ({type(error).__name__}: {error})", where=path, expected=EXPECTED
-            ) from error
+    member = _members(path)
+    meta = parse_json(member(META), f"{path}: {META}", EXPECTED)
+    try:
+        return _decoded(meta, member, path)
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OSError) as error:
+        found = f"is damaged ({type(error).__name__}: {error})"
+        raise InputError(found, where=path, expected=EXPECTED) from error
 
 
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Member]:
-    """Yield a function that returns the content of a member, whose size is checked before it is unpacked."""
+def _members(path: Path) -> Member:
+    """Return a function that returns the content of a member, whose size is checked before it is unpacked."""
     if path.suffix.lower() != ".sog":
         folder = path.parent if path.name == META else path
 
@@ -65,33 +61,8 @@ def _opened(path: Path) -> Iterator[Member]:
                 raise InputError(f"names a file {name!r}", where=path, expected=f"one next to {META}")
             return read_file(folder / name, f"a part of {EXPECTED}", LARGEST_MEMBER)
 
-        yield of_folder
-        return
-    try:
-        archive = zipfile.ZipFile(path)
-    except Exception as error:  # damaged archives raise errors of many types
-        raise InputError(f"is not a zip archive ({error})", where=path, expected=EXPECTED) from error
-    with archive:
-
-        def of_archive(name: str) -> bytes:
-            try:
-                size = archive.getinfo(name).file_size
-                if size > LARGEST_MEMBER:
-                    raise InputError(
-                        f"{name} unpacks to {size / 2**20:,.0f} MiB", where=path, expected="at most 512"
-                    )
-                with archive.open(name) as file:
-                    return file.read(LARGEST_MEMBER)
-            except InputError:
-                raise
-            except (
-                Exception
-            ) as error:  # raised by zipfile and its decompressors; an encrypted member raises another one
-                raise InputError(
-                    f"contains no readable {name} ({error})", where=path, expected=EXPECTED
-                ) from error
-
-        yield of_archive
+        return of_folder
+    return Archive(path, EXPECTED, LARGEST_MEMBER).read
 
 
 def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:

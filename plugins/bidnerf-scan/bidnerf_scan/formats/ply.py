@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import PlyHeader, read_ply, read_ply_header
+from bidnerf_core.io import check_ply_size, read_ply, read_ply_header
 from bidnerf_scan.formats import by_trimesh
 from bidnerf_scan.scan import Scan
 
@@ -40,7 +40,7 @@ def read(path: Path) -> Scan:
     if vertex.count == 0:
         raise InputError("holds no vertices", where=path, expected=EXPECTED)
     if face is not None and face.count:
-        _check_size(path, header)
+        check_ply_size(path, header)
         return by_trimesh.read(path, EXPECTED)
     rows = read_ply(path, EXPECTED).get("vertex")
     if rows is None:
@@ -59,19 +59,3 @@ def _colours(rows: NDArray) -> NDArray[np.float32] | None:
     if kind.kind in "ui":
         return rgb / np.float32(np.iinfo(kind).max)
     return rgb / np.float32(255) if len(rgb) and np.nanmax(rgb) > 1.5 else rgb
-
-
-def _check_size(path: Path, header: PlyHeader) -> None:
-    """Raise ``InputError`` if the declared elements need more bytes than the file has."""
-    left = path.stat().st_size - header.length
-    for element in header.elements:
-        width = sum(np.dtype(kind).itemsize for _, kind in element.properties)
-        least = 2 * len(element.properties) if header.order == "=" else width
-        least += 1 if element.has_lists else 0
-        if element.count * least > left + 1:
-            raise InputError(
-                f"declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of data are"
-                " too few for them; is the file truncated?",
-                where=path,
-            )
-        left -= element.count * least
