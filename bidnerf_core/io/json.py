@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.files import read_file
@@ -215,7 +215,7 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
     from pydantic import ValidationError  # imported here, since many commands read no JSON
 
     try:
-        found: _T = _validator(kind).validate_python([value])[0]
+        found: _T = _validator(cast(Any, kind)).validate_python([value])[0]
     except ValidationError as error:
         raise _first_error(error.errors(include_url=False), where) from None
     except (TypeError, OverflowError) as error:  # raised by a dataclass itself
