@@ -20,7 +20,7 @@ from pathlib import Path
 from _lab import one_thread
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.maps import train
+from bidnerf_core.maps import TrainOptions, train
 
 CONFIG = {"steps": 1500, "seed": 0}
 VERSION = 1
@@ -57,7 +57,12 @@ def main() -> None:
         if not folder.exists():
             # An interrupted training leaves nothing that could be taken for a finished map.
             partial = folder.with_name(f"{folder.name}.partial")
-            train(folder_of("BIDNERF_DATA") / scene, out=partial, config=CONFIG, overwrite=True)
+            train(
+                folder_of("BIDNERF_DATA") / scene,
+                out=partial,
+                config=CONFIG,
+                options=TrainOptions(overwrite=True),
+            )
             partial.rename(folder)
         print(f"{folder}: {time.process_time() - began:.0f} s of CPU time", flush=True)
 

@@ -158,9 +158,10 @@ def extended(scene: Scene, first: int, steps: int, work: Path) -> dict[str, Any]
         bn.load_map(work / "first").save(folder, overwrite=True)
         bn.extend(folder, rest, old)
 
-    kept("first", lambda folder: bn.train(some, out=folder, overwrite=True, **options))
+    replacing = bn.TrainOptions(overwrite=True)
+    kept("first", lambda folder: bn.train(some, out=folder, options=replacing, **options))
     kept("extended", lambda folder: grown(folder, None))
-    kept("all", lambda folder: bn.train(views, out=folder, overwrite=True, **options))
+    kept("all", lambda folder: bn.train(views, out=folder, options=replacing, **options))
     kept("extended_with_data", lambda folder: grown(folder, some))
     return {"first": first, "added": len(rest), "steps": steps, "maps": results}
 

@@ -28,6 +28,7 @@ from bidnerf_core import (
     InputError,
     Localizer,
     Map,
+    TrainOptions,
     View,
     load_map,
     open_dataset,
@@ -36,6 +37,7 @@ from bidnerf_core import (
     resume,
     train,
 )
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, tracked_views
 
 GROWN = 3
@@ -134,10 +136,19 @@ def trained(out: Path, views: Sequence[View], steps: int, background: tuple[floa
     """Train a map in the folder ``out``, or go on where that was interrupted."""
     if (out / "map.json").exists():
         try:
-            return resume(out, views, background=background, checkpoint_seconds=30)
+            return resume(
+                out,
+                views,
+                options=TrainOptions(images=DatasetOptions(background=background), checkpoint_seconds=30),
+            )
         except InputError:  # nothing is left to do
             return load_map(out)
-    return train(views, out=out, config={"steps": steps}, background=background, checkpoint_seconds=30)
+    return train(
+        views,
+        out=out,
+        config={"steps": steps},
+        options=TrainOptions(images=DatasetOptions(background=background), checkpoint_seconds=30),
+    )
 
 
 def measured(data: Path, way: str, steps: int, share: float, work: Path) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from _lab import (
     record,
 )
 
-from bidnerf_core import Localizer, Map, export_map, import_map, load_map
+from bidnerf_core import ImportOptions, Localizer, Map, export_map, import_map, load_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import RowStore
 from bidnerf_core.frames import View
@@ -81,9 +81,8 @@ def returned(scene: Scene, name: str, folder: Path) -> Map:
             written / way.file,
             place,
             config={"background": scene.map.bounds.background},
-            T_world_file=read_pose(pose) if pose.exists() else None,
             photos=scene.data if way.has_photos else None,
-            overwrite=True,
+            options=ImportOptions(T_world_file=read_pose(pose) if pose.exists() else None, overwrite=True),
         )
 
 

@@ -26,7 +26,7 @@ from _lab import RESULTS, Row, cpu_seconds, held_out, judgement, one_thread, par
 from clouds import Gicp, KissMatcher, Open3d, Points, Ransac, Refine, SmallGicp, measured_points
 from landmark_peers import Answer, Peer, answer, auto, kiss_gicp, open3d
 
-from bidnerf_core import Localizer, View, import_map, load_map
+from bidnerf_core import ImportOptions, Localizer, View, import_map, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import RowStore
@@ -101,7 +101,9 @@ def localizer(name: str, data: Path, folder: Path) -> Localizer:
         if found.surface is None:
             raise InputError("not finished")
     except InputError:
-        import_map(folder / file, place, photos=data if has_photos else None, overwrite=True)
+        import_map(
+            folder / file, place, photos=data if has_photos else None, options=ImportOptions(overwrite=True)
+        )
         found = load_map(place)
     return Localizer(found)
 

@@ -2,6 +2,7 @@ from .backend import RecipeBackend as RecipeBackend
 from .backend import load_backend as load_backend
 from .camera import Intrinsics as Intrinsics
 from .datasets import Dataset as Dataset
+from .datasets import DatasetOptions as DatasetOptions
 from .datasets import FrameSequence as FrameSequence
 from .datasets import open_dataset as open_dataset
 from .datasets import open_sequence as open_sequence
@@ -41,12 +42,14 @@ from .localization import TrackerConfig as TrackerConfig
 from .localization import settings_of as settings_of
 from .mapping import BakeConfig as BakeConfig
 from .maps import ImportedField as ImportedField
+from .maps import ImportOptions as ImportOptions
 from .maps import Map as Map
 from .maps import MapCollection as MapCollection
 from .maps import MapSummary as MapSummary
 from .maps import Placement as Placement
 from .maps import RenderingScores as RenderingScores
 from .maps import ScaleFit as ScaleFit
+from .maps import TrainOptions as TrainOptions
 from .maps import extend as extend
 from .maps import factor_of_distance as factor_of_distance
 from .maps import factor_of_poses as factor_of_poses

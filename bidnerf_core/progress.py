@@ -64,6 +64,11 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
         _JOB.reset(token)
 
 
+def current_job() -> Job:
+    """Return the job of this thread's work, for those who hand its functions to another thread or call them in their own way."""
+    return _JOB.get()
+
+
 def check_cancelled(stage: str = "localization", cancel: Cancel | None = None) -> None:
     """Raise ``Cancelled`` if this thread's work should stop, see ``job_context``. Called once per iteration of a long loop."""
     cancel = cancel or _JOB.get().cancel

@@ -14,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, multiplied
 
 LARGEST_NOISE = 1e6  # pixels
 MOST_NAMED = 6
@@ -48,6 +48,20 @@ class StoredCamera:
         given = self.given_T_world_camera
         moved = None if given is None else _rows(_pose(given).translated(offset))
         return replace(self, T_world_camera=_rows(self.pose.translated(offset)), given_T_world_camera=moved)
+
+    def scaled(self, factor: float) -> StoredCamera:
+        """Return the camera in a world with lengths multiplied by ``factor``."""
+
+        def rows(matrix: MatrixRows) -> MatrixRows:
+            return (*((a, b, c, t * factor) for a, b, c, t in matrix[:3]), matrix[3])
+
+        given, motion = self.given_T_world_camera, self.motion
+        return replace(
+            self,
+            T_world_camera=rows(self.T_world_camera),
+            given_T_world_camera=None if given is None else rows(given),
+            motion=None if motion is None else (*multiplied(motion[:3], factor), *motion[3:]),
+        )
 
     def posed(self, view: View) -> View:
         """Return the view with this pose and motion."""

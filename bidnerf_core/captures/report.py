@@ -5,9 +5,10 @@ The records are plain JSON-serializable data; ``captures.advice`` puts them into
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+from bidnerf_core.geometry import multiplied
 from bidnerf_core.mapping import HeldOutTrial
 
 PhotoProblem = Literal["mirrored", "turned", "badly posed", "apart", "isolated", "blurred", "badly exposed"]
@@ -84,6 +85,19 @@ class CaptureReport:
     coverage: CoverageRecord
     trial: HeldOutTrial = HeldOutTrial()
     exposure_range: float = 0.0  # stops between the darkest and the brightest tenth of the photos
+
+    def scaled(self, factor: float) -> CaptureReport:
+        """Return the report on the capture with lengths multiplied by ``factor``."""
+        photos = tuple(
+            replace(
+                photo,
+                position=multiplied(photo.position, factor),
+                pose_translation=None if photo.pose_translation is None else photo.pose_translation * factor,
+            )
+            for photo in self.photos
+        )
+        coverage = replace(self.coverage, centre=multiplied(self.coverage.centre, factor))
+        return replace(self, photos=photos, coverage=coverage, trial=self.trial.scaled(factor))
 
     def with_problem(self, *problems: PhotoProblem) -> list[PhotoRecord]:
         """Return the photos that have any of the problems, in capture order."""

@@ -16,7 +16,7 @@ from bidnerf_core.cli.camera_options import (
 )
 from bidnerf_core.cli.options import Device, Flag, Largest, MapFolder, option, parse
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import UsageError
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import load_map
@@ -81,11 +81,10 @@ def bake(
     with stopped_by_ctrl_c() as cancel, Display() as progress:
         scene.bake(
             photos,
-            split,
             config,
+            images=DatasetOptions(split=split, largest=largest),
             rendered_landmarks=rendered_landmarks,
             features=landmark_features,
-            largest=largest,
             progress=progress,
             cancel=cancel,
         )

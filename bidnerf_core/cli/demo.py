@@ -17,14 +17,14 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.options import DEFAULT_BACKEND, Flag, option, parse, require
 from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c, timed
-from bidnerf_core.datasets import write_transforms
+from bidnerf_core.datasets import DatasetOptions, write_transforms
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.evaluation import convergence_plot, perturb
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.io import output_folder, png_bytes, write_file
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps import Map, train
+from bidnerf_core.maps import Map, TrainOptions, train
 from bidnerf_core.results import Painter, PoseError, pose_error, save_gif
 from bidnerf_core.scenes import demo_object, orbit, views
 from bidnerf_core.settings import LARGEST_SEED
@@ -98,10 +98,16 @@ def _demonstrated(
         stopped_by_ctrl_c() as cancel,
         Display() as progress,
     ):
+        images = DatasetOptions(background=scene.bounds.background)
         stored = train(
-            seen, backend, out / "map", config, background=scene.bounds.background, overwrite=True,
-            progress=progress, cancel=cancel,
-        )  # fmt: skip
+            seen,
+            backend,
+            out / "map",
+            config,
+            options=TrainOptions(images, overwrite=True),
+            progress=progress,
+            cancel=cancel,
+        )
     write_transforms(out / "data", {"train": seen, "test": unseen}, scene.bounds.background)
     auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))
     trials = []

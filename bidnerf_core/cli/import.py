@@ -12,11 +12,11 @@ from bidnerf_core.cli.camera_options import DatasetCamera
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Device, FeaturesName, Flag, option, parse, require, value_of, wrong_usage
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import USUAL_FEATURES
-from bidnerf_core.maps import IMPORTERS, import_map, importer_of
+from bidnerf_core.maps import IMPORTERS, ImportOptions, import_map, importer_of
 from bidnerf_core.results import read_pose
 
 LEAST_SCALE = 1e-9
@@ -86,9 +86,23 @@ def run(arguments: list[str]) -> None:
         dataset = None if photos is None else open_dataset(photos, camera=camera)
         with stopped_by_ctrl_c() as cancel, Display() as progress:
             import_map(
-                file, out, as_, None if isinstance(config, NoSettings) else config, scale, None if T_world_file is None else pose, dataset, split,
-                not no_bake, device, overwrite, progress, cancel, features=landmark_features,
-            )  # fmt: skip
+                file,
+                out,
+                None if isinstance(config, NoSettings) else config,
+                photos=dataset,
+                bake=not no_bake,
+                options=ImportOptions(
+                    DatasetOptions(split=split),
+                    landmark_features,
+                    device,
+                    overwrite,
+                    as_,
+                    scale,
+                    None if T_world_file is None else pose,
+                ),
+                progress=progress,
+                cancel=cancel,
+            )
 
     parse("import", import_file, arguments, default)
 

@@ -32,7 +32,7 @@ from bidnerf_core.cli.options import (
     wrong_usage,
 )
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.datasets import SparseChoice, open_dataset
+from bidnerf_core.datasets import DatasetOptions, SparseChoice, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.io import Background, background_colour, from_plain
@@ -43,6 +43,7 @@ from bidnerf_core.maps import (
     Images,
     MapInfo,
     OtherSettings,
+    TrainOptions,
     interrupted,
     load_info,
     longest_side,
@@ -159,24 +160,27 @@ def run(arguments: list[str]) -> None:
                 data, begun, camera=camera, register_depth=registration, depth_unit=depth_unit, masks=hidden
             )
         with stopped_by_ctrl_c() as cancel, Display() as progress:
+            options = TrainOptions(
+                DatasetOptions(
+                    split=split,
+                    largest=largest,
+                    camera=camera if photos else None,
+                    background=begun if photos else None,
+                ),
+                landmark_features,
+                device,
+                overwrite,
+                refine_poses,
+                trust_poses,
+                depth_points,
+                model_points,
+                checkpoint_every,
+            )
             same: dict[str, Any] = {
-                "split": split, "bake": not no_bake, "device": device, "progress": progress, "cancel": cancel,
-                "depth_points": depth_points, "point_choice": model_points, "checkpoint_seconds": checkpoint_every,
-                "background": begun if photos else None, "camera": camera if photos else None,
+                "bake": not no_bake, "options": options, "progress": progress, "cancel": cancel,
             }  # fmt: skip
             if not resume:
-                train_map(
-                    images,
-                    name,
-                    out,
-                    config,
-                    refine_poses=refine_poses,
-                    overwrite=overwrite,
-                    features=landmark_features,
-                    largest=largest,
-                    trust_poses=trust_poses,
-                    **same,
-                )
+                train_map(images, name, out, config, **same)
                 return
             try:
                 resume_training(out, images, **same)

@@ -16,6 +16,7 @@ from torch import Generator, Tensor
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contraction import RaySpacing, contract_points
+from bidnerf_core.geometry import multiplied
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +203,17 @@ class SceneBounds:
     def side(self) -> float:
         """Side of the cube around the box (metres)."""
         return max(self.size)
+
+    def scaled(self, factor: float) -> SceneBounds:
+        """Return the bounds of the scene with lengths multiplied by ``factor``."""
+        return replace(
+            self,
+            lower=multiplied(self.lower, factor),
+            upper=multiplied(self.upper, factor),
+            near=self.near * factor,
+            far=self.far * factor,
+            footprint=self.footprint * factor,
+        )
 
     def normalized(self, positions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         """Return positions (metres, world) scaled so that the modelled space is the cube [-1, 1].

@@ -24,6 +24,7 @@ from .similarity import Similarity as Similarity
 from .similarity import covariance_in as covariance_in
 from .similarity import fit_similarity as fit_similarity
 from .similarity import look_at as look_at
+from .similarity import multiplied as multiplied
 from .similarity import rigid_pose as rigid_pose
 from .similarity import spread as spread
 from .similarity import symbol as symbol

@@ -38,6 +38,12 @@ def symbol(unit: LengthUnit) -> str:
     return "m" if unit == "metres" else "units"
 
 
+def multiplied(point: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+    """Return a point with its coordinates multiplied by ``factor``."""
+    x, y, z = point
+    return x * factor, y * factor, z * factor
+
+
 def rigid_pose(matrix: Float[Tensor, "3 4"], where: object, what: str = "the rotation") -> SE3:
     """Return the rigid transform that ``matrix`` represents up to rounding.
 

@@ -1,7 +1,6 @@
-"""The geographic anchor of a map: the file ``anchor.json`` next to ``map.json``, which states where on earth
-the map lies.
+"""The geographic anchor of a map, which states where on earth the map lies: key ``anchor`` of ``map.json``.
 
-It holds ``latitude`` and ``longitude`` (degrees) and ``height`` (metres above the WGS 84 ellipsoid) of a
+A file ``anchor.json`` next to ``map.json``, which users may write, takes its place until the map is saved. An anchor holds ``latitude`` and ``longitude`` (degrees) and ``height`` (metres above the WGS 84 ellipsoid) of a
 point, and ``T_enu_world``, the rows of the 4x4 matrix that maps the map's coordinates, times
 ``metres_per_unit``, to the east-north-up frame at that point. ``position_sigma`` (metres, along each axis)
 and ``orientation_sigma`` (degrees, about each axis) state how accurately the anchor itself is known.
@@ -9,14 +8,10 @@ and ``orientation_sigma`` (degrees, about each axis) state how accurately the an
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
-import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -24,11 +19,9 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3, Geodetic, geodetic, pose_from_matrix
-from bidnerf_core.io import from_plain, read_json, to_plain, write_file
+from bidnerf_core.io import from_plain, read_json
 
 ANCHOR = "anchor.json"
-NEWER = re.compile(r"anchor-\d{8,}-[0-9a-f]{8}\.json")
-"""Names of anchors that are about to take the place of ``anchor.json``, see ``MapInfo.anchor``."""
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -62,11 +55,6 @@ class Anchor:
         if not (0 <= self.position_sigma < math.inf and 0 <= self.orientation_sigma < math.inf):
             raise InputError(where="position_sigma and orientation_sigma", expected="0 or more")
 
-    def plain(self) -> dict[str, Any]:
-        """Return the anchor as JSON values."""
-        values: dict[str, Any] = to_plain(self)
-        return values
-
     @cached_property
     def _T_ecef_world(self) -> SE3:
         """The map's frame, in metres, in the earth-centred frame."""
@@ -91,47 +79,19 @@ class Anchor:
         )
         return SE3(inside.rotation, inside.translation / self.metres_per_unit)
 
+    def scaled(self, factor: float) -> Anchor:
+        """Return the anchor of the map after its lengths were multiplied by ``factor``."""
+        return replace(self, metres_per_unit=self.metres_per_unit / factor)
 
-def load_anchor(folder: Path, newer: str | None = None) -> Anchor | None:
-    """Return the anchor in the folder of a map, or None if there is none. Raises ``InputError`` for a damaged
+
+def load_anchor(folder: Path, newer: str = "") -> Anchor | None:
+    """Return the anchor in a file of its own in the folder of a map, or None if there is none.
+
+    This is ``anchor.json``, or the file ``newer`` by which earlier versions replaced it. Raises ``InputError`` for a damaged
     one.
-
-    ``newer`` is the name of the file that counts in place of ``anchor.json`` if it exists, see ``MapInfo.anchor``.
     """
-    path = folder / ANCHOR if newer is None or not (folder / newer).exists() else folder / newer
+    path = folder / newer if newer and (folder / newer).exists() else folder / ANCHOR
     if not path.exists():
         return None
     found = read_json(path, "the anchor of a map")
-    return None if found is None and path.name == newer else from_plain(Anchor, found, str(path))
-
-
-def save_anchor(folder: Path, anchor: Anchor) -> None:
-    """Write an anchor into the folder of a map, replacing an existing one."""
-    write_file(folder / ANCHOR, anchor_bytes(anchor))
-    for file in folder.iterdir():
-        if NEWER.fullmatch(file.name):
-            file.unlink()
-
-
-def anchor_bytes(anchor: Anchor | None) -> bytes:
-    """Return the content of a file with an anchor; None means that there is none."""
-    plain = None if anchor is None else anchor.plain()
-    return (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode()
-
-
-def put_in_place(folder: Path, newer: str) -> None:
-    """Replace ``anchor.json`` by the file ``newer``, which ``map.json`` names.
-
-    If this is interrupted, ``newer`` still exists and is the one that counts.
-    """
-    with contextlib.suppress(OSError, InputError):
-        if read_json(folder / newer, "the anchor of a map") is not None:
-            (folder / newer).replace(folder / ANCHOR)
-            return
-        (folder / ANCHOR).unlink(missing_ok=True)
-        (folder / newer).unlink()
-
-
-def scaled_anchor(anchor: Anchor, factor: float) -> Anchor:
-    """Return the anchor of a map whose lengths were multiplied by ``factor``."""
-    return replace(anchor, metres_per_unit=anchor.metres_per_unit / factor)
+    return None if found is None and newer else from_plain(Anchor, found, str(path))

@@ -1,13 +1,21 @@
-"""Baking: the surface and landmarks of a map, and the capture record of its photos."""
+"""Baking: the surface and landmarks of a map, the capture record of its photos, and whether these show its scene."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
-from bidnerf_core.captures import CaptureReport, UpDirection, pose_updates, summary, surveyed, tried_landmarks
+from bidnerf_core.captures import (
+    CaptureReport,
+    UpDirection,
+    pose_updates,
+    stored_cameras,
+    summary,
+    surveyed,
+    tried_landmarks,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
@@ -24,27 +32,20 @@ from bidnerf_core.mapping import (
     update_scatter,
 )
 from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of
-from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
 
-@dataclass(frozen=True, eq=False)
-class BakedLandmarks:
-    """Landmarks, and what was learned while they were built."""
-
-    landmarks: LandmarkMap | None  # None if the images show too little texture
-    source: LandmarkSource
-    colour_noise: (
-        float | None
-    )  # root mean square error of rendered colours on photos; None if it was not measured
-    capture: CaptureReport | None  # capture record of the photos; None for rendered images
+UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3
+"""Smallest difference (RMS) between rendered and photographed colours that indicates another scene: absolute;
+relative to that between the field and the photos the map was built from; and absolute if the latter is
+unknown, as in a map that was never baked."""
 
 
 def bake_surface(
-    info: MapInfo, field: RadianceField, views: Sequence[View], config: BakeConfig, where: str,
-    progress: ProgressCallback | None = None, cancel: Cancel | None = None,
-) -> SurfaceMap:  # fmt: skip
+    info: MapInfo, field: RadianceField, views: Sequence[View], config: BakeConfig, where: str
+) -> SurfaceMap:
     """Build the surface of a map from the measured depth of ``views`` or, if there is none, from depth
     rendered by ``field``.
 
@@ -63,9 +64,7 @@ def bake_surface(
         cameras = []
     else:
         measured = []  # a few points do not make a surface
-    surface = bake(
-        field, info.bounds, cameras, measured, config, counter("baking", "views", progress, cancel)
-    )
+    surface = bake(field, info.bounds, cameras, measured, config, counter("baking", "views"))
     source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
     log.info(
         f"{where}: surface of {len(surface.surfels)} surfels from {source} views, {time.monotonic() - began:.1f} s"
@@ -76,33 +75,41 @@ def bake_surface(
 
 
 def bake_landmarks(
-    info: MapInfo, field: RadianceField, views: Sequence[View], where: str, tracked: TrackedViews | None = None,
-    progress: ProgressCallback | None = None, cancel: Cancel | None = None, up: UpDirection | None = None,
-) -> BakedLandmarks:  # fmt: skip
-    """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's
-    cameras.
+    info: MapInfo,
+    field: RadianceField,
+    views: Sequence[View],
+    where: str,
+    tracked: TrackedViews | None = None,
+    up: UpDirection | None = None,
+) -> tuple[MapInfo, LandmarkMap | None, CaptureReport | None]:
+    """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's cameras.
 
-    ``tracked`` holds the views' keypoints if they were tracked already. A scene without texture has no
-    landmarks; localization then relies on the surface alone. ``where`` begins log messages, and ``up`` is the
-    upward direction of the scene if known.
+    Returns them, None if the images show too little texture (localization then relies on the surface alone), the description of
+    the map with what was learned meanwhile, and the capture record, None for rendered images. ``tracked`` holds the views'
+    keypoints if they were tracked already. ``where`` begins log messages, and ``up`` is the upward direction of the scene if
+    known.
     """
     began = time.monotonic()
     source: LandmarkSource = "photos" if views else "rendered images"
     # Only photos show how well the field renders; it has no error against its own images.
     noise = colour_noise(field, info.bounds, views) if views else info.colour_noise
-    rendering = counter("rendering", "views", progress, cancel)
-    images = views or rendered_views(field, info.bounds, cameras_of(info), rendering)
-    report = counter("landmarks", "steps", progress, cancel)
-    tracked = tracked_views(images, info.landmark_features, progress=report) if tracked is None else tracked
+    images = views or rendered_views(field, info.bounds, cameras_of(info), counter("rendering", "views"))
+    if tracked is None:
+        tracked = tracked_views(images, info.landmark_features, progress=counter("landmarks", "steps"))
     if views and not info.distances:
         tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
     trial, landmarks = HeldOutTrial(), None
     try:
-        landmarks = _tried(info, tracked, images, log.info)
+        landmarks = tried_landmarks(tracked, images, report=log.info)
     except InputError as error:
         log.info(f"{where}: no landmarks: {error}")
     else:
+        # New poses are compared with others from the same source as the given ones. If training kept those,
+        # except for some wrong ones, their errors are negligible.
+        by_source = update_scatter(pose_updates(info.cameras))
+        landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
         trial = landmarks.trial
+        info = replace(info, colour_noise=noise, landmark_source=source, landmark_features=landmarks.features)
         log.info(
             f"{where}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(images)} {source},"
             f" {time.monotonic() - began:.1f} s"
@@ -110,14 +117,27 @@ def bake_landmarks(
     capture = surveyed(tracked, views, trial=trial, up=up) if views else None
     for line in [] if capture is None else summary(capture):
         log.info(line)
-    return BakedLandmarks(landmarks, source, noise, capture)
+    return info, landmarks, capture
 
 
-def _tried(
-    info: MapInfo, tracked: TrackedViews, views: Sequence[View], report: Callable[[str], None]
-) -> LandmarkMap:
-    landmarks = tried_landmarks(tracked, views, report=report)
-    # New poses are compared with others from the same source as the given ones. If training kept those,
-    # except for some wrong ones, their errors are negligible.
-    by_source = update_scatter(pose_updates(info.cameras))
-    return replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
+def check_same_scene(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
+    """Raise ``InputError`` for photos of another scene: none of them was used to build the map, and they are
+    unlike its field.
+
+    The message begins with ``where``.
+    """
+    own = {(camera.name, camera.T_world_camera) for camera in info.cameras}
+    if own and not any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
+        check_alike(info, field, views, where)
+
+
+def check_alike(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
+    """Raise ``InputError`` for photos that are unlike the field, regardless of whether the map was built from them."""
+    off, usual = colour_noise(field, info.bounds, views), info.colour_noise
+    if off > (UNLIKE_ANY if usual is None else max(UNLIKE, UNLIKE_ITS_OWN * usual)):
+        raise InputError(
+            f"built from {info.data or 'other views'!r}, and its renderings differ from the photos by"
+            f" {off:.0%} of the range of colours;",
+            where=where,
+            expected="photos of the same scene, with poses in the coordinates of the map",
+        )

@@ -10,9 +10,9 @@ from pathlib import Path
 from torch import nn
 
 from bidnerf_core.fields import RadianceField
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.files import save_map
-from bidnerf_core.progress import Cancel, Progress, ProgressCallback
+from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.store import write_parts
+from bidnerf_core.progress import Progress, current_job
 from bidnerf_core.training import TrainingState, TrainingStep
 
 CHECKPOINT_SECONDS = 60.0
@@ -22,23 +22,26 @@ class Checkpoints:
     """The ``Report`` of a training run. States are saved to ``folder``, unless that is None; ``info``
     describes the last one.
 
-    ``state`` is the one to resume from, and ``seconds`` the time between checkpoints.
+    Progress goes to the current job, which may also stop the training. ``state`` is the one to resume from, and ``seconds`` the
+    time between checkpoints.
     """
 
     def __init__(
-        self, info: MapInfo, folder: Path | None = None, state: TrainingState | None = None,
-        seconds: float = CHECKPOINT_SECONDS, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        info: MapInfo,
+        folder: Path | None = None,
+        state: TrainingState | None = None,
+        seconds: float = CHECKPOINT_SECONDS,
+    ) -> None:
         self.info, self.folder = info, folder
-        self._state, self._seconds = state, seconds
-        self._progress, self._cancel = progress, cancel
+        self._state, self._seconds, self._job = state, seconds, current_job()
         self._step = self._total = info.step
         self._earlier, self._began = info.seconds, time.monotonic()
         self._saved = self._began
 
     @property
     def stopping(self) -> bool:
-        return self._cancel is not None and self._cancel()
+        return self._job.cancel is not None and self._job.cancel()
 
     def resume(self) -> TrainingState | None:
         return self._state
@@ -46,12 +49,12 @@ class Checkpoints:
     def step(self, progress: TrainingStep) -> None:
         self._state = None  # free it: it is as large as the field and its optimizer
         self._step, self._total = progress.step, progress.total
-        if self._progress is None:
+        if self._job.progress is None:
             return
         figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
         if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
             figures += f"  {progress.samples_per_ray:.1f} samples per ray"
-        self._progress(Progress("training", progress.step, progress.total, "steps", figures))
+        self._job.progress(Progress("training", progress.step, progress.total, "steps", figures))
 
     def due(self, step: int) -> bool:
         return step == self._total or time.monotonic() - self._saved > self._seconds
@@ -59,8 +62,10 @@ class Checkpoints:
     def save(self, state: TrainingState) -> None:
         seconds = self._earlier + time.monotonic() - self._began
         info = replace(self.info, step=state.step, complete=state.step >= self._total, seconds=seconds)
-        if self.folder is not None:  # the first save may replace another map, whose anchor does not count
-            info = save_map(self.folder, info, state, anchor="kept" if info.weights else None)
+        if self.folder is not None:
+            if info.weights:  # the first save may replace another map, whose anchor does not count
+                info = replace(info, anchor=load_info(self.folder).anchor)
+            info = write_parts(self.folder, info, state)
         self.info = info
         self._saved = time.monotonic()
 

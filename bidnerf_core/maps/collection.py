@@ -31,9 +31,9 @@ from bidnerf_core.localization import (
 )
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detected, find_features, pooled_views
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of, load_info
-from bidnerf_core.maps.files import load_landmarks
 from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter
+from bidnerf_core.maps.store import load_landmarks
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 
 log = logging.getLogger("bidnerf")
 
@@ -106,7 +106,8 @@ class MapCollection:
         self._infos = {name: _info(scene) for name, scene in self._maps.items()}
         self._pooled: dict[str, Float[Tensor, "v p"]] = {}
         self._vocabularies: dict[tuple[str, int], Vocabulary] = {}
-        self._index(progress, cancel)
+        with job_context(progress, cancel):
+            self._key = self._indexed()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -193,24 +194,26 @@ class MapCollection:
         found = replace(localization_of(problem, answer, began), unit=unit_of(localizer.scene))
         return found.translated(origin_of(localizer.scene))
 
-    def _index(self, progress: ProgressCallback | None, cancel: Cancel | None) -> None:
-        count = counter("reading", "maps", progress, cancel)
+    def _indexed(self) -> dict[str, tuple[str, int]]:
+        """Pool the descriptors of all maps; return the detector and the length of the descriptors of those with landmarks."""
+        count = counter("reading", "maps")
         landmarks: dict[str, LandmarkMap] = {}
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
-            check_cancelled("reading maps", cancel)
+            check_cancelled("reading maps")
             found = _landmarks(scene, self._infos[name])
             if found is not None and len(found):
                 landmarks[name] = found
             count(number, len(self._maps))
-        self._key = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
-        for key in dict.fromkeys(self._key.values()):
-            same = [found.descriptors for name, found in landmarks.items() if self._key[name] == key]
+        keys = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
+        for key in dict.fromkeys(keys.values()):
+            same = [found.descriptors for name, found in landmarks.items() if keys[name] == key]
             self._vocabularies[key] = Vocabulary.of(same)
         for name, found in landmarks.items():
             cameras = cameras_of(self._infos[name])
-            self._pooled[name] = pooled_views(self._vocabularies[self._key[name]], found, cameras)
+            self._pooled[name] = pooled_views(self._vocabularies[keys[name]], found, cameras)
         if bare := [name for name in self._maps if name not in landmarks]:
             log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
+        return keys
 
 
 def maps_in(folder: Path) -> list[Path]:

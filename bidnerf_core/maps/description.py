@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -11,14 +11,17 @@ from typing import Any, Literal
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import PoseRefinement, StoredCamera, with_wrong_pose
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import SceneBounds
-from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.fields import RadianceField, SceneBounds, scaled_field
+from bidnerf_core.geometry import SE3, LengthUnit, multiplied
 from bidnerf_core.io import from_plain, read_json
 from bidnerf_core.mapping import USUAL_FEATURES
+from bidnerf_core.maps.anchor import Anchor, load_anchor
 
 FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
+PART_NAMES = ("weights", "training", "surface", "landmarks", "capture")
+"""The keys that name files."""
 EXPECTED_PART = "a safetensors file, without which the map is incomplete"
 
 LandmarkSource = Literal["photos", "rendered images"]
@@ -68,7 +71,7 @@ class MapInfo:
     landmark_source: LandmarkSource | None = None  # the images they were built from, if recorded
     landmark_features: str = USUAL_FEATURES  # name of the detector of their keypoints
     capture: str | None = None  # capture record of the photos the landmarks were built from
-    anchor: str | None = None  # takes the place of ``anchor.json`` while a file of this name exists
+    anchor: Anchor | None = None  # where on earth the map lies, if known
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
@@ -80,6 +83,24 @@ class MapInfo:
         if self.complete:
             return None
         return f"its training stopped at step {self.step}; 'bidnerf train' with --resume continues it"
+
+    def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:
+        """Return the description of the map with lengths multiplied by ``factor``; weights stay in the unit of training."""
+        frame = self.field_frame or FieldFrame(1.0, self.bounds)
+        scale = frame.scale * factor
+        return replace(
+            self,
+            bounds=frame.bounds if scale == 1 else self.bounds.scaled(factor),
+            cameras=tuple(camera.scaled(factor) for camera in self.cameras),
+            unit=unit,
+            origin=multiplied(self.origin, factor),
+            field_frame=None if scale == 1 else replace(frame, scale=scale),
+            anchor=None if self.anchor is None else self.anchor.scaled(factor),
+        )
+
+    def in_map_unit(self, field: RadianceField) -> RadianceField:
+        """Convert a field as its backend built it to the unit of the map."""
+        return field if self.field_frame is None else scaled_field(field, self.field_frame.scale)
 
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
@@ -109,10 +130,15 @@ def load_info(folder: Path) -> MapInfo:
         newer = isinstance(found.get("version"), int) and found["version"] > VERSION
         advice = "it was written by a newer bidnerf; upgrade bidnerf" if newer else "retrain the map"
         raise InputError(f"version {found.get('version')!r}", where=path, expected=f"{VERSION}; {advice}")
-    info = from_plain(MapInfo, found, str(path))
-    for name in (info.weights, info.training, info.surface, info.landmarks, info.capture, info.anchor):
-        if name is not None and (not name or Path(name).name != name):
+    for part in (*PART_NAMES, "anchor"):
+        name = found.get(part)
+        if isinstance(name, str) and (not name or Path(name).name != name):
             raise InputError(f"names {name!r}", where=path, expected="the name of a file next to it")
+    named = found.get("anchor")  # earlier versions named a file
+    anchor = load_anchor(folder, named if isinstance(named, str) else "")
+    info = from_plain(MapInfo, found | {"anchor": None if isinstance(named, str) else named}, str(path))
+    if anchor is not None:
+        info = replace(info, anchor=anchor)
     for name in with_wrong_pose(info.cameras):
         raise InputError(f"pose of camera {name!r} is not a rigid transform", where=path, expected="4x4 rows")
     return info

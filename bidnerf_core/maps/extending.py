@@ -9,7 +9,7 @@ import logging
 import math
 import time
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
@@ -22,7 +22,15 @@ from torch import Tensor, nn
 from bidnerf_core.backend import load_backend
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import at_stored_poses, stored_cameras
-from bidnerf_core.datasets import Dataset, Photos, find_reader, open_dataset, photo_files, reading_at
+from bidnerf_core.datasets import (
+    Dataset,
+    DatasetOptions,
+    Photos,
+    find_reader,
+    open_dataset,
+    photo_files,
+    reading_at,
+)
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields import RadianceField, render_image, trained_field
 from bidnerf_core.frames import Frame, SeenLandmarks, View
@@ -41,13 +49,11 @@ from bidnerf_core.mapping import (
 )
 from bidnerf_core.maps.baking import bake_landmarks
 from bidnerf_core.maps.checkpoints import Checkpoints
-from bidnerf_core.maps.description import cameras_of, load_info, longest_side
-from bidnerf_core.maps.files import save_map, with_images
-from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.maps.scaling import in_map_frame
+from bidnerf_core.maps.description import load_info, longest_side
+from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.views import Images, read_views
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter
-from bidnerf_core.training import TrainingState, TrainingStopped
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
+from bidnerf_core.training import TrainingStopped
 
 log = logging.getLogger("bidnerf")
 
@@ -69,15 +75,6 @@ SAME_DESCRIPTOR = 0.42
 """Largest distance between descriptors of one landmark, relative to that between descriptors of different landmarks."""
 
 
-@dataclass(frozen=True, eq=False)
-class LocatedPhotos:
-    """New photos that were localized in a map, and those that were not."""
-
-    views: tuple[View, ...]
-    left_out: tuple[LeftOut, ...] = ()
-    known: tuple[str, ...] = ()  # photos that the map was built from
-
-
 def extend(
     scene: Map | str | Path,
     photos: NewPhotos,
@@ -85,7 +82,7 @@ def extend(
     *,
     split: str = "train",
     steps: int | None = None,
-    config: BakeConfig | None = None,
+    config: BakeConfig = USUAL_BAKE,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
@@ -108,79 +105,90 @@ def extend(
     folder = scene.folder if isinstance(scene, Map) else Path(scene)
     if folder is not None:
         load_info(folder)  # raises if there is no map
-    with contextlib.nullcontext() if folder is None else locked(folder):
+    with job_context(progress, cancel), contextlib.nullcontext() if folder is None else locked(folder):
         scene = scene if isinstance(scene, Map) else load_map(scene)
-        where = scene.name
         if scene.info.interruption is not None:
-            raise InputError(f"cannot be extended: {scene.info.interruption}", where=where)
-        frames, unread = _frames(photos, scene, split)
-        located = locate(scene, frames, where, progress, cancel, unread)
-        if not located.views:
-            log.info(f"{where}: was built from these photos already; nothing to add")
+            raise InputError(f"cannot be extended: {scene.info.interruption}", where=scene.name)
+        new = locate(scene, *_frames(photos, scene, split))
+        if not new:
+            log.info(f"{scene.name}: was built from these photos already; nothing to add")
             return scene
-        old = _old_views(scene, data, split, where, progress, cancel)
-        return _extended(
-            scene, located, old, data is not None, steps, config or BakeConfig(), where, progress, cancel
-        )
+        return _extended(scene, new, _old_views(scene, data, split), data is not None, steps, config)
 
 
-def locate(
-    scene: Map, frames: Sequence[Frame], where: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
-    unread: Sequence[LeftOut] = (),
-) -> LocatedPhotos:  # fmt: skip
-    """Localize frames in a map, and return them with names that the map does not use yet.
+def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> list[View]:
+    """Localize frames in a map, and return those that the map was not built from, with names that it does not use yet.
 
     ``unread`` are photos that could not be read, which count as left out. Raises ``InputError`` if the map
     has no landmarks, and if hardly any of the frames is localized.
     """
+    where = scene.name
     if scene.landmarks is None:
         raise InputError(
             "has no landmarks for localizing photos; 'bidnerf bake MAP --data DATA' builds them", where=where
         )
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
-    near = SAME_PLACE * scene.bounds.side
-    count = counter("locating", "photos", progress, cancel)
-    views, left_out, known = list[View](), list(unread), list[str]()
+    near, count = SAME_PLACE * scene.bounds.side, counter("locating", "photos")
+    views, left_out, known = list[View](), list(unread), 0
     for number, frame in enumerate(frames, start=1):
-        check_cancelled("extending", cancel)
+        check_cancelled("extending")
         try:
             found = localizer.solved(localizer.problem(frame))
         except InputError as error:
             left_out.append((frame.name, str(error)))
-            count(number, len(frames))
-            continue
-        stored = [cameras[name] for name in _names_like(frame.name, cameras)]
-        if not found.converged:
-            left_out.append((frame.name, f"{found.outcome}: {found.reason}"))
-        elif any(_apart(found.T_world_camera, pose) < near for pose in stored):
-            known.append(frame.name)
         else:
-            named = found.frame_as_taken(frame).replace(
-                name=_free(frame.name, {*cameras, *(v.frame.name for v in views)}),
-            )
-            views.append(View(named, found.T_world_camera))
+            like = _names_like(frame.name, cameras)
+            place = found.T_world_camera.translation
+            if not found.converged:
+                left_out.append((frame.name, f"{found.outcome}: {found.reason}"))
+            elif any(float((place - cameras[name].translation).norm()) < near for name in like):
+                known += 1
+            else:
+                like = _names_like(frame.name, {*cameras, *(view.frame.name for view in views)})
+                name = f"{frame.name}_{len(like) + 1}" if like else frame.name
+                views.append(View(found.frame_as_taken(frame).replace(name=name), found.T_world_camera))
         count(number, len(frames))
     for name, why in left_out:
         log.info(f"{name}: left out: {why}")
-    if len(views) + len(known) < max(1.0, LEAST_LOCATED * len(frames)):
+    if len(views) + known < max(1.0, LEAST_LOCATED * len(frames)):
         raise InputError(
-            f"localizes {len(views) + len(known)} of {amount(len(frames), 'photo')}",
+            f"localizes {len(views) + known} of {amount(len(frames), 'photo')}",
             where=where,
             expected="photos of its scene",
         )
     log.info(
-        f"{where}: {len(views)} of {amount(len(frames) + len(unread), 'photo')} localized, {len(known)}"
+        f"{where}: {len(views)} of {amount(len(frames) + len(unread), 'photo')} localized, {known}"
         f" already in the map, {len(left_out)} left out"
     )
-    return LocatedPhotos(tuple(views), tuple(left_out), tuple(known))
+    return views
 
 
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
     """Read photos, downscaled to the size of the map's largest image; also return those that cannot be read."""
-    side, unread = longest_side(scene.info), list[LeftOut]()
-    source = _opened(Path(photos), scene) if isinstance(photos, str | Path) else photos
+    side, frames, unread = longest_side(scene.info), list[Frame](), list[LeftOut]()
+    source: Sequence[Frame] | Sequence[View] | Dataset | Photos
+    if isinstance(photos, str | Path):
+        path, background = Path(photos), scene.bounds.background
+        if path.is_dir() and find_reader(path) is not None:
+            source = open_dataset(path, background)
+        else:
+            camera = CameraSource(assumed=landmark_cameras(scene))
+            source = Photos(photo_files([path]), camera, background=background)
+    else:
+        source = photos
     if isinstance(source, Dataset | Photos):
-        frames, unread = _read_each(source, split, side)
+        names = source.names if isinstance(source, Photos) else source.frame_names(split)
+        for place, name in enumerate(names):
+            try:
+                with reading_at(side, asked=side is not None):
+                    if isinstance(source, Photos):
+                        views: Sequence[View] = source.read(place).views
+                    else:
+                        views = source.views(split, [name])
+            except InputError as error:
+                unread.append((name, str(error)))
+                continue
+            frames += [view.frame for view in views]
     else:
         frames = [item.frame if isinstance(item, View) else item for item in source]
     for frame in frames:
@@ -193,56 +201,26 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
     return [frame if side is None else frame.at_most(side) for frame in frames], unread
 
 
-def _opened(path: Path, scene: Map) -> Dataset | Photos:
-    if path.is_dir() and find_reader(path) is not None:
-        return open_dataset(path, scene.bounds.background)
-    source = CameraSource(assumed=landmark_cameras(scene))
-    return Photos(photo_files([path]), source, background=scene.bounds.background)
-
-
-def _read_each(photos: Dataset | Photos, split: str, side: int | None) -> tuple[list[Frame], list[LeftOut]]:
-    """Read the frames of a split, or photos, of at most ``side`` pixels; also return those that cannot be read."""
-    frames, unread = list[Frame](), list[LeftOut]()
-    names = photos.names if isinstance(photos, Photos) else photos.frame_names(split)
-    for place, name in enumerate(names):
-        try:
-            with reading_at(side, asked=side is not None):
-                views = (
-                    photos.read(place).views if isinstance(photos, Photos) else photos.views(split, [name])
-                )
-        except InputError as error:
-            unread.append((name, str(error)))
-            continue
-        frames += [view.frame for view in views]
-    return frames, unread
-
-
-def _old_views(
-    scene: Map, data: Images | None, split: str, where: str, progress: ProgressCallback | None, cancel: Cancel | None
-) -> list[View]:  # fmt: skip
+def _old_views(scene: Map, data: Images | None, split: str) -> list[View]:
     """Return the images that the map was built from, or renderings at their cameras."""
     if data is not None:
         background = scene.bounds.background if isinstance(data, str | Path) else None
-        read = read_views(data, split, background, progress=progress, cancel=cancel)
+        read = read_views(data, DatasetOptions(split=split, background=background))
         views = at_stored_poses(read.about(scene.origin).views, scene.info.cameras)
         own = {camera.name for camera in scene.info.cameras}
         if not any(view.frame.name in own for view in views):
             raise InputError(
-                "data has none of the images that the map was built from", where=where, expected="these"
+                "data has none of the images that the map was built from", where=scene.name, expected="these"
             )
         return views
-    count, cameras = counter("rendering", "images", progress, cancel), cameras_of(scene.info)
-    views = []
-    for number, ((intrinsics, pose), camera) in enumerate(
-        zip(cameras, scene.info.cameras, strict=True), start=1
-    ):
-        small = intrinsics.at_most(STAND_IN_SIDE)
+    count, views = counter("rendering", "images"), []
+    for number, camera in enumerate(scene.info.cameras, start=1):
+        small, pose = camera.intrinsics.at_most(STAND_IN_SIDE), camera.pose
         image = render_image(scene.field, small, pose, scene.bounds)
         frame = Frame(camera.name, image.rgb.cpu().clamp(0, 1), small)
-        views.append(
-            View(frame, pose, landmarks=_distances(frame, image.depth.cpu(), image.opacity.cpu(), number))
-        )
-        count(number, len(cameras))
+        seen = _distances(frame, image.depth.cpu(), image.opacity.cpu(), number)
+        views.append(View(frame, pose, landmarks=seen))
+        count(number, len(scene.info.cameras))
     return views
 
 
@@ -260,48 +238,50 @@ def _distances(frame: Frame, depth: Tensor, opacity: Tensor, seed: int) -> SeenL
 
 
 def _extended(
-    scene: Map, located: LocatedPhotos, old: Sequence[View], complete: bool, steps: int | None, config: BakeConfig,
-    where: str, progress: ProgressCallback | None, cancel: Cancel | None,
-) -> Map:  # fmt: skip
-    began, info, new = time.monotonic(), scene.info, list(located.views)
+    scene: Map,
+    new: Sequence[View],
+    old: Sequence[View],
+    complete: bool,
+    steps: int | None,
+    config: BakeConfig,
+) -> Map:
+    """Return the map with new photos; ``complete`` states whether ``old`` are its own photos, not renderings."""
+    began, where, everything = time.monotonic(), scene.name, [*old, *new]
     tracked = tracked_views(
-        [*old, *new] if complete else new,
-        info.landmark_features,
-        progress=counter("landmarks", "steps", progress, cancel),
+        everything if complete else new,
+        scene.info.landmark_features,
+        progress=counter("landmarks", "steps"),
     )
-    seeing = _with_distances([*old, *new] if complete else new, tracked)
-    old, new = (seeing[: len(old)], seeing[len(old) :]) if complete else (old, seeing)
-    weighted = list(old) if complete else list(old) * _repeated(old, new)
-    field, done = _trained_on(
-        scene, [*weighted, *new], steps, len(new) / max(1, len(old) + len(new)), progress, cancel
-    )
+    seeing = _with_distances(everything if complete else new, tracked)
+    new = seeing[len(old) :] if complete else seeing
+    weighted = seeing if complete else [*old] * _repeated(old, new) + seeing
+    field, done = _trained_on(scene, weighted, steps, len(new) / max(1, len(everything)))
     info = replace(
-        info, cameras=(*info.cameras, *stored_cameras(new)), step=info.step + done, added=info.added + len(new),
-        seconds=info.seconds + time.monotonic() - began,
-    )  # fmt: skip
-    whole = replace(scene, info=info, field=in_map_frame(field, info), folder=None, record=scene.capture)
-    surface = _surface(whole, [*old, *new] if complete else new, config, progress, cancel)
-    check_cancelled("extending", cancel)
+        scene.info,
+        cameras=(*scene.info.cameras, *stored_cameras(new)),
+        step=scene.info.step + done,
+        added=scene.info.added + len(new),
+        seconds=scene.info.seconds + time.monotonic() - began,
+    )
+    grown = replace(scene, info=info, field=info.in_map_unit(field), folder=None, record=scene.capture)
+    if (surface := _surface(grown, seeing, config)) is not None:
+        grown = replace(grown, surface=surface)
+    check_cancelled("extending")
     if complete:
-        baked = bake_landmarks(info, whole.field, [*old, *new], where, tracked, progress, cancel, whole.up)
-        landmarks, record = baked.landmarks or scene.landmarks, baked.capture
-        info = replace(info, colour_noise=baked.colour_noise)
+        info, landmarks, record = bake_landmarks(info, grown.field, seeing, where, tracked, grown.up)
+        grown = replace(grown, info=info, record=record)
     else:
-        landmarks, record = _with_more_landmarks(scene, tracked), scene.capture
-    if landmarks is not None:
-        landmarks = with_images(landmarks, info)
-    grown = replace(whole, info=info, surface=surface or scene.surface, landmarks=landmarks, record=record)
-    before, after = (0 if each is None else len(each) for each in (scene.landmarks, landmarks))
+        landmarks = _more_landmarks(scene.landmarks, tracked)
+    grown = grown.with_parts(None, landmarks or scene.landmarks)
+    before, after = (0 if m.landmarks is None else len(m.landmarks) for m in (scene, grown))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")
     if scene.folder is None:
         return grown
-    if load_info(scene.folder).weights != scene.info.weights:
+    stored = load_info(scene.folder)
+    if stored.weights != scene.info.weights:
         raise InputError("was retrained meanwhile; extend it again", where=where)
-    check_cancelled("extending", cancel)
-    state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
-    here = grown.to("cpu")
-    stored = save_map(scene.folder, info, state, here.surface, here.landmarks, record, "kept")
-    return replace(grown, info=stored, folder=scene.folder)
+    check_cancelled("extending")
+    return replace(grown, info=replace(info, anchor=stored.anchor)).stored_in(scene.folder)
 
 
 def _with_distances(views: Sequence[View], tracked: TrackedViews) -> list[View]:
@@ -330,8 +310,8 @@ def _repeated(old: Sequence[View], new: Sequence[View]) -> int:
 
 
 def _trained_on(
-    scene: Map, views: Sequence[View], steps: int | None, share: float, progress: ProgressCallback | None, cancel: Cancel | None
-) -> tuple[RadianceField, int]:  # fmt: skip
+    scene: Map, views: Sequence[View], steps: int | None, share: float
+) -> tuple[RadianceField, int]:
     """Continue training a copy of the field; return it, in the unit of its own training, and the number of steps."""
     info = scene.info
     backend = load_backend(info.backend, str(scene.folder or ""))
@@ -346,11 +326,11 @@ def _trained_on(
             f"the map's field is a {type(trained).__name__}", expected="an nn.Module of a backend"
         )
     field = copy.deepcopy(trained).requires_grad_(True).train()
-    scale = 1.0 if info.field_frame is None else info.field_frame.scale
-    own = [_in_field_unit(view, 1 / scale) for view in views] if scale != 1 else list(views)
-    report = Checkpoints(replace(info, step=0, complete=False), progress=progress, cancel=cancel)
+    if info.field_frame is not None:
+        views = [_in_field_unit(view, 1 / info.field_frame.scale) for view in views]
+    report = Checkpoints(replace(info, step=0, complete=False))
     try:
-        backend.train(cast(RadianceField, field), own, settings, report)
+        backend.train(cast(RadianceField, field), views, settings, report)
     except TrainingStopped as stopped:
         raise Cancelled(f"cancelled after step {stopped.step}; the map is unchanged") from stopped
     field.requires_grad_(False).eval()
@@ -368,35 +348,22 @@ def _in_field_unit(view: View, factor: float) -> View:
     return replace(view, frame=frame, T_ref_camera=pose, landmarks=seen)
 
 
-def _surface(
-    scene: Map,
-    views: Sequence[View],
-    config: BakeConfig,
-    progress: ProgressCallback | None,
-    cancel: Cancel | None,
-) -> SurfaceMap | None:
+def _surface(scene: Map, views: Sequence[View], config: BakeConfig) -> SurfaceMap | None:
     """Bake the surface from the measured depth of views and, unlike ``bake_surface``, also from depth rendered from the
     other cameras: the photos of these are not at hand, and what they measured must not be lost.
     """
     measured = [view for view in views if view.frame.has_dense_depth]
     names = {view.frame.name for view in measured}
-    cameras = [
-        place
-        for camera, place in zip(scene.info.cameras, cameras_of(scene.info), strict=True)
-        if camera.name not in names
-    ]
+    others = [(c.intrinsics, c.pose) for c in scene.info.cameras if c.name not in names]
     try:
-        return bake(
-            scene.field, scene.bounds, cameras, measured, config, counter("baking", "views", progress, cancel)
-        )
+        return bake(scene.field, scene.bounds, others, measured, config, counter("baking", "views"))
     except InputError as error:
         log.info(f"the surface is unchanged: {error}")
         return None
 
 
-def _with_more_landmarks(scene: Map, tracked: TrackedViews) -> LandmarkMap | None:
+def _more_landmarks(landmarks: LandmarkMap | None, tracked: TrackedViews) -> LandmarkMap | None:
     """Return the landmarks of a map plus those of new photos that it lacks."""
-    landmarks = scene.landmarks
     try:
         more = tracked.landmarks(DEFAULT_LANDMARKS)
     except InputError as error:  # one photo, or photos without overlap
@@ -404,8 +371,7 @@ def _with_more_landmarks(scene: Map, tracked: TrackedViews) -> LandmarkMap | Non
         return landmarks
     if landmarks is None or not len(more):
         return landmarks or more
-    new = more[~_present(landmarks, more)]
-    return concatenated([landmarks, new])
+    return concatenated([landmarks, more[~_present(landmarks, more)]])
 
 
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
@@ -422,19 +388,9 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     return ((distance <= 3 * deviation) & alike).any(-1)
 
 
-def _apart(first: SE3, second: SE3) -> float:
-    return float((first.translation - second.translation).norm())
-
-
 def _names_like(name: str, taken: Container[str]) -> list[str]:
-    """Return the names taken by photos called ``name``: the name itself, and those that ``_free`` derived from it."""
+    """Return the names taken by photos called ``name``: the name itself, and those that were derived from it."""
     found = itertools.takewhile(
         lambda each: each in taken, itertools.chain([name], (f"{name}_{n}" for n in itertools.count(2)))
     )
     return list(found)
-
-
-def _free(name: str, taken: Container[str]) -> str:
-    """Return a free name: the name itself, or with the first number that makes it free."""
-    like = _names_like(name, taken)
-    return f"{name}_{len(like) + 1}" if like else name

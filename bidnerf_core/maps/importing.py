@@ -21,17 +21,17 @@ from bidnerf_core.fields import RadianceField, SceneBounds, device_of, render
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3, LengthUnit, Similarity
 from bidnerf_core.io import from_plain, to_plain
-from bidnerf_core.mapping import USUAL_FEATURES, BakeConfig, find_features, surface_of_points
-from bidnerf_core.maps.baking import bake_surface
+from bidnerf_core.mapping import BakeConfig, surface_of_points
+from bidnerf_core.maps.baking import bake_surface, check_alike
 from bidnerf_core.maps.description import MapInfo, cameras_of
-from bidnerf_core.maps.files import map_folder, save_map
 from bidnerf_core.maps.importers import ImportedField, importer_of, robust_box
 from bidnerf_core.maps.map import Map, frozen_field
-from bidnerf_core.maps.same_scene import check_alike
-from bidnerf_core.maps.training import USUAL_BAKE, baked_or_kept
+from bidnerf_core.maps.options import ImportOptions
+from bidnerf_core.maps.store import map_folder, write_parts
+from bidnerf_core.maps.training import bake_settings, baked_if_possible
 from bidnerf_core.maps.viewpoints import viewpoints
 from bidnerf_core.maps.views import Images, chosen_origin, read_views
-from bidnerf_core.progress import Cancel, ProgressCallback
+from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
@@ -44,87 +44,81 @@ SAME_LENGTH = 0.03
 FEWEST_COMPARED = 200
 OPAQUE = 0.5
 """Opacity of a ray above which its rendered depth is meaningful."""
+AS_IN_THE_FILE = ImportOptions()
 
 
 def import_map(
     path: str | Path,
     out: str | Path | None = None,
-    importer: str | None = None,
     config: Any = None,
-    scale: float = 1.0,
-    T_world_file: SE3 | None = None,
+    *,
     photos: Images | None = None,
-    split: str = "train",
     bake: bool | BakeConfig = True,
-    device: torch.device | str = "cpu",
-    overwrite: bool = False,
+    options: ImportOptions = AS_IN_THE_FILE,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
-    *,
-    features: str = USUAL_FEATURES,
 ) -> Map:
     """Build a map from a field in a file: splats, a checkpoint, or whatever an installed importer reads.
 
-    ``importer`` is the name of one, by default the one that recognizes the file; ``config`` holds its
-    settings: an object of its ``config_type``, or a dict of those that differ from the defaults. Lengths are
-    multiplied by ``scale``, and ``T_world_file`` then transforms the file's coordinates to the world. If that
-    is far away, as survey coordinates are, the map gets an origin there, see ``Map.origin``.
-    ``photos`` are images with poses in the world (a dataset, the path to one, or views), of which ``split``
-    selects a part; landmarks are built from them. Without any, landmarks come from rendered images, which
-    match photos less well. ``features`` is the name of the landmarks' detector. The map is stored in folder
-    ``out``, or only in memory if that is None.
+    ``config`` holds settings of the importer: an object of its ``config_type``, or a dict of those that differ from the
+    defaults. Lengths are multiplied by ``options.scale``, and ``options.T_world_file`` then transforms the file's
+    coordinates to the world. If that is far away, as survey coordinates are, the map gets an origin there, see
+    ``Map.origin``. ``photos`` are images with poses in the world (a dataset, the path to one, or views), of which
+    ``options.images`` selects a part; landmarks are built from them. Without any, landmarks come from rendered images,
+    which match photos less well. The map is stored in folder ``out``, or only in memory if that is None.
 
     Raises ``InputError`` if the file, the photos, the settings or the folder cannot be used, and if the
-    photos do not show the scene of the field; the folder must be empty unless ``overwrite`` is set.
+    photos do not show the scene of the field; the folder must be empty unless ``options.overwrite`` is set.
     """
-    path = Path(path)
+    path, scale = Path(path), options.scale
     if not (math.isfinite(scale) and scale > 0):
         raise InputError(f"scale is {scale}", expected="a number above 0")
-    find_features(features)
-    name, chosen = importer_of(path, importer)
-    settings = config
+    name, chosen = importer_of(path, options.importer)
+    settings, baking = config, bake_settings(bake)
     if config is None or isinstance(config, dict):
         settings = from_plain(chosen.config_type, config or {}, f"settings of importer {name!r}")
-    T = SE3.identity() if T_world_file is None else T_world_file
+    T = SE3.identity() if options.T_world_file is None else options.T_world_file
     origin = chosen_origin(T.translation[None])
-    T = T.translated(-torch.tensor(origin, dtype=torch.float64)) if any(origin) else T
-    placement = Similarity(scale, T)
-    place = None if out is None else Path(out)
-    there = working_device(device)
-    with contextlib.nullcontext() if place is None else map_folder(place, overwrite):
-        found = chosen.read(path, settings, placement)
+    if any(origin):
+        T = T.translated(-torch.tensor(origin, dtype=torch.float64))
+    place, device, where = None if out is None else Path(out), working_device(options.device), str(path)
+    with (
+        job_context(progress, cancel),
+        contextlib.nullcontext() if place is None else map_folder(place, options.overwrite),
+    ):
+        found = chosen.read(path, settings, Similarity(scale, T))
         for line in found.found:
-            log.info(f"{path}: {line}")
-        images = _own_photos(found, str(path)) if photos is None else photos
-        read = (
-            None
-            if images is None
-            else read_views(images, split, progress=progress, cancel=cancel).about(origin)
-        )
+            log.info(f"{where}: {line}")
+        images = _own_photos(found, where) if photos is None else photos
+        read = None if images is None else read_views(images, options.images).about(origin)
         views: list[View] = [] if read is None else read.views
         unit: LengthUnit = "metres" if scale != 1 else "units" if read is None else read.unit
-        _tell_extent(found, str(path), unit)
+        _report_extent(found, where, unit)
         bounds = found.bounds
         if read is not None and read.source and any(view.frame.alpha is not None for view in views):
             bounds = replace(bounds, background=read.background)  # over which its images were composited
         info = MapInfo(
-            found.backend, to_plain(found.config, "config"), bounds, found.steps, True, path.name,
-            landmark_features=features, unit=unit, origin=origin, gravity_up=None if read is None else read.gravity_up,
-        )  # fmt: skip
-        field = frozen_field(info, found.tensors, None)
-        scene = Map(info, field).to(there)
-        scene = replace(scene, info=replace(info, cameras=_cameras(scene.field, found, views, str(path))))
+            found.backend,
+            to_plain(found.config, "config"),
+            bounds,
+            found.steps,
+            True,
+            path.name,
+            landmark_features=options.features,
+            unit=unit,
+            origin=origin,
+            gravity_up=None if read is None else read.gravity_up,
+        )
+        scene = Map(info, frozen_field(info, found.tensors, None)).to(device)
+        scene = replace(scene, info=replace(info, cameras=_cameras(scene.field, found, views, where)))
         if views:
-            _check_photos(scene, views, str(path))
+            _check_photos(scene, views, where)
         if place is not None:
             state = TrainingState(found.steps, found.tensors, {})
-            scene = replace(scene, info=save_map(place, scene.info, state), folder=place)
-        settings_of_bake = bake if isinstance(bake, BakeConfig) else USUAL_BAKE
-        if not bake:
+            scene = replace(scene, info=write_parts(place, scene.info, state), folder=place)
+        if baking is None:
             return scene
-        return baked_or_kept(
-            scene, lambda scene: _baked(scene, found, views, settings_of_bake, progress, cancel)
-        )
+        return baked_if_possible(scene, lambda scene: _baked(scene, found, views, baking))
 
 
 def _own_photos(found: ImportedField, where: str) -> Dataset | None:
@@ -149,12 +143,12 @@ def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], 
     chosen = viewpoints(field, found.bounds, found.up, found.is_solid)
     log.info(
         f"{where}: no photos; viewed from {amount(len(chosen), 'viewpoint')}"
-        + (" around it" if found.is_solid else "found in free space")
+        + (" around it" if found.is_solid else " found in free space")
     )
     return chosen
 
 
-def _tell_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
+def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     """Log how large the scene is, and warn if its lengths are hardly in metres."""
     if found.points is None or not len(found.points):
         size = found.bounds.size
@@ -206,14 +200,7 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
     return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())
 
 
-def _baked(
-    scene: Map,
-    found: ImportedField,
-    views: Sequence[View],
-    config: BakeConfig,
-    progress: ProgressCallback | None,
-    cancel: Cancel | None,
-) -> Map:
+def _baked(scene: Map, found: ImportedField, views: Sequence[View], config: BakeConfig) -> Map:
     has_landmarks = bool(views) or found.is_coloured
     if not views and found.is_coloured:
         log.info(
@@ -228,7 +215,5 @@ def _baked(
             f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
         )
     if has_landmarks:
-        return scene.with_baked_parts(list(views), config, not views, None, progress, cancel, surface)
-    return scene.with_surface(
-        surface or bake_surface(scene.info, scene.field, [], config, scene.name, progress, cancel)
-    )
+        return scene.with_baked_parts(views, config, not views, surface=surface)
+    return scene.with_parts(surface or bake_surface(scene.info, scene.field, [], config, scene.name))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +15,6 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.camera import checked_side
 from bidnerf_core.captures import (
     CaptureReport,
     UpDirection,
@@ -22,38 +23,45 @@ from bidnerf_core.captures import (
     poses_of,
     up_direction,
 )
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.fields import RadianceField, RenderedImage, SceneBounds, levels, render_image, trained_field
+from bidnerf_core.fields import (
+    LARGEST_LENGTH,
+    RadianceField,
+    RenderedImage,
+    SceneBounds,
+    levels,
+    render_image,
+    trained_field,
+)
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
-from bidnerf_core.io import from_plain, locked, read_tensors
+from bidnerf_core.io import from_plain, locked
 from bidnerf_core.localization import on_device, origin_of
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedViews, find_features
-from bidnerf_core.maps.anchor import Anchor, load_anchor
-from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
-from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
-from bidnerf_core.maps.files import (
+from bidnerf_core.maps.anchor import Anchor
+from bidnerf_core.maps.baking import bake_landmarks, bake_surface, check_same_scene
+from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info
+from bidnerf_core.maps.store import (
+    checked_weights,
     content_digest,
     load_capture,
     load_landmarks,
     load_state,
     load_surface,
     map_folder,
-    save_capture,
-    save_landmarks,
-    save_map,
-    save_surface,
+    read_parts,
     with_images,
+    write_parts,
 )
-from bidnerf_core.maps.same_scene import check_same_scene
-from bidnerf_core.maps.scaling import in_map_frame, scaled
-from bidnerf_core.maps.summary import MapSummary, summarized
-from bidnerf_core.maps.views import Images, read_views
-from bidnerf_core.maps.weights import checked_weights
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
+from bidnerf_core.maps.summary import MapSummary
+from bidnerf_core.maps.views import AS_STORED, Images, read_views
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, job_context
 from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
+
+USUAL_BAKE = BakeConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +77,6 @@ class Map:
     landmarks: LandmarkMap | None = None  # None if none were built
     folder: Path | None = None  # None for a map in memory
     record: CaptureReport | None = None  # capture record, for a map in memory; see ``capture``
-    anchor: Anchor | None = None  # where on earth the map lies, if known
 
     def __repr__(self) -> str:
         """A one-line description without tensors or cameras; ``describe`` gives the details."""
@@ -92,6 +99,11 @@ class Map:
         Positions of the map's parts are relative to the origin, which is 0 unless the data are far from that.
         """
         return self.info.origin
+
+    @property
+    def anchor(self) -> Anchor | None:
+        """Where on earth the map lies, if known."""
+        return self.info.anchor
 
     @property
     def has_distances(self) -> bool:
@@ -128,9 +140,9 @@ class Map:
 
         Raises ``InputError`` if its file is damaged.
         """
-        if self.record is not None or self.folder is None or self.info.capture is None:
+        if self.record is not None or self.folder is None:
             return self.record
-        return load_capture(self.folder / self.info.capture)
+        return load_capture(self.folder, self.info)
 
     @cached_property
     def training(self) -> str:
@@ -153,19 +165,38 @@ class Map:
 
     def describe(self) -> MapSummary:
         """Return the facts about the map; ``str()`` gives a human-readable description."""
-        return summarized(
-            self.info, self.field, self.surface, self.landmarks, self.capture, self.folder, self.up
-        )
+        return MapSummary.of(self)
 
     def scaled(self, factor: float, unit: LengthUnit = "metres") -> Map:
         """Return the map with all lengths multiplied by ``factor``, in memory: field, bounds, surface,
-        landmarks and record.
+        landmarks, record and anchor.
 
         ``unit`` is the resulting length unit; ``scaled(1)`` declares that lengths are metres. ``save`` stores
-        it, also over the map itself. Raises ``InputError`` for a factor that is not positive, and for a map
-        whose training is not complete.
+        it, also over the map itself. Raises ``InputError`` for a factor that is not positive or makes lengths
+        too large or too small, and for a map whose training is not complete.
         """
-        return scaled(self, factor, unit)
+        if isinstance(factor, bool) or not (isinstance(factor, int | float) and 0 < factor < math.inf):
+            raise InputError(f"factor is {factor!r}", expected="a positive number")
+        if self.info.interruption is not None:
+            raise InputError(f"cannot be scaled: {self.info.interruption}", where=self.name)
+        if self.unit == unit == "metres" and factor != 1:
+            log.info(
+                f"{self.name}: was in metres before; its lengths are multiplied by {factor:.6g} all the same"
+            )
+        extent = max(map(abs, (*self.bounds.lower, *self.bounds.upper, self.bounds.far)))
+        if not extent * factor <= LARGEST_LENGTH or not factor >= 1 / LARGEST_LENGTH:
+            raise InputError(
+                f"factor is {factor:g}, which makes the lengths of {self.name} too large or too small"
+            )
+        whole, capture = self.whole(), self.capture
+        info = whole.info.scaled(factor, unit)
+        return Map(
+            info,
+            info.in_map_unit(trained_field(whole.field)),
+            None if whole.surface is None else whole.surface.scaled(factor),
+            None if whole.landmarks is None else whole.landmarks.scaled(factor),
+            record=None if capture is None else capture.scaled(factor),
+        )
 
     def render(self, view: View, level: int | None = None) -> RenderedImage:
         """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with the camera and pose of
@@ -190,29 +221,29 @@ class Map:
     def bake(
         self,
         data: Images | None = None,
-        split: str = "train",
-        config: BakeConfig | None = None,
+        config: BakeConfig = USUAL_BAKE,
         *,
+        images: DatasetOptions = AS_STORED,
         rendered_landmarks: bool = False,
         features: str | None = None,
-        largest: int | None = None,
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
     ) -> Map:
         """Return the map with a new surface and new landmarks, which are stored with it if it has a folder.
 
         For the surface, views with measured depth replace rendered ones; landmarks are built from all views
-        of ``data`` (those of ``split``, for a dataset or the path to one). Without data, landmarks are built
-        from rendered images, unless the map has landmarks from photos: these are kept unless
-        ``rendered_landmarks`` is set. ``features`` names a landmark detector other than the map's, and
-        ``largest`` is as for ``train``. Raises ``InputError`` if the data cannot be used or shows another
-        scene, if nothing can be baked, and if another program is writing to the folder; raises ``Cancelled``
-        once ``cancel`` returns True. Finished parts are kept in that case.
+        of ``data`` (those of ``images.split``, for a dataset or the path to one). Without data, landmarks are
+        built from rendered images, unless the map has landmarks from photos: these are kept unless
+        ``rendered_landmarks`` is set. ``features`` names a landmark detector other than the map's. Raises
+        ``InputError`` if the data cannot be used or shows another scene, if nothing can be baked, and if
+        another program is writing to the folder; raises ``Cancelled`` once ``cancel`` returns True. Finished
+        parts are kept in that case.
         """
         if rendered_landmarks and data is not None:
             raise InputError(
                 "rendered_landmarks uses no photos, but data gives some;", expected="only one of them"
             )
+        scene = self
         if features is not None and features != self.info.landmark_features:
             find_features(features)
             if data is None and not rendered_landmarks and self.info.landmark_source == "photos":
@@ -221,46 +252,44 @@ class Map:
                     f" {features!r}, give the photos again (--data) or use --rendered-landmarks",
                     where=self.name,
                 )
-            return replace(self, info=replace(self.info, landmark_features=features)).bake(
-                data, split, config, rendered_landmarks=rendered_landmarks, largest=largest, progress=progress,
-                cancel=cancel,
-            )  # fmt: skip
-        with contextlib.nullcontext() if self.folder is None else locked(self.folder):
+            scene = replace(self, info=replace(self.info, landmark_features=features))
+        with (
+            job_context(progress, cancel),
+            contextlib.nullcontext() if self.folder is None else locked(self.folder),
+        ):
             views = list[View]()
             if data is not None:
-                found = read_views(
-                    data, split, self._background(data), progress=progress, cancel=cancel,
-                    largest=checked_side(largest), folder=self.folder,
-                )  # fmt: skip
+                if images.background is None and isinstance(data, str | Path):
+                    images = replace(images, background=self.bounds.background)
+                found = read_views(data, images, folder=self.folder)
                 views = at_stored_poses(found.about(self.origin).views, self.info.cameras)
                 check_same_scene(self.info, self.field, views, self.name)
-            settings = BakeConfig() if config is None else config
-            return self.with_baked_parts(views, settings, rendered_landmarks, None, progress, cancel)
-
-    def _background(self, data: Images) -> tuple[float, float, float] | None:
-        return self.bounds.background if isinstance(data, str | Path) else None
+            return scene.with_baked_parts(views, config, rendered_landmarks)
 
     def with_baked_parts(
-        self, views: list[View], config: BakeConfig, rendered_landmarks: bool = False,
-        tracked: TrackedViews | None = None, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+        self,
+        views: Sequence[View],
+        config: BakeConfig,
+        rendered_landmarks: bool = False,
+        tracked: TrackedViews | None = None,
         surface: SurfaceMap | None = None,
-    ) -> Map:  # fmt: skip
+    ) -> Map:
         """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the
         folder.
 
         ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if known.
         """
-        check_cancelled("baking", cancel)
-        surface = surface or bake_surface(self.info, self.field, views, config, self.name, progress, cancel)
-        scene = self.with_surface(surface)
-        if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
+        check_cancelled("baking")
+        scene = self.with_parts(surface or bake_surface(self.info, self.field, views, config, self.name))
+        if not views and not rendered_landmarks and (photos := self._landmarks_from_photos()) is not None:
             log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
-            return replace(scene, landmarks=kept)
-        check_cancelled("baking", cancel)
-        found = bake_landmarks(self.info, self.field, views, self.name, tracked, progress, cancel, scene.up)
-        return scene._with_landmarks(found)
+            return replace(scene, landmarks=photos)
+        check_cancelled("baking")
+        info, landmarks, record = bake_landmarks(self.info, self.field, views, self.name, tracked, scene.up)
+        info = replace(info, surface=scene.info.surface)
+        return replace(scene, info=info).with_parts(None, landmarks, record)
 
-    def _photo_landmarks(self) -> LandmarkMap | None:
+    def _landmarks_from_photos(self) -> LandmarkMap | None:
         """Return the landmarks that were built from photos, unless their file is damaged."""
         if self.info.landmark_source == "rendered images":
             return None
@@ -272,24 +301,25 @@ class Map:
             log.info(str(error))
             return None
 
-    def with_surface(self, surface: SurfaceMap) -> Map:
-        """Return the map with another surface, and store that, while the caller holds the lock of the folder."""
-        info = self.info if self.folder is None else save_surface(self.folder, self.info, surface)
-        return replace(self, info=info, surface=surface)
-
-    def _with_landmarks(self, found: BakedLandmarks) -> Map:
-        info, landmarks = self.info, self.landmarks
-        if found.landmarks is not None:
-            info = replace(
-                info, colour_noise=found.colour_noise, landmark_source=found.source,
-                landmark_features=found.landmarks.features,
-            )  # fmt: skip
-            landmarks = with_images(found.landmarks, info)
-            if self.folder is not None:
-                info = save_landmarks(self.folder, self.info, landmarks, found.colour_noise, found.source)
-        if found.capture is not None and self.folder is not None:
-            info = save_capture(self.folder, info, found.capture)
-        return replace(self, info=info, landmarks=landmarks, record=found.capture or self.record)
+    def with_parts(
+        self,
+        surface: SurfaceMap | None = None,
+        landmarks: LandmarkMap | None = None,
+        record: CaptureReport | None = None,
+    ) -> Map:
+        """Return the map with these parts in place of its own, and store them, while the caller holds the lock of the folder."""
+        info = self.info
+        if landmarks is not None:
+            landmarks = with_images(landmarks, info)
+        if self.folder is not None and any(part is not None for part in (surface, landmarks, record)):
+            info = write_parts(self.folder, info, None, surface, landmarks, record)
+        return replace(
+            self,
+            info=info,
+            surface=surface or self.surface,
+            landmarks=self.landmarks if landmarks is None else landmarks,
+            record=record or self.record,
+        )
 
     def save(self, folder: str | Path, overwrite: bool = False) -> Map:
         """Write the whole map into a folder, and return it with that folder.
@@ -305,29 +335,31 @@ class Map:
         """Write the whole map into a folder as ``save`` does, while the caller holds the lock of the folder."""
         field = trained_field(self.field)
         if not isinstance(field, nn.Module):
-            found = type(field).__name__
             raise InputError(
-                f"the map's field is a {found}", where=folder, expected="an nn.Module of a backend"
+                f"the map's field is a {type(field).__name__}",
+                where=folder,
+                expected="an nn.Module of a backend",
             )
         state = TrainingState(self.info.step, field.state_dict(), {})
         if not self.info.complete and self.folder is not None:
             state = load_state(self.folder, self.info, self.field)
         whole = self.whole()
         here = whole.to("cpu")
-        info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture, whole.anchor)
+        info = write_parts(folder, whole.info, state, here.surface, here.landmarks, self.capture)
         return replace(whole, info=info, folder=folder, record=self.capture)
 
     def whole(self) -> Map:
         """Return the map including the parts of its folder that were not loaded, or were added since."""
         if self.folder is None:
             return self
-        surface, landmarks = self.surface, self.landmarks
-        if surface is None and self.info.surface is not None:
-            surface = load_surface(self.folder / self.info.surface)
+        surface, landmarks, info = self.surface, self.landmarks, self.info
+        if surface is None:
+            surface = load_surface(self.folder, info)
         if landmarks is None:
-            landmarks = load_landmarks(self.folder, self.info)
-        anchor = self.anchor or load_anchor(self.folder, self.info.anchor)
-        return replace(self, surface=surface, landmarks=landmarks, anchor=anchor)
+            landmarks = load_landmarks(self.folder, info)
+        if info.anchor is None:
+            info = replace(info, anchor=load_info(self.folder).anchor)
+        return replace(self, info=info, surface=surface, landmarks=landmarks)
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
@@ -337,11 +369,10 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     not a map, or is a damaged one.
     """
     folder = Path(folder)
-    info, tensors, surface, landmarks, anchor = _read(folder, baked)
+    info, weights, surface, landmarks = read_parts(folder, baked)
     if info.interruption is not None:
         log.info(f"{folder}: {info.interruption}")
-    field = frozen_field(info, tensors, folder)
-    return Map(info, field, surface, landmarks, folder, anchor=anchor).to(device)
+    return Map(info, frozen_field(info, weights, folder), surface, landmarks, folder).to(device)
 
 
 def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
@@ -350,17 +381,23 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
     Errors name the files of ``folder``. Raises ``InputError`` if the backend or the weights do not fit.
     """
     where = str(DESCRIPTION if folder is None else folder / DESCRIPTION)
-    backend = load_backend(info.backend, "" if folder is None else str(folder))
     path = Path(info.weights) if folder is None else folder / info.weights
-    outline = _outline(backend, info, where)
-    if outline is not None:  # before memory is allocated for a field of whatever size map.json describes
+    backend, outline = load_backend(info.backend, "" if folder is None else str(folder)), None
+    try:  # only the shapes, before memory is allocated for a field of whatever size map.json describes
+        with torch.device("meta"):
+            outline = build_field(backend, info, where)[0]
+    except InputError:
+        raise
+    except Exception:  # a backend may raise anything for missing values
+        log.debug("%s: backend %r needs real tensors to build its field", where, info.backend)
+    if outline is not None:
         tensors = checked_weights(outline, tensors, path)
     field, _ = build_field(backend, info, where)
     if outline is None:
         tensors = checked_weights(field, tensors, path)
     cast(nn.Module, field).load_state_dict(tensors)
     cast(nn.Module, field).requires_grad_(False).eval()
-    return in_map_frame(field, info)
+    return info.in_map_unit(field)
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
@@ -371,42 +408,9 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
     except ValueError as error:
         raise InputError(f"backend {info.backend!r} rejects its config: {error}", where=where) from error
     if not (isinstance(field, nn.Module) and isinstance(field, RadianceField)):
-        found = type(field).__name__
         raise InputError(
-            f"backend {info.backend!r} built a {found}",
+            f"backend {info.backend!r} built a {type(field).__name__}",
             where=where,
             expected="an nn.Module with query and sampler",
         )
     return field, config
-
-
-def _outline(backend: Backend, info: MapInfo, where: str) -> RadianceField | None:
-    """Return the field with only the shapes of its tensors, or None if its backend needs real tensors to build it."""
-    try:
-        with torch.device("meta"):
-            return build_field(backend, info, where)[0]
-    except InputError:
-        raise
-    except Exception:  # a backend may raise anything for missing values
-        return None
-
-
-def _read(
-    folder: Path, baked: bool
-) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None, Anchor | None]:
-    """Load parts that belong to the same map, even while a training run replaces them."""
-    info = load_info(folder)
-    while True:
-        try:
-            anchor = load_anchor(folder, info.anchor)
-            if anchor is not None and (now := load_info(folder)) != info:  # which had another anchor
-                info = now
-                continue
-            weights = read_tensors(folder / info.weights, EXPECTED_PART)
-            surface = load_surface(folder / info.surface) if baked and info.surface else None
-            landmarks = load_landmarks(folder, info) if baked else None
-            return info, weights, surface, landmarks, anchor
-        except InputError:
-            before, info = info, load_info(folder)
-            if replace(before, bidnerf="") == replace(info, bidnerf=""):
-                raise

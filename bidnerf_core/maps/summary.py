@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
@@ -18,12 +17,14 @@ from bidnerf_core.captures import (
     sentences,
 )
 from bidnerf_core.errors import amount
-from bidnerf_core.fields import RadianceField, SceneBounds, levels
+from bidnerf_core.fields import SceneBounds, levels
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import to_plain
-from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
-from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.mapping import HeldOutTrial
 from bidnerf_core.progress import duration_text
+
+if TYPE_CHECKING:
+    from bidnerf_core.maps.map import Map
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,49 @@ class MapSummary:
     capture: CaptureReport | None  # the capture record, if there is one
     colour_noise: float | None  # root mean square error of rendered colours on training images
     remarks: tuple[str, ...]  # sentences about the poses and the photos
+
+    @staticmethod
+    def of(scene: Map) -> MapSummary:
+        """Return the summary of a map."""
+        info, field, surface, folder = scene.info, scene.field, scene.surface, scene.folder
+        refinement, capture = info.pose_refinement, scene.capture
+        remarks = [] if refinement is None else pose_sentences(info.cameras, refinement)
+        if capture is not None:
+            remarks += sentences(capture)
+        size, files = None, None
+        if surface is not None:
+            size = SurfaceSize(surface.cell, surface.stored_cells, round(surface.mebibytes, 1))
+        if folder is not None:
+            files = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+        return MapSummary(
+            map="" if folder is None else str(folder),
+            backend=info.backend,
+            data=info.data,
+            cameras=len(info.cameras),
+            added=info.added,
+            unit=info.unit,
+            up=scene.up,
+            distances=info.distances,
+            poses=refinement,
+            step=info.step,
+            complete=info.complete,
+            seconds=round(info.seconds, 1),
+            levels=len(levels(field)),
+            parameters=sum(p.numel() for p in field.parameters()) if isinstance(field, nn.Module) else 0,
+            surfels=0 if surface is None else len(surface.surfels),
+            surface=size,
+            landmarks=0 if scene.landmarks is None else len(scene.landmarks),
+            trial=None if scene.landmarks is None else scene.landmarks.trial,
+            bytes=files,
+            bounds=info.bounds,
+            origin=info.origin,
+            config=info.config,
+            bidnerf=info.bidnerf,
+            moved=tuple(moved_cameras(info.cameras)),
+            capture=capture,
+            colour_noise=info.colour_noise,
+            remarks=tuple(remarks),
+        )
 
     def plain(self) -> dict[str, Any]:
         """Return the facts as JSON-serializable values."""
@@ -127,49 +171,6 @@ class MapSummary:
             return "none; 'bidnerf bake MAP' builds it"
         cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
         return f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
-
-
-def summarized(
-    info: MapInfo, field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None,
-    capture: CaptureReport | None, folder: Path | None, up: UpDirection | None = None,
-) -> MapSummary:  # fmt: skip
-    """Return the summary of a map from its parts."""
-    size, files = None, None
-    if surface is not None:
-        size = SurfaceSize(surface.cell, surface.stored_cells, round(surface.mebibytes, 1))
-    if folder is not None:
-        files = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
-    refinement = info.pose_refinement
-    remarks = [] if refinement is None else pose_sentences(info.cameras, refinement)
-    return MapSummary(
-        map="" if folder is None else str(folder),
-        backend=info.backend,
-        data=info.data,
-        cameras=len(info.cameras),
-        added=info.added,
-        unit=info.unit,
-        up=up,
-        distances=info.distances,
-        poses=refinement,
-        step=info.step,
-        complete=info.complete,
-        seconds=round(info.seconds, 1),
-        levels=len(levels(field)),
-        parameters=sum(p.numel() for p in field.parameters()) if isinstance(field, nn.Module) else 0,
-        surfels=0 if surface is None else len(surface.surfels),
-        surface=size,
-        landmarks=0 if landmarks is None else len(landmarks),
-        trial=None if landmarks is None else landmarks.trial,
-        bytes=files,
-        bounds=info.bounds,
-        origin=info.origin,
-        config=info.config,
-        bidnerf=info.bidnerf,
-        moved=tuple(moved_cameras(info.cameras)),
-        capture=capture,
-        colour_noise=info.colour_noise,
-        remarks=tuple(remarks if capture is None else [*remarks, *sentences(capture)]),
-    )
 
 
 def _scene_line(bounds: SceneBounds) -> str:

@@ -4,60 +4,44 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import torch
 from torch import nn
 
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.camera import Intrinsics, checked_side
-from bidnerf_core.captures import (
-    RefinementChoice,
-    as_given,
-    at_stored_poses,
-    located,
-    prepared,
-    stored_cameras,
-)
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import as_given, at_stored_poses, located, prepared, stored_cameras
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets import SparseChoice
+from bidnerf_core.datasets import HOLD_OUT_EVERY, DatasetOptions
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields import device_of
 from bidnerf_core.frames import View
-from bidnerf_core.io import Background, from_plain, packed, to_plain
-from bidnerf_core.mapping import USUAL_FEATURES, BakeConfig, TrackedViews, find_features
-from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS, Checkpoints
+from bidnerf_core.io import from_plain, packed, to_plain
+from bidnerf_core.mapping import BakeConfig, TrackedViews
+from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info, longest_side
-from bidnerf_core.maps.files import load_state, map_folder
-from bidnerf_core.maps.map import Map, build_field, frozen_field, load_map
-from bidnerf_core.maps.photos import posed_images
+from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
+from bidnerf_core.maps.options import TrainOptions
+from bidnerf_core.maps.store import load_state, map_folder
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, job_context
 from bidnerf_core.registry import PluginError
+from bidnerf_core.structure import lacks_poses
 from bidnerf_core.training import TrainingStopped
 
 log = logging.getLogger("bidnerf")
-USUAL_BAKE = BakeConfig()
+
+USUAL = TrainOptions()
 
 
 class OtherSettings(InputError):
     """A training run cannot be resumed with settings that differ from its original ones."""
-
-
-@dataclass(frozen=True)
-class _Work:
-    """How to train and bake, independent of the views."""
-
-    out: Path | None
-    bake: BakeConfig | None
-    device: torch.device
-    checkpoint_seconds: float
-    progress: ProgressCallback | None
-    cancel: Cancel | None
 
 
 def train(
@@ -65,134 +49,132 @@ def train(
     backend: str = "hashgrid",
     out: str | Path | None = None,
     config: Any = None,
-    split: str = "train",
-    refine_poses: RefinementChoice = "auto",
+    *,
     bake: bool | BakeConfig = True,
-    device: torch.device | str = "cpu",
-    overwrite: bool = False,
+    options: TrainOptions = USUAL,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
-    *,
-    background: Background | None = None,
-    depth_points: str | Path | None = None,
-    point_choice: SparseChoice | None = None,
-    checkpoint_seconds: float = CHECKPOINT_SECONDS,
-    features: str = USUAL_FEATURES,
-    largest: int | None = None,
-    trust_poses: bool = False,
-    camera: Intrinsics | str | Path | None = None,
 ) -> Map:
     """Train a map on images: check and refine their poses, train the field, and bake a surface and landmarks.
 
-    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``split`` selects the
-    views of a dataset, and "all" stands for all splits. The path may also be a folder of photos without
-    poses, or a video: ``find_poses`` then finds the poses first, in the folder OUT-poses next to the map.
-    ``camera`` (intrinsics or a file) is for such photos, and for the path to a dataset that stores no camera.
-    ``backend`` is the name of an installed backend, and ``config`` holds its settings: an object of its
-    ``config_type``, or a dict of those that differ from the defaults. The map is stored in folder ``out``
-    during training, or only kept in memory if that is None. ``refine_poses`` is "always", "never", or "auto"
-    (if the images contradict the given poses). ``bake`` may hold the settings of baking.
+    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``options.images`` says how it
+    is read, such as which split. The path may also be a folder of photos without poses, or a video: ``find_poses`` then
+    finds the poses first, in the folder OUT-poses next to the map. ``backend`` is the name of an installed backend, and
+    ``config`` holds its settings: an object of its ``config_type``, or a dict of those that differ from the defaults.
+    The map is stored in folder ``out`` during training, or only kept in memory if that is None. ``bake`` may hold the
+    settings of baking.
 
     ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True,
     ``Cancelled`` is raised; a map in a folder whose training has begun is saved first, and ``resume``
     continues it. An exception raised by ``progress`` ends the training as well; the map in the folder is then
-    that of the last checkpoint, at most ``checkpoint_seconds`` old.
+    that of the last checkpoint, at most ``options.checkpoint_seconds`` old.
 
-    ``background`` is the colour behind images with an alpha channel. Images without depth take it from the
-    points of the COLMAP sparse model in folder ``depth_points``, filtered by ``point_choice``. ``features``
-    is the name of the landmarks' detector. Images with more than ``largest`` pixels along the longer side are
-    downscaled to that, by default to 1600, or fewer if they would take more than 2 GB or a quarter of the
-    available memory; the map's cameras are scaled accordingly. Poses that contradict most pairs of images are
-    rejected unless ``trust_poses`` is set.
+    Images with more than ``options.images.largest`` pixels along the longer side are downscaled to that, by default to
+    1600, or fewer if they would take more than 2 GB or a quarter of the available memory; the map's cameras are scaled
+    accordingly.
 
-    Raises ``InputError`` if data, settings or folder cannot be used; the folder must be empty unless
-    ``overwrite`` is set.
+    Raises ``InputError`` if data, settings or folder cannot be used, and if the poses contradict most pairs of images
+    unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
     """
-    chosen = load_backend(backend)
-    find_features(features)
-    settings = _settings(chosen, backend, config)
-    if refine_poses not in get_args(RefinementChoice):
-        choices = ", ".join(get_args(RefinementChoice))
-        raise InputError(f"refine_poses is {refine_poses!r}", expected=f"one of {choices}")
-    work = _work(out, bake, device, checkpoint_seconds, progress, cancel)
+    chosen, settings = load_backend(backend), config
+    if config is None or isinstance(config, dict):
+        settings = from_plain(chosen.config_type, config or {}, f"settings of backend {backend!r}")
+    elif not isinstance(config, chosen.config_type):
+        found, expected = type(config).__name__, chosen.config_type.__name__
+        raise InputError(f"config is a {found}", expected=f"a {expected} or a dict of its settings")
+    baking, device = bake_settings(bake), working_device(options.device)
+    place = None if out is None else Path(out)
     with (
-        contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite),
-        posed_images(data, split, work.out, camera, overwrite, progress, cancel) as (images, camera),
+        job_context(progress, cancel),
+        contextlib.nullcontext() if place is None else map_folder(place, options.overwrite),
+        posed_images(data, options.images, place, options.overwrite) as (posed, images),
     ):
-        side = checked_side(largest)
-        read = read_views(
-            images, split, background, depth_points, point_choice, progress, cancel, side, work.out, camera
-        )
+        read = read_views(posed, images, options.depth_points, options.point_choice, place)
         origin = chosen_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
         if any(origin):
             log.info(f"{read.place}: the map's own coordinates begin at {origin}, near its cameras")
         read = read.about(origin)
-        part = f" in split {split!r}" if read.source else ""
+        part = f" in split {images.split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
             log.info(f"{read.place}: no measured depth{part}; training on colour only")
-        taken = prepared(read.views, refine_poses, progress, cancel, features, trust_poses, read.depth_unit)
+        taken = prepared(
+            read.views,
+            options.refine_poses,
+            features=options.features,
+            trust_poses=options.trust_poses,
+            depth_unit=read.depth_unit,
+        )
         if not taken.distances:
             log.info(
                 f"{read.place}: the photos are from one place and do not determine distances; the map's"
                 " depth will be arbitrary, and localization in it will give directions, but no positions"
             )
-        check_cancelled("training", cancel)
-        bounds = estimate_bounds(taken.views, read.background)
+        check_cancelled("training")
         info = MapInfo(
-            backend, to_plain(settings, "config"), bounds, 0, False, read.source, cameras=taken.cameras,
-            pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=read.sparse_depth,
+            backend,
+            to_plain(settings, "config"),
+            estimate_bounds(taken.views, read.background),
+            0,
+            False,
+            read.source,
+            cameras=taken.cameras,
+            pose_refinement=taken.refinement,
+            distances=taken.distances,
+            sparse_depth=read.sparse_depth,
             hidden=read.hidden,
-            landmark_features=features, unit=read.unit, origin=origin, gravity_up=read.gravity_up,
-        )  # fmt: skip
-        return _trained(chosen, info, taken.views, taken.tracked, work)
+            landmark_features=options.features,
+            unit=read.unit,
+            origin=origin,
+            gravity_up=read.gravity_up,
+        )
+        report = Checkpoints(info, place, None, options.checkpoint_seconds)
+        return _baked(_trained(chosen, taken.views, report, device), taken.views, taken.tracked, baking)
 
 
 def resume(
     folder: str | Path,
     data: Images,
-    split: str = "train",
+    *,
     bake: bool | BakeConfig = True,
-    device: torch.device | str = "cpu",
+    options: TrainOptions = USUAL,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
-    *,
-    background: Background | None = None,
-    depth_points: str | Path | None = None,
-    point_choice: SparseChoice | None = None,
-    checkpoint_seconds: float = CHECKPOINT_SECONDS,
-    camera: Intrinsics | str | Path | None = None,
 ) -> Map:
     """Resume the interrupted training of the map in ``folder``, with the same result as an uninterrupted run.
 
-    A map that is trained but not baked is baked. Backend, settings and poses are those of the original run;
-    ``data``, ``split``, ``background``, ``depth_points``, ``point_choice`` and ``camera`` must give the same
-    views. The other arguments and the errors are as for ``train``. Raises ``InputError`` if nothing is left
-    to do.
+    A map that is trained but not baked is baked. Backend, settings and poses are those of the original run; ``data`` and
+    those ``options`` that concern reading must give the same views. The other arguments and the errors are as for
+    ``train``. Raises ``InputError`` if nothing is left to do.
     """
-    work = _work(folder, bake, device, checkpoint_seconds, progress, cancel)
-    out = Path(folder)
-    interrupted(out, work.bake is not None)
+    out, baking, device = Path(folder), bake_settings(bake), working_device(options.device)
+    interrupted(out, baking is not None)
     with (
+        job_context(progress, cancel),
         map_folder(out, overwrite=True),
-        posed_images(data, split, out, camera, False, progress, cancel) as (images, camera),
+        posed_images(data, options.images, out) as (posed, images),
     ):
-        info = interrupted(out, work.bake is not None)  # another process may have finished meanwhile
-        if background is None and isinstance(images, str | Path):
-            background = info.bounds.background
-        side = longest_side(info)
-        read = read_views(
-            images, split, background, depth_points, point_choice, progress, cancel, side, out, camera
-        ).about(info.origin)
-        _check_same_views(out, info, read, split)
+        info = interrupted(out, baking is not None)  # another process may have finished meanwhile
+        images = replace(images, largest=longest_side(info))
+        if images.background is None and isinstance(posed, str | Path):
+            images = replace(images, background=info.bounds.background)
+        read = read_views(posed, images, options.depth_points, options.point_choice, out).about(info.origin)
+        _check_same_views(out, info, read, images.split)
         views = at_stored_poses(read.views, info.cameras)
         if info.complete:  # interrupted between training and baking
             log.info(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
-            scene = load_map(out, work.device, baked=False)
-            return scene.with_baked_parts(views, work.bake or USUAL_BAKE, progress=progress, cancel=cancel)
+            return load_map(out, device, baked=False).with_baked_parts(views, baking or USUAL_BAKE)
         tracked, views = located(
-            views, progress, cancel, info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
+            views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
         )  # the same as when training began
-        return _trained(load_backend(info.backend, str(out)), info, views, tracked, work)
+        backend = load_backend(info.backend, str(out))
+        field, _ = build_field(backend, info, str(out))
+        state = None
+        if info.step:
+            state = load_state(out, info, field)
+            log.info(f"{out}: resuming from step {info.step}")
+        report = Checkpoints(info, out, state, options.checkpoint_seconds)
+        del state, field  # the report frees the state once training resumes from it
+        return _baked(_trained(backend, views, report, device), views, tracked, baking)
 
 
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
@@ -213,31 +195,50 @@ def interrupted(folder: Path, baking: bool = True) -> MapInfo:
     return info
 
 
-def _settings(chosen: Backend, name: str, config: Any) -> Any:
-    kind = chosen.config_type
-    if config is None or isinstance(config, dict):
-        return from_plain(kind, config or {}, f"settings of backend {name!r}")
-    if not isinstance(config, kind):
-        found = type(config).__name__
-        raise InputError(f"config is a {found}", expected=f"a {kind.__name__} or a dict of its settings")
-    return config
-
-
-def _work(
-    out: str | Path | None, bake: bool | BakeConfig, device: torch.device | str, seconds: float,
-    progress: ProgressCallback | None, cancel: Cancel | None,
-) -> _Work:  # fmt: skip
-    if not seconds >= 0:
-        raise InputError(f"checkpoint_seconds is {seconds}", expected="0 or more")
+def bake_settings(bake: bool | BakeConfig) -> BakeConfig | None:
+    """Return the settings of baking, or None for False. Raises ``InputError`` for anything else."""
     if not isinstance(bake, bool | BakeConfig):
         raise InputError(f"bake is {bake!r}", expected="True, False or a BakeConfig")
-    if progress is not None and not callable(progress):
+    return bake if isinstance(bake, BakeConfig) else USUAL_BAKE if bake else None
+
+
+@contextlib.contextmanager
+def posed_images(
+    data: Images, options: DatasetOptions, out: Path | None, overwrite: bool = False
+) -> Iterator[tuple[Images, DatasetOptions]]:
+    """Yield images with poses, and the options with which to read them.
+
+    For a folder of photos without poses, or a video, this is the dataset of poses found by structure from
+    motion, next to the map ``out``, or in a temporary folder for a map in memory; existing poses are reused.
+    Anything else is yielded unchanged.
+    """
+    if not isinstance(data, str | Path) or not lacks_poses(data):
+        yield data, options
+        return
+    from bidnerf_core.structure import find_poses
+
+    camera = options.camera
+    if not (camera is None or isinstance(camera, Intrinsics | str | Path)):
         raise InputError(
-            f"progress is a {type(progress).__name__}", expected="a function that takes a Progress"
+            f"camera is a {type(camera).__name__}", where=data, expected="intrinsics or a file of them"
         )
-    config = bake if isinstance(bake, BakeConfig) else USUAL_BAKE if bake else None
-    place = None if out is None else Path(out)
-    return _Work(place, config, working_device(device), seconds, progress, cancel)
+    with (
+        tempfile.TemporaryDirectory() if out is None else contextlib.nullcontext(poses_folder(out)) as folder
+    ):
+        found = find_poses(data, folder, camera, overwrite, reuse=True)
+        if options.split == "train":
+            tested = len(range(0, found.placed, HOLD_OUT_EVERY))
+            log.info(
+                f"{folder}: {amount(tested, 'photo')} of {found.placed} {'is' if tested == 1 else 'are'} held out to test"
+                " the map; split 'all' trains on all"
+            )
+        yield folder, replace(options, camera=None)
+
+
+def poses_folder(out: Path) -> Path:
+    """Return the folder next to a map that holds the poses of its photos: MAP-poses."""
+    place = out if out.name else out.absolute()  # "." has no name
+    return place.with_name(f"{place.name}-poses")
 
 
 def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
@@ -267,43 +268,35 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
         )
 
 
-def _trained(
-    backend: Backend, info: MapInfo, views: Sequence[View], tracked: TrackedViews | None, work: _Work
-) -> Map:
-    """Train from the state that ``info`` describes, and bake."""
-    where = str(work.out or info.data or "map in memory")
+def _trained(backend: Backend, views: Sequence[View], report: Checkpoints, device: torch.device) -> Map:
+    """Train from the state that the report holds to the end."""
+    info, out = report.info, report.folder
+    where = str(out or info.data or "map in memory")
     built, config = build_field(backend, info, where)
-    field = moved(built, work.device)
-    state = None
-    if info.step and work.out is not None:
-        state = load_state(work.out, info, field)
-        log.info(f"{where}: resuming from step {info.step}")
-    report = Checkpoints(info, work.out, state, work.checkpoint_seconds, work.progress, work.cancel)
-    del state  # the report frees it once training resumes from it
+    field = moved(built, device)
     try:
         backend.train(field, views, config, report)
     except TrainingStopped as stopped:
-        kept = "saved" if work.out is not None else "cancelled"
-        advice = "; --resume continues from there" if work.out is not None else ", nothing is stored"
+        kept, advice = "cancelled", ", nothing is stored"
+        if out is not None:
+            kept, advice = "saved", "; --resume continues from there"
         raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
     report.finish(field)
     weights = packed(cast(nn.Module, field).state_dict())
     del field, built
-    scene = Map(report.info, frozen_field(report.info, weights, work.out), folder=work.out).to(work.device)
-    if (config := work.bake) is not None:
-        scene = baked_or_kept(
-            scene,
-            lambda whole: whole.with_baked_parts(
-                list(views), config, False, tracked, work.progress, work.cancel
-            ),
-        )
-    if work.out is not None:
-        size = sum(file.stat().st_size for file in work.out.iterdir()) / 2**20
-        log.info(f"{where}: map of {info.data or 'views in memory'}, {size:.1f} MiB")
+    return Map(report.info, frozen_field(report.info, weights, out), folder=out).to(device)
+
+
+def _baked(scene: Map, views: Sequence[View], tracked: TrackedViews | None, config: BakeConfig | None) -> Map:
+    if config is not None:
+        scene = baked_if_possible(scene, lambda whole: whole.with_baked_parts(views, config, tracked=tracked))
+    if scene.folder is not None:
+        size = sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20
+        log.info(f"{scene.folder}: map of {scene.info.data or 'views in memory'}, {size:.1f} MiB")
     return scene
 
 
-def baked_or_kept(scene: Map, bake: Callable[[Map], Map]) -> Map:
+def baked_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
     """Return what ``bake`` returns or, if the images do not allow it, the map as it is: it is valid without a surface."""
     try:
         return bake(scene)

@@ -13,14 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import checked_side
 from bidnerf_core.datasets import (
     Dataset,
+    DatasetOptions,
     Georeferenced,
-    ReadingProgress,
     SparseChoice,
     SparsePoints,
-    open_dataset,
     reading_at,
     with_all,
 )
@@ -36,13 +35,15 @@ from bidnerf_core.frames import (
     masks_sentence,
 )
 from bidnerf_core.geometry import LengthUnit
-from bidnerf_core.io import Background, available_memory, background_colour
-from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.io import available_memory, background_colour
+from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
 Images: TypeAlias = Dataset | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
+AS_STORED = DatasetOptions()
+"""Images of split "train" as their dataset stores them."""
 
 
 Origin: TypeAlias = tuple[float, float, float]
@@ -93,34 +94,25 @@ class ReadViews:
 
 def read_views(
     data: Images,
-    split: str = "train",
-    background: Background | None = None,
+    options: DatasetOptions = AS_STORED,
     depth_points: str | Path | None = None,
     point_choice: SparseChoice | None = None,
-    progress: ProgressCallback | None = None,
-    cancel: Cancel | None = None,
-    largest: int | None = None,
     folder: Path | None = None,
-    camera: Intrinsics | str | Path | None = None,
 ) -> ReadViews:
-    """Read the views of ``data``; ``split`` selects those of a dataset, and "all" stands for all splits.
+    """Read the views of ``data``; ``options.split`` selects those of a dataset, and "all" stands for all splits.
 
-    Images of a dataset with more than ``largest`` pixels along the longer side are downscaled to that, by
+    Images of a dataset with more than ``options.largest`` pixels along the longer side are downscaled to that, by
     default to ``useful_size``. They are held as bytes, and if they are many in a nameless file in ``folder``,
-    see ``PixelStore``.
+    see ``PixelStore``. The background behind images with an alpha channel is by default the dataset's; the other
+    options are for the path to a dataset.
 
-    ``background`` is the colour behind images with an alpha channel, by default the dataset's. Images without
-    depth take it from the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``.
-    ``camera`` is for the path to a dataset that stores no camera. Raises ``InputError`` if there are no
-    views, and if they or the model cannot be used.
+    Images without depth take it from the points of the COLMAP model in folder ``depth_points``, see
+    ``SparsePoints``. Raises ``InputError`` if there are no views, and if they or the model cannot be used.
     """
-    stated: LengthUnit | None = None
-    up: tuple[float, float, float] | None = None
-    step: float | None = None
+    split, background, largest = options.split, options.background, checked_side(options.largest)
     if isinstance(data, str | Path):
-        data, camera = open_dataset(data, background, camera=camera), None
-        background = None
-    if camera is not None:
+        data, background = options.open(data), None
+    elif options.camera is not None:
         raise InputError(
             "camera is given for images that have cameras; it is only for the path to images without"
         )
@@ -129,67 +121,68 @@ def read_views(
             raise InputError(
                 f"was opened with background {data.background}, got {background!r}", where=data.path
             )
-        if isinstance(data, Georeferenced):
-            stated, up = data.unit, data.up
-        step, data = getattr(data, "depth_unit", None), with_all(data, split)
-        if not data.frame_names(split):
-            raise InputError(f"split {split!r} has no frames", where=data.path)
-        views = _read(data, split, largest, folder, counter("reading", "images", progress, cancel))
-        if left_out := len(data.frame_names(split)) - len(views):
-            log.info(f"{data.path}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
-        if not views:
-            raise InputError(
-                f"masks hide every image in split {split!r} entirely; {INVERTED}", where=data.path
-            )
-        source, place, colour = data.path.resolve().name, str(data.path), data.background
+        read = _read_dataset(data, split, largest, folder)
     else:
-        views, source, place = _checked(data), "", "views in memory"
+        given: Sequence[object] = data if isinstance(data, Sequence) else [data]
+        views = [view for view in given if isinstance(view, View)]
+        for other in given:
+            if not isinstance(other, View):
+                raise InputError(
+                    f"data is or holds a {type(other).__name__}",
+                    expected="a dataset, a path, or views with poses",
+                )
+        if not views:
+            raise InputError("data holds no views", expected="at least one")
         colour = BLACK if background is None else background_colour(background)
-    hidden = _hidden(views, place)
-    unit = stated or _unit_of(views)
-    if depth_points is None:
-        return ReadViews(views, source, place, colour, hidden, unit, up, depth_unit=step)
-    views, count = _with_depth(views, Path(depth_points), point_choice or SparseChoice(), split)
-    return ReadViews(views, source, place, colour, hidden, unit, up, count, step)
-
-
-def _hidden(views: Sequence[View], place: str) -> int:
-    """Return how many pixels masks hide, and log it."""
-    hidden = [view.frame.hidden for view in views]
+        read = ReadViews(views, "", "views in memory", colour, unit=_unit_of(views))
+    hidden = [view.frame.hidden for view in read.views]
     if (sentence := masks_sentence(hidden)) is not None:
-        log.info(f"{place}: {sentence}")
-    return sum(int(pixels.sum()) for pixels in hidden if pixels is not None)
+        log.info(f"{read.place}: {sentence}")
+    read = replace(read, hidden=sum(int(pixels.sum()) for pixels in hidden if pixels is not None))
+    if depth_points is None:
+        return read
+    return _with_depth(read, Path(depth_points), point_choice or SparseChoice(), split)
 
 
-def _read(
-    data: Dataset, split: str, largest: int | None, folder: Path | None, progress: ReadingProgress
-) -> list[View]:
+def _read_dataset(data: Dataset, split: str, largest: int | None, folder: Path | None) -> ReadViews:
     """Read the views of a split one after another, so that only one image is in memory at full size."""
-    names = data.frame_names(split)
-    views: list[View] = []
+    unit: LengthUnit | None = None
+    up: tuple[float, float, float] | None = None
+    if isinstance(data, Georeferenced):
+        unit, up = data.unit, data.up
+    step, data = getattr(data, "depth_unit", None), with_all(data, split)
+    names, place = data.frame_names(split), str(data.path)
+    if not names:
+        raise InputError(f"split {split!r} has no frames", where=place)
+    count, views = counter("reading", "images"), list[View]()
     store, limit = PixelStore(0), 0  # the first image is read at full size, which is logged
-    for place, name in enumerate(names):
-        for view in _one(data, split, name, limit if views else None, largest is not None):
+    for number, name in enumerate(names, start=1):
+        try:
+            with reading_at(limit if views else None, largest is not None):
+                read = data.views(split, [name])
+        except WhollyHidden:  # by a mask
+            read = []
+        for view in read:
             if not views:
                 limit = largest or useful_size(view.frame, len(names))
                 small = view.frame.at_most(limit)
                 store = PixelStore(len(names) * bytes_of(small), folder)
-                _say_size(str(data.path), view.frame, small, len(names))
+                if small is not view.frame:
+                    before, after = (
+                        f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (view.frame, small)
+                    )
+                    log.info(
+                        f"{place}: {amount(len(names), 'image')} of {before} read at {after},"
+                        f" {len(names) * bytes_of(small) / 1e6:.0f} MB; --largest (largest=) sets another size"
+                    )
             views.append(replace(view, frame=store.stored(view.frame.at_most(limit))))
-        progress(place + 1, len(names))
-    return views
-
-
-def _one(data: Dataset, split: str, name: str, limit: int | None, asked: bool) -> list[View]:
-    """Read a frame, at most ``limit`` pixels wide and high, which the user may have requested (``asked``).
-
-    Returns none if a mask hides it entirely, as when a whole split is read.
-    """
-    try:
-        with reading_at(limit, asked):
-            return data.views(split, [name])
-    except WhollyHidden:
-        return []
+        count(number, len(names))
+    if left_out := len(names) - len(views):
+        log.info(f"{place}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
+    if not views:
+        raise InputError(f"masks hide every image in split {split!r} entirely; {INVERTED}", where=place)
+    source = data.path.resolve().name
+    return ReadViews(views, source, place, data.background, 0, unit or _unit_of(views), up, depth_unit=step)
 
 
 USEFUL_SIDE, LEAST_SIDE = 1600, 800
@@ -211,39 +204,17 @@ def useful_size(frame: Frame, count: int) -> int:
     return min(USEFUL_SIDE, max(LEAST_SIDE, fitting))
 
 
-def _say_size(place: str, frame: Frame, small: Frame, count: int) -> None:
-    if small is frame:
-        return
-    before, after = (f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (frame, small))
-    size = count * bytes_of(small) / 1e6
-    log.info(
-        f"{place}: {amount(count, 'image')} of {before} read at {after}, {size:.0f} MB; --largest (largest=) sets another size"
-    )
-
-
 def _unit_of(views: Sequence[View]) -> LengthUnit:
     """Return metres for views with dense measured depth: training rejects poses that contradict it."""
     return "metres" if any(view.frame.has_dense_depth for view in views) else "units"
 
 
-def _checked(views: Sequence[View]) -> list[View]:
-    found = list(views) if isinstance(views, Sequence) else [views]
-    for view in found:
-        if not isinstance(view, View):
-            raise InputError(
-                f"data is or holds a {type(view).__name__}", expected="a dataset, a path, or views with poses"
-            )
-    if not found:
-        raise InputError("data holds no views", expected="at least one")
-    return found
-
-
-def _with_depth(views: list[View], model: Path, choice: SparseChoice, split: str) -> tuple[list[View], int]:
+def _with_depth(read: ReadViews, model: Path, choice: SparseChoice, split: str) -> ReadViews:
     """Return the views with depth from the model's points, and the number of pixels that have it."""
-    places = [(view.frame.name, view.T_ref_camera) for view in views]
+    places = [(view.frame.name, view.T_ref_camera) for view in read.views]
     sparse = SparsePoints(model, places, choice, split)
-    changed = [sparse.onto(view, split) for view in views]
-    new = [after for after, before in zip(changed, views, strict=True) if after is not before]
+    changed = [sparse.onto(view, split) for view in read.views]
+    new = [after for after, before in zip(changed, read.views, strict=True) if after is not before]
     count = sum(int((view.frame.depth > 0).sum()) for view in new if view.frame.depth is not None)
     if count == 0:
         raise InputError(
@@ -251,5 +222,5 @@ def _with_depth(views: list[View], model: Path, choice: SparseChoice, split: str
             where=model,
             expected="points that its images observe and images without depth",
         )
-    log.info(f"{sparse.summary}; depth at {count} pixels of {len(new)} of {len(views)} images")
-    return changed, count
+    log.info(f"{sparse.summary}; depth at {count} pixels of {len(new)} of {len(read.views)} images")
+    return replace(read, views=changed, sparse_depth=count)

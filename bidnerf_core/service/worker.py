@@ -15,6 +15,7 @@ from typing import Any
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import BLACK
+from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
 from bidnerf_core.results import Answer, localize_each, place_each
@@ -39,7 +40,7 @@ class Served:
         """Facts about the map that clients may see."""
         facts = self.scene.describe().plain()
         return {key: facts[key] for key in TOLD} | {
-            "anchor": None if self.scene.anchor is None else self.scene.anchor.plain()
+            "anchor": None if self.scene.anchor is None else to_plain(self.scene.anchor)
         }
 
 

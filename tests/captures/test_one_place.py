@@ -13,9 +13,10 @@ from bidnerf_core import SE3, Localizer, Outcome, Tracker, View, load_map, train
 
 # Inside: whether photos show distances, before a map of them is trained
 from bidnerf_core.captures.coverage import shows_distances
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.mapping import LandmarkConfig, tracked_views
-from bidnerf_core.maps import load_info
+from bidnerf_core.maps import TrainOptions, load_info
 from bidnerf_core.testing import MapWithLandmarks, textured_map, unseen
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
@@ -102,7 +103,13 @@ def test_training_goes_on_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureF
         )
         for i, v in enumerate(tiny.views(3))
     ]
-    train(photos, out=tmp_path / "still", config=tiny.config(2), background=tiny.BACKGROUND, bake=False)
+    train(
+        photos,
+        out=tmp_path / "still",
+        config=tiny.config(2),
+        bake=False,
+        options=TrainOptions(images=DatasetOptions(background=tiny.BACKGROUND)),
+    )
     assert caplog.text.count("from one place and do not determine distances") == 1
     assert not load_info(tmp_path / "still").distances
     assert not load_map(tmp_path / "still").has_distances
@@ -110,4 +117,9 @@ def test_training_goes_on_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureF
         replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation, v.T_ref_camera.translation + i))
         for i, v in enumerate(photos)
     ]
-    assert train(moved, config=tiny.config(2), background=tiny.BACKGROUND, bake=False).has_distances
+    assert train(
+        moved,
+        config=tiny.config(2),
+        bake=False,
+        options=TrainOptions(images=DatasetOptions(background=tiny.BACKGROUND)),
+    ).has_distances

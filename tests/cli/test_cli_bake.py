@@ -22,10 +22,10 @@ from bidnerf_core.captures import located
 from bidnerf_core.cli import bake as command
 from bidnerf_core.cli import main
 from bidnerf_core.cli.output import read_views
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
-from bidnerf_core.maps import Map, load_info, load_map
+from bidnerf_core.maps import Map, TrainOptions, load_info, load_map
 from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
@@ -264,7 +264,9 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
     monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
     monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda name: watched)
-    stored = train(photos, config=tiny.config(4), background=tiny.BACKGROUND)
+    stored = train(
+        photos, config=tiny.config(4), options=TrainOptions(images=DatasetOptions(background=tiny.BACKGROUND))
+    )
     assert built == [24]
     assert seen[0] > 100
     assert stored.landmarks is not None
@@ -304,10 +306,10 @@ def test_photos_of_another_scene_are_not_baked_into_a_map(
     known = json.loads((baked / "map.json").read_text())
     (baked / "map.json").write_text(json.dumps(known | {"colour_noise": 0.1}))
     before = {file.name: file.read_bytes() for file in baked.iterdir()}
-    monkeypatch.setattr("bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.31)
+    monkeypatch.setattr("bidnerf_core.maps.baking.colour_noise", lambda *_: 0.31)
     for never_baked_or_baked in (folder, baked):
         refused = bidnerf("bake", never_baked_or_baked, "--data", tmp_path / "other")
         assert_refused(refused, 1, "differ from the photos", "by 31%")
     assert {file.name: file.read_bytes() for file in baked.iterdir()} == before
-    monkeypatch.setattr("bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.15)  # of the same scene
+    monkeypatch.setattr("bidnerf_core.maps.baking.colour_noise", lambda *_: 0.15)  # of the same scene
     assert bidnerf("bake", baked, "--data", tmp_path / "other").status == 0

@@ -113,7 +113,9 @@ def test_photos_that_are_baked_later_have_the_refined_poses(
     out = Path(shutil.copytree(refined, tmp_path / "map"))
     assert bidnerf("bake", out, "--data", shared / "data", "--measured", 5000, "--cells", 5000).status == 0
     info = load_info(out)
-    photos = load_capture(out / str(info.capture)).photos
+    capture = load_capture(out, info)
+    assert capture is not None
+    photos = capture.photos
     for photo, (_, T) in zip(photos, cameras_of(info), strict=True):
         torch.testing.assert_close(torch.tensor(photo.position).double(), T.translation, rtol=0, atol=1e-6)
 

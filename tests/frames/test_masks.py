@@ -27,7 +27,7 @@ from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.terms.images import Thumbnail
 from bidnerf_core.localization.terms.rays import averaged
 from bidnerf_core.mapping import SIFT, image_keypoints, tracked_views
-from bidnerf_core.maps import rendering_scores
+from bidnerf_core.maps import TrainOptions, rendering_scores
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import RayBank
 from commands import Run
@@ -332,6 +332,6 @@ def test_training_in_memory_takes_hidden_pixels(caplog: pytest.LogCaptureFixture
     generator = torch.Generator().manual_seed(0)
     seen = [hiding(view, torch.rand(view.frame.rgb.shape, generator=generator)) for view in views(3)]
     with caplog.at_level(logging.INFO, "bidnerf"):
-        scene = train(seen, config=config(), refine_poses="never", bake=False)
+        scene = train(seen, config=config(), bake=False, options=TrainOptions(refine_poses="never"))
     assert scene.info.hidden == sum(int(v.frame.hidden.sum()) for v in seen if v.frame.hidden is not None)
     assert any("inverted" not in r.message and "masks hide 50 %" in r.message for r in caplog.records)

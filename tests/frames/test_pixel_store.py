@@ -18,7 +18,7 @@ from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
 
 # Inside: blocks are made so small that the images of a test fill several
 from bidnerf_core.captures.photos import nearby
-from bidnerf_core.datasets import open_dataset, reading_at
+from bidnerf_core.datasets import DatasetOptions, open_dataset, reading_at
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import (
@@ -32,7 +32,7 @@ from bidnerf_core.frames import (
 )
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.landmarks import tracks
-from bidnerf_core.maps import read_views
+from bidnerf_core.maps import TrainOptions, read_views
 from bidnerf_core.maps import views as views_of_map
 from bidnerf_core.training import RayBank, ray_bank
 from photo_files import noise
@@ -202,7 +202,13 @@ def test_a_map_of_reduced_images_is_resumed_at_their_size(tmp_path: Path) -> Non
     from bidnerf_core.maps import load_info, longest_side
 
     data, out = tiny.write_dataset(tmp_path / "data"), tmp_path / "map"
-    train(data, out=out, config=tiny.config(), largest=20, bake=False)
+    train(
+        data,
+        out=out,
+        config=tiny.config(),
+        bake=False,
+        options=TrainOptions(images=DatasetOptions(largest=20)),
+    )
     info = load_info(out)
     assert longest_side(info) == 20
     assert resume(out, data).info.cameras == info.cameras

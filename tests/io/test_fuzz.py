@@ -39,7 +39,7 @@ from bidnerf_core.io import (
     read_tensors,
     to_plain,
 )
-from bidnerf_core.maps import MapInfo, load_info, save_map
+from bidnerf_core.maps import MapInfo, load_info, write_parts
 from bidnerf_core.maps import load_map as load
 from bidnerf_core.results import read_pose
 from bidnerf_core.training import TrainingState
@@ -68,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bounds = tiny.demo_object().bounds
     info = MapInfo("hashgrid", to_plain(tiny.config()), bounds, step=5, complete=True)
     field = backend.build(tiny.config(), bounds)
-    save_map(folder / "map", info, TrainingState(5, field.state_dict(), {}))
+    write_parts(folder / "map", info, TrainingState(5, field.state_dict(), {}))
     (folder / "pose.json").write_text(json.dumps({"T_world_camera": np.eye(4).tolist()}))
     (folder / "camera.json").write_text(json.dumps({"fl_x": 32, "cx": 12, "cy": 12, "w": 24, "h": 24}))
     (folder / "points.txt").write_text("0 0 1\n0 1 1\n")

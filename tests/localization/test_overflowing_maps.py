@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import Localizer, Outcome, Tracker
-from bidnerf_core.mapping import surface_tensors
-from bidnerf_core.maps import load_surface
+from bidnerf_core.mapping import surface_from_tensors, surface_tensors
 from bidnerf_core.testing import textured_map
 from flights import flight
 
@@ -25,14 +22,13 @@ def overflowing(tensors: dict[str, Tensor], part: str, value: float) -> dict[str
 
 @pytest.mark.parametrize("value", [1e30, -1e30, 3.4e38])
 @pytest.mark.parametrize("part", ["rgb", "normals", "positions"])
-def test_a_surface_of_overflowing_numbers_ends_no_tracking(part: str, value: float, tmp_path: Path) -> None:
+def test_a_surface_of_overflowing_numbers_ends_no_tracking(part: str, value: float) -> None:
     known = textured_map(surface=True)
     assert known.surface is not None
-    file = tmp_path / "surface.safetensors"
-    file.write_bytes(tensors_to_bytes(overflowing(surface_tensors(known.surface), part, value)))
     try:
-        scene = replace(known, surface=load_surface(file))
-    except InputError:
+        tensors = overflowing(surface_tensors(known.surface), part, value)
+        scene = replace(known, surface=surface_from_tensors(tensors))
+    except (InputError, ValueError):
         return
     tracker = Tracker(Localizer(scene, warm_up=False))
     answers = [tracker(frame, time) for time, frame, _ in flight()[:2]]

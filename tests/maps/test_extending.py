@@ -70,10 +70,10 @@ def test_a_photo_that_was_added_under_another_name_is_known(stored: Path) -> Non
     scene, new = bn.load_map(stored), training_views()[7]
     name = scene.info.cameras[0].name
     frame = replace(new.frame, name=name)
-    located = locate(scene, [frame], "map")
-    assert [each.frame.name for each in located.views] == [f"{name}_2"]
-    info = replace(scene.info, cameras=(*scene.info.cameras, *stored_cameras(located.views)))
-    assert locate(replace(scene, info=info), [frame], "map").known == (name,)
+    located = locate(scene, [frame], [])
+    assert [each.frame.name for each in located] == [f"{name}_2"]
+    info = replace(scene.info, cameras=(*scene.info.cameras, *stored_cameras(located)))
+    assert locate(replace(scene, info=info), [frame], []) == []
 
 
 def test_another_scene_is_refused(map_folder: Path) -> None:

@@ -18,7 +18,7 @@ from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, RayHits, Rays, SceneBounds, Stratified
 from bidnerf_core.geometry import SE3, Similarity
-from bidnerf_core.maps import ImportedField, bounds_about, importer_of
+from bidnerf_core.maps import ImportedField, ImportOptions, bounds_about, importer_of
 
 # Inside: viewpoints of given fields and bounds, whose number a map does not state
 from bidnerf_core.maps.viewpoints import VIEWS, viewpoints
@@ -150,13 +150,13 @@ def test_who_reads_a_file(file: Path, tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_scale_and_pose_reach_the_importer(file: Path) -> None:
     with refused(where=file, found="moved by 2.0"):
-        import_map(file, scale=2.0)
+        import_map(file, options=ImportOptions(scale=2.0))
     turned = SE3.exp(torch.tensor([0, 0, 0, 0, 0, 1.0], dtype=torch.float64))
     with refused(where=file, found="moved by 1.0"):
-        import_map(file, T_world_file=turned)
+        import_map(file, options=ImportOptions(T_world_file=turned))
     for scale in (0.0, -1.0, float("nan")):
         with refused(found=f"scale is {scale}", expected="a number above 0"):
-            import_map(file, scale=scale)
+            import_map(file, options=ImportOptions(scale=scale))
 
 
 def test_the_command(file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -30,8 +30,7 @@ from bidnerf_core.io import is_temporary, write_file
 # Inside: each writer is called by itself and stopped at each of its writes
 from bidnerf_core.localization.tracking.motion import Clock
 from bidnerf_core.localization.tracking.state import TrackerState, save_state
-from bidnerf_core.maps import Anchor, load_info, load_map, save_map
-from bidnerf_core.maps.anchor import save_anchor
+from bidnerf_core.maps import load_info, load_map, write_parts
 from bidnerf_core.results import Answer, Answers, PosedImage, new_figure, save_gif, write_figure
 from bidnerf_core.results.pose_files import POSE_WRITERS
 from interruptions import FULL, Stopped, outcomes
@@ -88,7 +87,6 @@ def results(path: Path, number: int) -> None:
 
 SAVERS: dict[str, Saver] = {
     **{name: part_of_a_map(name) for name in PARTS},
-    "anchor": file("anchor.json", lambda path, n: save_anchor(path.parent, Anchor(47.0, 19.0, float(n)))),
     "bytes": file("x", lambda path, n: write_file(path, bytes(n))),
     **{f"poses{ending}": file(f"poses{ending}", posed) for ending in POSE_WRITERS if "scanner" not in ending},
     "localization": file("found.json", lambda path, n: bn.Localization.save(FOUND.rejected(FOUND) if n > 1 else FOUND, path)),
@@ -115,7 +113,7 @@ def test_a_save_that_fails_at_any_write_leaves_whole_files(
     old, folder, seen = next(places), tmp_path, list[tuple[object, object]]()
     old.mkdir()
     if name in PARTS:
-        save_map(old, info(complete=True), state())
+        write_parts(old, info(complete=True), state())
     if before:
         save(old, 1)
     kept = read(old)

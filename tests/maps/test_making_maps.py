@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,13 @@ BAKE = BakeConfig(cells=5000)
 DESCENT = bn.settings_of("bid", {"rays": 64, "max_steps": 3})
 
 
-def trained(out: Path | None = None, **options: Any) -> bn.Map:
-    given = {"config": tiny.config(), "bake": False, "background": tiny.BACKGROUND}
-    return bn.train(tiny.views(), out=out, **(given | options))
+IMAGES = bn.DatasetOptions(background=tiny.BACKGROUND)
+OPTIONS = bn.TrainOptions(images=IMAGES)
+
+
+def trained(out: Path | None = None, **given: Any) -> bn.Map:
+    usual = {"config": tiny.config(), "bake": False, "options": OPTIONS}
+    return bn.train(tiny.views(), out=out, **(usual | given))
 
 
 def answer(scene: bn.Map, method: str = "bid") -> bn.Localization:
@@ -83,7 +88,8 @@ def test_a_folder_a_path_a_dataset_and_views_give_the_same_map(tmp_path: Path) -
     assert stored.folder == tmp_path / "map"
     assert stored.info == load_info(tmp_path / "map")
     assert stored.info.data == "data"
-    views = bn.train(data.views("train"), background=data.background, **options)
+    over = bn.TrainOptions(images=bn.DatasetOptions(background=data.background))
+    views = bn.train(data.views("train"), options=over, **options)
     for other in (bn.train(tmp_path / "data", **options), views, bn.load_map(tmp_path / "map")):
         assert_same_field(stored, other)
 
@@ -140,7 +146,7 @@ def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(
             raise Failed("the caller's own")
 
     with pytest.raises(Failed, match="the caller's own"):
-        trained(tmp_path / "map", progress=fail, checkpoint_seconds=0)
+        trained(tmp_path / "map", progress=fail, options=replace(OPTIONS, checkpoint_seconds=0))
     assert load_info(tmp_path / "map").step == 6
     assert_same_field(bn.resume(tmp_path / "map", tiny.views(), bake=False), whole)
 
@@ -185,7 +191,7 @@ def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_pat
             with pytest.raises(bn.InputError):
                 second(tmp_path / "map")
         with refused(where=tmp_path / "map", found="another bidnerf process", error=FileInUse):
-            trained(tmp_path / "map", overwrite=True)
+            trained(tmp_path / "map", options=replace(OPTIONS, overwrite=True))
         go_on.set()
         assert first.result().info.complete
     assert load_info(tmp_path / "map").complete
@@ -278,8 +284,7 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
         ({"backend": "hashgird"}, None, "no backend 'hashgird'", None),
         ({"config": {"stepps": 3}}, None, "no field 'stepps', did you mean 'steps'?", None),
         ({"config": 7}, None, "config is a int", "a HashGridConfig or a dict"),
-        ({"device": "tpu:9"}, None, "device 'tpu:9' does not work here", "cpu"),
-        ({"checkpoint_seconds": -1.0}, None, "checkpoint_seconds is -1.0", None),
+        ({"options": bn.TrainOptions(device="tpu:9")}, None, "device 'tpu:9' does not work here", "cpu"),
         ({"bake": "yes"}, None, "bake is 'yes'", "True, False or a BakeConfig"),
         ({"progress": 3}, None, "progress is a int", "a function"),
         (
@@ -288,7 +293,6 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
             "cancel is a Event",
             "a function, such as the is_set of an event",
         ),
-        ({"refine_poses": "maybe"}, None, "refine_poses is 'maybe'", "one of auto, always, never"),
     ],
 )
 def test_wrong_arguments_are_refused_before_any_work(
@@ -296,6 +300,16 @@ def test_wrong_arguments_are_refused_before_any_work(
 ) -> None:
     with refused(where=where, found=found, expected=expected):
         bn.train(**({"data": tiny.views(1), "config": tiny.config(1), "bake": False} | options))
+
+
+def test_wrong_options_are_refused() -> None:
+    for options, found in (
+        ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
+        ({"refine_poses": "maybe"}, "refine_poses is 'maybe'"),
+        ({"features": "sfit"}, "no detector 'sfit'"),
+    ):
+        with refused(found=found):
+            bn.TrainOptions(**options)  # type: ignore[arg-type]
 
 
 def test_a_backend_whose_module_is_no_field_is_refused_before_training(
@@ -322,7 +336,8 @@ def test_a_broken_detector_ends_training_with_an_error_and_the_map_in_its_folder
 ) -> None:
     monkeypatch.setattr("bidnerf_core.registry.registered", {("features", "blind"): lambda rgb: None})
     with refused(where="detector", found="returned a NoneType", expected="Keypoints", error=PluginError):
-        trained(tmp_path / "map", features="blind", refine_poses="never", bake=BAKE)
+        options = bn.TrainOptions(images=IMAGES, features="blind", refine_poses="never")
+        trained(tmp_path / "map", options=options, bake=BAKE)
     assert load_info(tmp_path / "map").complete
 
 

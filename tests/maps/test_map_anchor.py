@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import pytest
 from hypothesis import given
@@ -16,10 +17,8 @@ import tiny
 from bidnerf_core import resume, train
 from bidnerf_core.captures import CaptureReport, CoverageRecord
 
-# Inside: writes are counted and stopped at each, and an anchor is written as users write it
-from bidnerf_core.maps import Anchor, Map, files, load_anchor, load_info, load_map, save_map
-from bidnerf_core.maps.anchor import anchor_bytes, save_anchor
-from bidnerf_core.maps.files import save_capture
+# Inside: writes are counted and stopped at each
+from bidnerf_core.maps import Anchor, Map, TrainOptions, load_info, load_map, store, write_parts
 from bidnerf_core.progress import Progress
 from bidnerf_core.training import TrainingState
 from drawn import poses, record, shares
@@ -31,10 +30,10 @@ def trained() -> Map:
     return train(tiny.views(3), config=tiny.config(2), bake=False)
 
 
-def save(folder: Path, trained: Map, step: int, **options: Any) -> None:
+def save(folder: Path, trained: Map, step: int, anchor: Anchor | None = None) -> None:
     """Save the map as one of that number of steps."""
     state = TrainingState(step, cast(nn.Module, trained.field).state_dict(), {})
-    save_map(folder, replace(trained.info, step=step), state, **options)
+    write_parts(folder, replace(trained.info, step=step, anchor=anchor), state)
 
 
 def names(folder: Path) -> set[str]:
@@ -48,9 +47,12 @@ def names(folder: Path) -> set[str]:
         orientation_sigma=shares,
     )
 )  # fmt: skip
-def test_any_anchor_comes_back_as_it_was(anchor: Anchor, tmp_path: Path) -> None:
-    save_anchor(tmp_path, anchor)
-    assert load_anchor(tmp_path) == anchor
+def test_any_anchor_comes_back_as_it_was(anchor: Anchor, trained: Map, tmp_path: Path) -> None:
+    save(tmp_path, trained, 5, anchor)
+    assert load_info(tmp_path).anchor == anchor
+    save(tmp_path, trained, 5)
+    tiny.write_anchor(tmp_path, anchor)
+    assert load_info(tmp_path).anchor == anchor
 
 
 @pytest.mark.parametrize(
@@ -69,36 +71,46 @@ def test_a_save_that_stops_anywhere_leaves_a_map_with_its_own_anchor(
         nonlocal folder
         folder = next(places)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(files, "write_file", Path.write_bytes)  # not counted
+            patch.setattr(store, "write_file", Path.write_bytes)  # not counted
             save(folder, trained, 5)
-            (folder / "anchor.json").write_bytes(anchor_bytes(old))
-        save(folder, trained, 6, anchor=new)
+        tiny.write_anchor(folder, old)
+        save(folder, trained, 6, new)
 
     for number, raised in enumerate(outcomes(attempt, error, ((Path, "unlink"),))):
         loaded = load_map(folder)
         expected = {5: old, 6: new}[loaded.info.step]
         assert loaded.anchor == expected
         assert raised is not None or loaded.info.step == 6
-        following = number % 3
-        if following == 0:
-            save(folder, trained, 7, anchor="kept")
-        elif following == 1:
-            save_capture(folder, loaded.info, CaptureReport((), CoverageRecord()))
+        if number % 2:
+            write_parts(folder, loaded.info, capture=CaptureReport((), CoverageRecord()))
         else:
             expected = Anchor(1.0, 2.0, 3.0)
-            save_anchor(folder, expected)
+            tiny.write_anchor(folder, expected)
         assert load_map(folder).anchor == expected
-        assert load_anchor(folder) == expected or following == 2
-        assert not any(name.startswith("anchor-") for name in names(folder))
+
+
+def test_an_anchor_as_earlier_versions_stored_it_counts(tmp_path: Path, trained: Map) -> None:
+    """In a file of its own, which a new one replaced under another name until it had been renamed."""
+    old, new, name = Anchor(47.0, 19.0, 100.0), Anchor(1.0, 2.0, 3.0), "anchor-00000005-0123abcd.json"
+    save(tmp_path, trained, 5)
+    tiny.write_anchor(tmp_path, old)
+    description = tmp_path / "map.json"
+    description.write_text(json.dumps(json.loads(description.read_text()) | {"anchor": name}))
+    assert load_map(tmp_path).anchor == old
+    (tmp_path / "anchor.json").rename(tmp_path / name)
+    tiny.write_anchor(tmp_path, new)
+    assert load_map(tmp_path).anchor == old
+    (tmp_path / name).write_text("null")
+    assert load_map(tmp_path).anchor is None
 
 
 def test_a_map_does_not_take_over_the_anchor_of_the_one_before(tmp_path: Path) -> None:
     trained = train(tiny.views(3), out=tmp_path / "a", config=tiny.config(3), bake=False)
-    save_anchor(tmp_path / "a", anchor := Anchor(47.0, 19.0, 100.0))
+    tiny.write_anchor(tmp_path / "a", anchor := Anchor(47.0, 19.0, 100.0))
     trained.save(tmp_path / "b")
     assert load_map(tmp_path / "b").anchor == anchor
-    again = {"bake": False, "overwrite": True, "checkpoint_seconds": 0}
-    train(tiny.views(3), out=tmp_path / "a", config=tiny.config(3), **again)  # type: ignore[arg-type]
+    again = TrainOptions(overwrite=True, checkpoint_seconds=0)
+    train(tiny.views(3), out=tmp_path / "a", config=tiny.config(3), bake=False, options=again)
     assert names(tmp_path / "a") == {"map.json", load_info(tmp_path / "a").weights}
     load_map(tmp_path / "a").save(tmp_path / "b", overwrite=True)
     assert load_map(tmp_path / "b").anchor is None
@@ -109,9 +121,9 @@ def test_a_training_that_goes_on_keeps_the_anchor(tmp_path: Path) -> None:
         if progress.stage == "training" and progress.done == 2:
             raise Stopped
 
-    options = {"bake": False, "progress": stop, "checkpoint_seconds": 0}
+    options = TrainOptions(checkpoint_seconds=0)
     with pytest.raises(Stopped):
-        train(tiny.views(3), out=tmp_path, config=tiny.config(4), **options)  # type: ignore[arg-type]
-    save_anchor(tmp_path, anchor := Anchor(47.0, 19.0, 100.0))
+        train(tiny.views(3), out=tmp_path, config=tiny.config(4), bake=False, options=options, progress=stop)
+    tiny.write_anchor(tmp_path, anchor := Anchor(47.0, 19.0, 100.0))
     assert resume(tmp_path, tiny.views(3), bake=False).info.complete
     assert load_map(tmp_path).anchor == anchor

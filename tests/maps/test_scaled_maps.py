@@ -15,10 +15,9 @@ from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, locked
 
-# Inside: the place of a map by its name, and an anchor that users wrote before it is scaled
-from bidnerf_core.maps import Anchor, Map, MapInfo, load_anchor
-from bidnerf_core.maps.anchor import save_anchor
-from bidnerf_core.maps.scaling import place_of
+# Inside: the place of a map by its name
+from bidnerf_core.maps import Anchor, Map, MapInfo, load_info
+from bidnerf_core.maps.known_lengths import place_of
 from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen
 from commands import Run
 from refusals import refused
@@ -162,11 +161,11 @@ def test_an_interrupted_training_is_not_scaled(ground: Map) -> None:
 def test_saving_takes_the_anchor_along(tmp_path: Path) -> None:
     anchor = Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5)
     bn.train(tiny.views(3), out=tmp_path / "a", config=tiny.config(2), bake=False)
-    save_anchor(tmp_path / "a", anchor)
+    tiny.write_anchor(tmp_path / "a", anchor)
     bn.load_map(tmp_path / "a").save(tmp_path / "b")
-    assert load_anchor(tmp_path / "b") == anchor
+    assert load_info(tmp_path / "b").anchor == anchor
     bn.load_map(tmp_path / "b").scaled(0.5).save(tmp_path / "b", overwrite=True)
-    assert load_anchor(tmp_path / "b") == replace(anchor, metres_per_unit=1.0)
+    assert load_info(tmp_path / "b").anchor == replace(anchor, metres_per_unit=1.0)
 
 
 def test_a_map_that_is_being_changed_is_not_read(
@@ -194,13 +193,13 @@ def test_a_map_that_is_being_changed_is_not_read(
 def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     trained = tmp_path / "map"
     before = bn.train(tiny.views(3), out=trained, config=tiny.config(5), bake=False)
-    save_anchor(trained, Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5))
+    tiny.write_anchor(trained, Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5))
     status, out, err = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half")
     assert status == 0, err
     assert "all lengths multiplied by 0.5" in out
     half = bn.load_map(tmp_path / "half")
     assert half.unit == "metres"
-    anchors = [load_anchor(folder) for folder in (trained, tmp_path / "half")]
+    anchors = [load_info(folder).anchor for folder in (trained, tmp_path / "half")]
     places = [
         anchor.geographic(scene.info.cameras[0].pose).place
         for anchor, scene in zip(anchors, (before, half), strict=True)

@@ -30,10 +30,18 @@ from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.mapping import LandmarkMap, build_landmarks, landmark_tensors, surface_tensors
 
 # Inside: single parts of a map are saved, damaged and read again
-from bidnerf_core.maps import Map, MapInfo, files, load_info, load_map, save_map, save_surface
-from bidnerf_core.maps import map as map_module
+from bidnerf_core.maps import (
+    Anchor,
+    Map,
+    MapInfo,
+    load_capture,
+    load_info,
+    load_map,
+    store,
+    write_parts,
+)
 from bidnerf_core.maps.description import FieldFrame
-from bidnerf_core.maps.files import load_state, save_capture, save_landmarks
+from bidnerf_core.maps.store import load_state
 from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
@@ -92,14 +100,14 @@ def names(folder: Path) -> set[str]:
 
 def described(folder: Path, **changes: Any) -> None:
     """Write a map whose description has these entries."""
-    save_map(folder, info(), state())
+    write_parts(folder, info(), state())
     path = folder / "map.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 @pytest.mark.parametrize("complete", [True, False])
 def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None:
-    saved = save_map(tmp_path / "a" / "map", info(complete=complete), state())
+    saved = write_parts(tmp_path / "a" / "map", info(complete=complete), state())
     assert replace(saved, weights="", training=None) == info(complete=complete)
     loaded = load_map(tmp_path / "a" / "map")
     assert loaded.info == saved
@@ -123,6 +131,8 @@ descriptions = record(
     MapInfo,
     cameras=st.lists(record(StoredCamera, T_world_camera=rows, given_T_world_camera=st.none() | rows), max_size=2).map(tuple),
     pose_refinement=st.none() | record(PoseRefinement, noise_before=shares, noise_after=shares),
+    anchor=st.none() | record(Anchor, latitude=st.floats(-89, 89), longitude=st.floats(-180, 180),
+        metres_per_unit=st.floats(1e-3, 1e3), T_enu_world=rows, position_sigma=shares, orientation_sigma=shares),
     field_frame=st.none() | record(FieldFrame, scale=st.floats(1e-3, 1e3)),
     **{name: st.just(getattr(info(), name)) for name in ("landmark_source", "colour_noise", "format", "version")},
 )  # fmt: skip
@@ -131,16 +141,16 @@ descriptions = record(
 @settings(max_examples=20)
 @given(given_info=descriptions)
 def test_any_description_comes_back_as_it_was(given_info: MapInfo, tmp_path: Path) -> None:
-    saved = save_map(tmp_path, given_info, TrainingState(5, {"w": torch.ones(1)}, {}))
+    saved = write_parts(tmp_path, given_info, TrainingState(5, {"w": torch.ones(1)}, {}))
     assert load_info(tmp_path) == saved
-    parts = ("weights", "training", "surface", "landmarks", "capture", "anchor")
+    parts = ("weights", "training", "surface", "landmarks", "capture")
     assert replace(saved, **{p: getattr(given_info, p) for p in parts}) == given_info
 
 
 def test_what_follows_from_the_occupancy_is_brought_up_to_date_on_loading(tmp_path: Path) -> None:
     sparse = field(0)
     sparse.occupancy.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
-    save_map(tmp_path, info(), TrainingState(5, sparse.state_dict(), {}))
+    write_parts(tmp_path, info(), TrainingState(5, sparse.state_dict(), {}))
     loaded = load_map(tmp_path).field
     assert isinstance(loaded, HashGridField)
     assert not loaded.occupancy.near_occupied.any()
@@ -151,12 +161,12 @@ def test_views_of_shared_or_strided_memory_are_saved(tmp_path: Path) -> None:
     tensors = dict(state().field)
     weight = tensors["geometry.0.weight"]
     tensors["geometry.0.weight"] = weight.t().contiguous().t()
-    save_map(tmp_path, info(), TrainingState(5, tensors, {}))
+    write_parts(tmp_path, info(), TrainingState(5, tensors, {}))
     assert_holds(load_map(tmp_path), state())
 
 
 def test_nothing_on_disk_can_run(tmp_path: Path) -> None:
-    save_map(tmp_path, info(), state())
+    write_parts(tmp_path, info(), state())
     assert {file.suffix for file in tmp_path.iterdir()} == {".json", ".safetensors"}
     weights = tmp_path / load_info(tmp_path).weights
     weights.write_bytes(b"\x80\x04.")  # a pickle
@@ -170,11 +180,11 @@ def test_old_files_are_removed_and_others_are_left_alone(tmp_path: Path) -> None
              "training-00000004-0a1b2c3d.safetensors"]  # fmt: skip
     for name in (*mine, *stray):
         (tmp_path / name).touch()
-    save_map(tmp_path, info(step=5), state(5))
-    saved = save_map(tmp_path, info(step=6), state(6))
+    write_parts(tmp_path, info(step=5), state(5))
+    saved = write_parts(tmp_path, info(step=6), state(6))
     assert saved.training is not None
     assert names(tmp_path) == {*mine, "map.json", saved.weights, saved.training}
-    done = save_map(tmp_path, info(step=7, complete=True), state(7))
+    done = write_parts(tmp_path, info(step=7, complete=True), state(7))
     assert names(tmp_path) == {*mine, "map.json", done.weights}
 
 
@@ -196,9 +206,9 @@ def test_a_save_that_stops_anywhere_leaves_a_whole_map(
         folder.mkdir()
         if before:
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(files, "write_file", Path.write_bytes)  # not counted
-                save_map(folder, info(step=5), state(5))
-        save_map(folder, info(step=6, complete=complete), state(6))
+                patch.setattr(store, "write_file", Path.write_bytes)  # not counted
+                write_parts(folder, info(step=5), state(5))
+        write_parts(folder, info(step=6, complete=complete), state(6))
 
     steps = []
     for raised in outcomes(attempt, error):
@@ -226,37 +236,52 @@ def test_a_map_that_a_training_replaces_while_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between the description and the weights, the next checkpoint comes."""
-    save_map(tmp_path, info(step=5), state(5))
-    read = map_module.read_tensors
-    pending = [lambda: save_map(tmp_path, info(step=6), state(6))]
+    write_parts(tmp_path, info(step=5), state(5))
+    read = store.read_tensors
+    pending = [lambda: write_parts(tmp_path, info(step=6), state(6))]
 
     def late(path: Path, expected: str) -> dict[str, Tensor]:
         if pending:
             pending.pop()()
         return read(path, expected)
 
-    monkeypatch.setattr(map_module, "read_tensors", late)
+    monkeypatch.setattr(store, "read_tensors", late)
     loaded = load_map(tmp_path)
     assert loaded.info.step == 6
     assert_holds(loaded, state(6))
 
 
+def test_a_map_that_is_replaced_faster_than_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_parts(tmp_path, info(step=5), state(5))
+    read, steps = store.read_tensors, itertools.count(6)
+
+    def late(path: Path, expected: str) -> dict[str, Tensor]:
+        write_parts(tmp_path, info(step=next(steps)), state(5))
+        return read(path, expected)
+
+    monkeypatch.setattr(store, "read_tensors", late)
+    with refused(where=tmp_path, found="replaced faster than it can be read"):
+        load_map(tmp_path)
+
+
 def test_a_damaged_description_makes_no_save_remove_anything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    save_map(tmp_path, info(step=5), state(5))
+    write_parts(tmp_path, info(step=5), state(5))
     (tmp_path / "map.json").write_text("{")
     before = names(tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", striking(Path.replace, [], 0, FULL))
         with pytest.raises(OSError, match="No space left"):
-            save_map(tmp_path, info(step=6), state(6))
+            write_parts(tmp_path, info(step=6), state(6))
     assert names(tmp_path) == before
 
 
 def test_what_json_cannot_hold_is_told_before_anything_is_written(tmp_path: Path) -> None:
     with refused(found="config.learning_rate is nan", expected="a finite number"):
-        save_map(tmp_path / "map", replace(info(), config={"learning_rate": float("nan")}), state())
+        write_parts(tmp_path / "map", replace(info(), config={"learning_rate": float("nan")}), state())
     assert not (tmp_path / "map").exists()
 
 
@@ -266,7 +291,7 @@ def test_what_json_cannot_hold_is_told_before_anything_is_written(tmp_path: Path
 def test_a_backend_that_builds_something_else_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    save_map(tmp_path, info(), state())
+    write_parts(tmp_path, info(), state())
     chosen = load_backend("hashgrid")
     monkeypatch.setattr(type(chosen), "build", lambda *_: HomogeneousBall(1.0, 1.0))
     with refused(
@@ -300,16 +325,18 @@ def plain(tensors: dict[str, Tensor]) -> dict[str, Any]:
 
 PARTS = {
     "surface": Part(
-        lambda: (baked.patch(), baked.patch(3)), save_surface, lambda scene: scene.surface,
+        lambda: (baked.patch(), baked.patch(3)), lambda folder, info, part: write_parts(folder, info, surface=part),
+        lambda scene: scene.surface,
         lambda part: plain(surface_tensors(part)),
     ),
     "landmarks": Part(
-        lambda: (landmarks(), landmarks()[torch.arange(10)]), save_landmarks, lambda scene: scene.landmarks,
+        lambda: (landmarks(), landmarks()[torch.arange(10)]),
+        lambda folder, info, part: write_parts(folder, info, landmarks=part), lambda scene: scene.landmarks,
         lambda part: plain(landmark_tensors(part)),
     ),
     "capture": Part(
-        lambda: (CaptureReport((), CoverageRecord(landmarks=7)), CaptureReport((), CoverageRecord())), save_capture,
-        lambda scene: scene.capture, lambda part: part,
+        lambda: (CaptureReport((), CoverageRecord(landmarks=7)), CaptureReport((), CoverageRecord())),
+        lambda folder, info, part: write_parts(folder, info, capture=part), lambda scene: scene.capture, lambda part: part,
     ),
 }  # fmt: skip
 every_part = pytest.mark.parametrize("name", PARTS)
@@ -319,7 +346,7 @@ baked_part = pytest.mark.parametrize("name", ["surface", "landmarks"])
 def with_part(folder: Path, name: str, complete: bool = True) -> tuple[MapInfo, Path]:
     """Write a map with a part; return its description and the path of the part."""
     part = PARTS[name]
-    saved = part.save(folder, save_map(folder, info(complete=complete), state()), part.contents()[0])
+    saved = part.save(folder, write_parts(folder, info(complete=complete), state()), part.contents()[0])
     return saved, folder / getattr(saved, name)
 
 
@@ -337,8 +364,8 @@ def test_a_part_comes_back_as_it_was_and_the_rest_of_the_map_stays(name: str, tm
 @settings(max_examples=20)
 @given(capture=record(CaptureReport))
 def test_any_capture_record_comes_back_as_it_was(capture: CaptureReport, tmp_path: Path) -> None:
-    save_capture(tmp_path, save_map(tmp_path, info(), TrainingState(5, {"w": torch.ones(1)}, {})), capture)
-    assert files.load_capture(tmp_path / str(load_info(tmp_path).capture)) == capture
+    saved = write_parts(tmp_path, info(), TrainingState(5, {"w": torch.ones(1)}, {}), capture=capture)
+    assert load_capture(tmp_path, saved) == capture
 
 
 @baked_part
@@ -361,7 +388,7 @@ def test_a_new_part_replaces_the_old_one_alone_and_training_drops_it(name: str, 
     assert part.plain(part.read(loaded)) == part.plain(part.contents()[1])
     assert all(other.plain(other.read(loaded)) == other.plain(other.contents()[0]) for other in others)
     assert names(tmp_path) == {"map.json", after.weights, after.surface, after.landmarks, after.capture}
-    trained = save_map(tmp_path, after, state(6))
+    trained = write_parts(tmp_path, after, state(6))
     assert [getattr(trained, each) for each in PARTS] == [None] * 3
     assert [each.read(load_map(tmp_path)) for each in PARTS.values()] == [None] * 3
     assert names(tmp_path) == {"map.json", trained.weights}
@@ -370,16 +397,16 @@ def test_a_new_part_replaces_the_old_one_alone_and_training_drops_it(name: str, 
 def test_what_was_measured_of_the_field_is_stored_with_landmarks_and_dropped_by_training(
     tmp_path: Path,
 ) -> None:
-    saved = save_map(tmp_path, info(complete=True), state())
-    found = save_landmarks(tmp_path, saved, landmarks(), colour_noise=0.03125)
+    saved = write_parts(tmp_path, info(complete=True), state())
+    found = write_parts(tmp_path, replace(saved, colour_noise=0.03125), landmarks=landmarks())
     assert load_map(tmp_path).colour_noise == 0.03125
-    assert save_map(tmp_path, found, state(6)).colour_noise is None
+    assert write_parts(tmp_path, found, state(6)).colour_noise is None
     assert load_map(tmp_path).colour_noise is None
 
 
 @every_part
 def test_a_part_of_other_weights_is_refused(name: str, tmp_path: Path) -> None:
-    before, after = (save_map(tmp_path, info(complete=True), state()) for _ in range(2))
+    before, after = (write_parts(tmp_path, info(complete=True), state()) for _ in range(2))
     with refused(where=tmp_path, found=f"retrained while its {name}"):
         PARTS[name].save(tmp_path, before, PARTS[name].contents()[0])
     assert load_info(tmp_path) == after
@@ -387,9 +414,9 @@ def test_a_part_of_other_weights_is_refused(name: str, tmp_path: Path) -> None:
 
 
 def test_landmarks_of_a_detector_without_a_name_are_not_stored(tmp_path: Path) -> None:
-    saved = save_map(tmp_path, info(complete=True), state())
+    saved = write_parts(tmp_path, info(complete=True), state())
     with refused(where=tmp_path, found="detector has no name", expected="a registered one"):
-        save_landmarks(tmp_path, saved, replace(landmarks(), features=""))
+        write_parts(tmp_path, saved, landmarks=replace(landmarks(), features=""))
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -454,7 +481,7 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(name: str, tmp_path: Pat
 
 def test_a_map_from_before_there_were_landmarks_still_opens(tmp_path: Path) -> None:
     """Its description has neither entry."""
-    save_map(tmp_path, info(), state())
+    write_parts(tmp_path, info(), state())
     path = tmp_path / "map.json"
     entries = json.loads(path.read_text())
     path.write_text(json.dumps({k: v for k, v in entries.items() if k not in ("landmarks", "colour_noise")}))
@@ -477,7 +504,7 @@ def test_a_map_from_before_there_were_landmarks_still_opens(tmp_path: Path) -> N
 def test_weights_and_buffers_of_another_kind_are_refused(
     name: str, change: Callable[[Tensor], Tensor], found: str, tmp_path: Path
 ) -> None:
-    path = tmp_path / save_map(tmp_path, info(complete=True), state()).weights
+    path = tmp_path / write_parts(tmp_path, info(complete=True), state()).weights
     write_file(path, tensors_to_bytes(dict(state().field) | {name: change(state().field[name])}))
     with refused(where=path, found=f"tensor {name!r} {found}"):
         load_map(tmp_path)
@@ -485,7 +512,7 @@ def test_weights_and_buffers_of_another_kind_are_refused(
 
 @pytest.mark.parametrize("value", [-1e30, 3e38, math.nan, -math.inf])
 def test_weights_that_no_training_gives_are_refused(tmp_path: Path, value: float) -> None:
-    saved = save_map(tmp_path, info(step=5), state(5))
+    saved = write_parts(tmp_path, info(step=5), state(5))
     tensors = state(5).field
     name = next(key for key, held in tensors.items() if held.is_floating_point())
     write_file(
@@ -538,7 +565,7 @@ def test_a_map_of_thousands_of_cameras_is_described_without_a_loop_of_tensors(
     many = tuple(
         replace(CAMERAS[0], name=f"{i}", given_T_world_camera=CAMERAS[1].T_world_camera) for i in range(3000)
     )
-    save_map(tmp_path, replace(info(complete=True), cameras=many), state())
+    write_parts(tmp_path, replace(info(complete=True), cameras=many), state())
     counted = []
     usual = SE3.from_matrix
     monkeypatch.setattr(SE3, "from_matrix", lambda rows: counted.append(len(rows)) or usual(rows))

@@ -31,10 +31,10 @@ from bidnerf_core import (
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.geometry import Similarity
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.maps import ImportedField
+from bidnerf_core.maps import ImportedField, ImportOptions
 
 # Inside: where a map's own coordinates begin, and what the names of its places mean
-from bidnerf_core.maps.scaling import place_of
+from bidnerf_core.maps.known_lengths import place_of
 from bidnerf_core.maps.views import chosen_origin
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
@@ -218,7 +218,7 @@ def test_a_field_is_imported_into_survey_coordinates(tmp_path: Path, monkeypatch
     monkeypatch.setitem(registered, ("importers", "any"), AnyImporter())
     (tmp_path / "field.any").touch()
     T = SE3.identity().to(torch.float64).translated(OFFSET)
-    scene = import_map(tmp_path / "field.any", T_world_file=T, bake=False)
+    scene = import_map(tmp_path / "field.any", bake=False, options=ImportOptions(T_world_file=T))
     assert scene.origin == ORIGIN
     seen = view(POSES[0])
     assert torch.equal(scene.render(shifted([seen])[0]).rgb, near().render(seen).rgb)

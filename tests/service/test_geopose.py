@@ -18,12 +18,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from bidnerf_core import SE3, InputError, Intrinsics, Localization, Outcome
+from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import Geodetic, geodetic
-from bidnerf_core.maps import Anchor, GeographicPose, load_anchor
+from bidnerf_core.maps import Anchor, GeographicPose, MapInfo, load_info, write_parts
 from bidnerf_core.results import Answer
 
 # Inside: the axes of the standard, and answers without a server
 from bidnerf_core.service import geopose
+from bidnerf_core.training import TrainingState
 
 places = st.builds(Geodetic, st.floats(-90, 90), st.floats(-179.99, 179.99), st.floats(-5000, 20000))
 TURNED = SE3.exp(torch.tensor([3.0, -2.0, 1.0, 0.4, -0.5, 0.6], dtype=torch.float64))
@@ -83,10 +85,11 @@ def test_an_anchor_at_its_own_place_is_exact() -> None:
 
 
 def test_damaged_anchors_are_refused(tmp_path: Path) -> None:
-    assert load_anchor(tmp_path) is None
+    write_parts(tmp_path, MapInfo("hashgrid", {}, SceneBounds((0, 0, 0), (1, 1, 1), 0, 1), 1, True), TrainingState(1, {}, {}))
+    assert load_info(tmp_path).anchor is None
     good: dict[str, Any] = {"latitude": 47.0, "longitude": 19.0, "height": 100.0}
     (tmp_path / "anchor.json").write_text(json.dumps(good))
-    assert load_anchor(tmp_path) == Anchor(**good)
+    assert load_info(tmp_path).anchor == Anchor(**good)
     for change, part in (
         ({"latitude": 91.0}, "latitude is 91"),
         ({"longitude": None}, "longitude"),
@@ -98,7 +101,7 @@ def test_damaged_anchors_are_refused(tmp_path: Path) -> None:
     ):
         (tmp_path / "anchor.json").write_text(json.dumps(good | change))
         with pytest.raises(InputError, match=r"anchor\.json: .*" + part):
-            load_anchor(tmp_path)
+            load_info(tmp_path)
 
 
 COVARIANCE = torch.diag(torch.tensor([1e-4, 4e-4, 1e-4, 1e-6, 1e-6, 1e-6], dtype=torch.float64))

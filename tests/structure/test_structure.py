@@ -25,7 +25,7 @@ from bidnerf_core.datasets import all_views
 from bidnerf_core.geometry import fit_similarity
 
 # Inside: each stage of the search for poses, with its damaged files and rare geometry
-from bidnerf_core.maps.photos import posed_images, poses_folder
+from bidnerf_core.maps.training import posed_images, poses_folder
 from bidnerf_core.results import pose_error
 from bidnerf_core.structure import lacks_poses
 from bidnerf_core.structure.agreement import Agreement, agreement
@@ -172,8 +172,11 @@ def test_train_takes_photos_without_poses(
         assert ran.status == 0, ran.err
         assert "already has the poses of these photos" in ran.err
         assert len(bn.load_map(out).info.cameras) == PLACED
-        with caplog.at_level("INFO", "bidnerf"), posed_images(search.photos, "train", out) as (data, _):
-            assert data == str(beside)
+        with (
+            caplog.at_level("INFO", "bidnerf"),
+            posed_images(search.photos, bn.DatasetOptions(), out) as (data, _),
+        ):
+            assert data == beside
         assert "2 photos of 9 are held out" in caplog.text
     finally:
         beside.rename(search.out)

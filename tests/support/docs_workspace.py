@@ -21,7 +21,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.maps import MapInfo, save_map, save_surface
+from bidnerf_core.maps import MapInfo, write_parts
 from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.scenes import views as views_of
 from bidnerf_core.training import Silent, TrainingState
@@ -79,7 +79,7 @@ def write_map(folder: Path, views: list[View]) -> None:
     state = TrainingState(config.steps, dict(field.state_dict()), {})
     seen = views_of(demo_object(), dataclasses.replace(tiny.CAMERA), orbit(3.5, 24))
     surface = bake(field, bounds, [], seen, BakeConfig(rays=20_000, cells=20_000))
-    save_surface(folder, save_map(folder, info, state), surface)
+    write_parts(folder, info, state, surface)
 
 
 def write_photo(path: Path, view: View) -> None:

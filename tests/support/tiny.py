@@ -14,6 +14,8 @@ import torch
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import Observations, Rays
 from bidnerf_core.frames import View, all_pixels, observe
+from bidnerf_core.io import to_plain
+from bidnerf_core.maps import Anchor
 from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.scenes import views as seen_from
 from bidnerf_core.training import TrainingBatch
@@ -60,6 +62,11 @@ def black_batch(rays: Rays, distance: torch.Tensor) -> TrainingBatch:
     return TrainingBatch(
         rays, observed, black, torch.zeros(len(black), dtype=torch.long), torch.zeros_like(distance)
     )
+
+
+def write_anchor(folder: Path, anchor: Anchor) -> None:
+    """Write the anchor of the map in a folder into a file of its own, as users do."""
+    (folder / "anchor.json").write_text(json.dumps(to_plain(anchor)))
 
 
 def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = True) -> Path:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from bidnerf_core import SE3, BakeConfig, Frame, View, train
+from bidnerf_core import SE3, BakeConfig, Frame, TrainOptions, View, train
 from bidnerf_core.datasets import Query
 from photo_room import CAMERA, HALF, photograph
 from photo_room import walk as walk
@@ -32,7 +32,14 @@ def make_room(folder: Path) -> None:
     """Train a map of the room for two steps into ``folder / "map"``, and bake it."""
     views = [posed(T, f"view {number}") for number, T in enumerate(walk(8))]
     bake = BakeConfig(cells=20_000)
-    train(views, backend="hashgrid", out=folder / "map", config=config(2), bake=bake, refine_poses="never")
+    train(
+        views,
+        backend="hashgrid",
+        out=folder / "map",
+        config=config(2),
+        bake=bake,
+        options=TrainOptions(refine_poses="never"),
+    )
 
 
 def query(name: str = "unseen", seed: int = 0) -> Query:

@@ -30,6 +30,10 @@ class HeldOutTrial:
     translation: float = 0.0  # metres: median error
     rotation_deg: float = 0.0
 
+    def scaled(self, factor: float) -> HeldOutTrial:
+        """Return the trial in a map with lengths multiplied by ``factor``."""
+        return replace(self, translation=self.translation * factor)
+
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
@@ -69,6 +73,18 @@ class LandmarkMap:
 
     def __getitem__(self, index: Tensor) -> LandmarkMap:
         return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
+
+    def scaled(self, factor: float) -> LandmarkMap:
+        """Return the landmarks with lengths multiplied by ``factor``."""
+        lengths = self.pose_covariance.new_tensor([factor] * 3 + [1.0] * 3)
+        return replace(
+            self,
+            positions=self.positions * factor,
+            deviations=self.deviations * factor,
+            sizes=self.sizes * factor,
+            pose_covariance=self.pose_covariance * torch.outer(lengths, lengths),
+            trial=self.trial.scaled(factor),
+        )
 
     def to(self, device: torch.device | str) -> LandmarkMap:
         """Return the landmarks on another device; ``self`` if they are already there.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.fields import VoxelGrid
+from bidnerf_core.geometry import multiplied
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
 
 SURFEL_NEIGHBOURS = 12
@@ -97,6 +98,14 @@ class SurfaceMap:
     def device(self) -> torch.device:
         """Device of the surfels, their index and the keyframes, on which rays and query points must be too."""
         return self.surfels.positions.device
+
+    def scaled(self, factor: float) -> SurfaceMap:
+        """Return the surface with lengths multiplied by ``factor``; the entries of its index are unchanged."""
+        parts, grid, keyframes = self.surfels, self.grid, self.keyframes.clone()
+        keyframes[:, :3, 3] *= factor
+        surfels = replace(parts, positions=parts.positions * factor, rgb_gradient=parts.rgb_gradient / factor)
+        moved_grid = VoxelGrid(multiplied(grid.lower, factor), grid.cell * factor, grid.shape)
+        return replace(self, surfels=surfels, index=replace(self.index, grid=moved_grid), keyframes=keyframes)
 
     def to(self, device: torch.device | str) -> SurfaceMap:
         """Return the surface on another device; ``self`` if it is already there."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core import import_map, load_map
+from bidnerf_core import ImportOptions, import_map, load_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.errors import InputWarning
@@ -55,7 +55,7 @@ def test_a_map_in_another_world(file: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 40)
     T = SE3.exp(torch.tensor([1.0, -2, 0.5, 0.4, 1.1, -0.7], dtype=torch.float64))
     here = import_map(file, bake=False)
-    there = import_map(file, scale=3.0, T_world_file=T, bake=False)
+    there = import_map(file, bake=False, options=ImportOptions(scale=3.0, T_world_file=T))
     eye = SE3(T.rotation @ EYE.rotation, T.apply(3 * EYE.translation))
     first = render_image(here.field, CAMERA, EYE, replace(here.bounds, contracted=True))
     second = render_image(there.field, CAMERA, eye, replace(there.bounds, contracted=True))
@@ -69,7 +69,7 @@ def test_the_cameras_beside_a_file_are_its_viewpoints(file: Path) -> None:
         "rotation": torch.eye(3).tolist(),
     }  # fmt: skip
     (file.parent / "cameras.json").write_text(json.dumps([entry]))
-    (camera,) = import_map(file, scale=2.0, bake=False).info.cameras
+    (camera,) = import_map(file, bake=False, options=ImportOptions(scale=2.0)).info.cameras
     assert camera.intrinsics == Intrinsics(50.0, 51.0, 32.0, 24.0, 64, 48)
     assert camera.pose.translation.tolist() == [2, 4, 6]
 

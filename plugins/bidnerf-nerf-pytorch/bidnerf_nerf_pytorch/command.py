@@ -11,7 +11,7 @@ import tyro
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import to_plain
-from bidnerf_core.maps import UNMOVED, MapInfo, map_folder, save_map
+from bidnerf_core.maps import UNMOVED, MapInfo, map_folder, write_parts
 from bidnerf_core.training import TrainingState
 from bidnerf_nerf_pytorch.importer import Box, ImportSettings, importer
 
@@ -52,7 +52,7 @@ def import_checkpoint(
     plain = to_plain(found.config, "config")
     info = MapInfo(found.backend, plain, found.bounds, found.steps, True, checkpoint.name)
     with map_folder(out, overwrite):
-        save_map(out, info, TrainingState(found.steps, found.tensors, {}))
+        write_parts(out, info, TrainingState(found.steps, found.tensors, {}))
     print(f"{out}: {'; '.join(found.found)}", file=sys.stderr)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bidnerf_core import import_map
+from bidnerf_core import ImportOptions, import_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.maps import importer_of
 from bidnerf_nerf_pytorch.importer import importer
@@ -28,4 +28,4 @@ def test_other_files_are_not(write: Writer) -> None:
 
 def test_networks_stay_where_they_were_trained(write: Writer) -> None:
     with pytest.raises(InputError, match="cannot be moved or scaled"):
-        import_map(write(), scale=2.0, bake=False)
+        import_map(write(), bake=False, options=ImportOptions(scale=2.0))

@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from bidnerf_core import Map, export_map, import_map
+from bidnerf_core import ImportOptions, Map, export_map, import_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
@@ -109,7 +109,7 @@ def test_the_importer_reads_the_mesh_in_the_frame_and_unit_of_the_map(
     assert (b"turned so that y is upwards" in content) == (pose is not None)
     if pose is not None:  # these formats have y upwards
         assert T.rotation[:, 1].tolist() == pytest.approx([0, 0.6, 0.8])
-    found = import_map(files[f"mesh.{ending}"], T_world_file=T, bake=False)
+    found = import_map(files[f"mesh.{ending}"], bake=False, options=ImportOptions(T_world_file=T))
     for own, other in zip(scene.info.cameras, found.info.cameras, strict=True):
         assert own.name == other.name
         assert torch.allclose(own.pose.matrix(), other.pose.matrix(), atol=1e-9)

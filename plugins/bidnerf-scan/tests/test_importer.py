@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from bidnerf_core import import_map, load_map
+from bidnerf_core import ImportOptions, import_map, load_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import render_image
@@ -59,7 +59,7 @@ def test_a_map_in_another_world(tmp_path: Path) -> None:
     box().export(tmp_path / "box.glb")
     T = SE3.exp(torch.tensor([1.0, -2, 0.5, 0.4, 1.1, -0.7], dtype=torch.float64))
     here = import_map(tmp_path / "box.glb", bake=False)
-    there = import_map(tmp_path / "box.glb", scale=3.0, T_world_file=T, bake=False)
+    there = import_map(tmp_path / "box.glb", bake=False, options=ImportOptions(scale=3.0, T_world_file=T))
     eye = SE3(T.rotation @ EYE.rotation, T.apply(3 * EYE.translation))
     first = render_image(here.field, CAMERA, EYE, replace(here.bounds, contracted=True))
     second = render_image(there.field, CAMERA, eye, replace(there.bounds, contracted=True))
@@ -71,7 +71,7 @@ def test_millimetres_are_suspected(tmp_path: Path) -> None:
     box(1000).export(tmp_path / "mm.ply")
     with pytest.warns(InputWarning, match="millimetres"):
         import_map(tmp_path / "mm.ply", bake=False)
-    scene = import_map(tmp_path / "mm.ply", scale=0.001, bake=False)
+    scene = import_map(tmp_path / "mm.ply", bake=False, options=ImportOptions(scale=0.001))
     assert max(scene.bounds.size) < 2
 
 

@@ -1,44 +1,27 @@
-"""Maps in another length unit: scaling a whole map about the origin, and finding the factor that converts it
-to metres.
-"""
+"""Finding the factor that converts the lengths of a map to metres: by a known distance, or by known positions of cameras."""
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.captures import CaptureReport, MatrixRows, RowMotion, StoredCamera
+from bidnerf_core.captures import StoredCamera
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.fields import (
-    LARGEST_LENGTH,
-    RadianceField,
-    SceneBounds,
-    VoxelGrid,
     device_of,
     render,
-    scaled_field,
-    trained_field,
 )
-from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, spread
+from bidnerf_core.geometry import SE3, fit_similarity, spread
 from bidnerf_core.io import IMAGE_SUFFIXES
 from bidnerf_core.localization import origin_of
-from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
-from bidnerf_core.maps.anchor import scaled_anchor
-from bidnerf_core.maps.description import FieldFrame, MapInfo
-
-if TYPE_CHECKING:
-    from bidnerf_core.maps.map import Map
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.maps.map import Map
 
 Position = Sequence[float] | Float[Tensor, "3"]
 """Three coordinates."""
@@ -63,94 +46,6 @@ class ScaleFit:
 
     def __str__(self) -> str:
         return f"factor {self.factor:.6g} from {self.cameras} cameras, which fit to {self.error:.3g} m (root mean square)"
-
-
-def scaled(scene: Map, factor: float, unit: LengthUnit = "metres") -> Map:
-    """Return the map with all lengths multiplied by ``factor``, in memory; ``unit`` is the resulting length
-    unit.
-
-    Raises ``InputError`` for a factor that is not positive or makes lengths too large, and for a map whose
-    training is not complete.
-    """
-    if isinstance(factor, bool) or not (isinstance(factor, int | float) and 0 < factor < math.inf):
-        raise InputError(f"factor is {factor!r}", expected="a positive number")
-    where = scene.name
-    if scene.info.interruption is not None:
-        raise InputError(f"cannot be scaled: {scene.info.interruption}", where=where)
-    if scene.unit == unit == "metres" and factor != 1:
-        log.info("%s: was in metres before; its lengths are multiplied by %.6g all the same", where, factor)
-    whole = scene.whole()
-    extent = max(map(abs, (*scene.bounds.lower, *scene.bounds.upper, scene.bounds.far)))
-    if not extent * factor <= LARGEST_LENGTH or not factor >= 1 / LARGEST_LENGTH:
-        raise InputError(f"factor is {factor:g}, which makes the lengths of {where} too large or too small")
-    capture = whole.capture
-    info = scaled_info(whole.info, factor, unit)
-    return replace(
-        whole,
-        info=info,
-        field=in_map_frame(trained_field(whole.field), info),
-        surface=None if whole.surface is None else scaled_surface(whole.surface, factor),
-        landmarks=None if whole.landmarks is None else scaled_landmarks(whole.landmarks, factor),
-        folder=None,
-        record=None if capture is None else scaled_capture(capture, factor),
-        anchor=None if whole.anchor is None else scaled_anchor(whole.anchor, factor),
-    )
-
-
-def in_map_frame(field: RadianceField, info: MapInfo) -> RadianceField:
-    """Convert a field as its backend built it to the unit of its map."""
-    return field if info.field_frame is None else scaled_field(field, info.field_frame.scale)
-
-
-def scaled_info(info: MapInfo, factor: float, unit: LengthUnit) -> MapInfo:
-    """Return the description of a map with lengths multiplied by ``factor``; weights stay in the unit of training."""
-    frame = info.field_frame or FieldFrame(1.0, info.bounds)
-    scale = frame.scale * factor
-    bounds = frame.bounds if scale == 1 else scaled_bounds(info.bounds, factor)
-    cameras, origin = tuple(_camera(camera, factor) for camera in info.cameras), _three(info.origin, factor)
-    field_frame = None if scale == 1 else replace(frame, scale=scale)
-    return replace(info, bounds=bounds, cameras=cameras, unit=unit, origin=origin, field_frame=field_frame)
-
-
-def scaled_bounds(bounds: SceneBounds, factor: float) -> SceneBounds:
-    """Return the bounds of a scene with lengths multiplied by ``factor``."""
-    return replace(
-        bounds, lower=_three(bounds.lower, factor), upper=_three(bounds.upper, factor), near=bounds.near * factor,
-        far=bounds.far * factor, footprint=bounds.footprint * factor,
-    )  # fmt: skip
-
-
-def scaled_surface(surface: SurfaceMap, factor: float) -> SurfaceMap:
-    """Return a surface with lengths multiplied by ``factor``; its index is unchanged."""
-    parts, grid = surface.surfels, surface.grid
-    surfels = replace(parts, positions=parts.positions * factor, rgb_gradient=parts.rgb_gradient / factor)
-    moved = VoxelGrid(_three(grid.lower, factor), grid.cell * factor, grid.shape)
-    keyframes = surface.keyframes.clone()
-    keyframes[:, :3, 3] *= factor
-    return replace(surface, surfels=surfels, index=replace(surface.index, grid=moved), keyframes=keyframes)
-
-
-def scaled_landmarks(landmarks: LandmarkMap, factor: float) -> LandmarkMap:
-    """Return landmarks with lengths multiplied by ``factor``."""
-    lengths = landmarks.pose_covariance.new_tensor([factor] * 3 + [1.0] * 3)
-    return replace(
-        landmarks, positions=landmarks.positions * factor, deviations=landmarks.deviations * factor,
-        sizes=landmarks.sizes * factor, pose_covariance=landmarks.pose_covariance * torch.outer(lengths, lengths),
-        trial=_trial(landmarks.trial, factor),
-    )  # fmt: skip
-
-
-def scaled_capture(capture: CaptureReport, factor: float) -> CaptureReport:
-    """Return a capture record with lengths multiplied by ``factor``."""
-    photos = tuple(
-        replace(
-            photo, position=_three(photo.position, factor),
-            pose_translation=None if photo.pose_translation is None else photo.pose_translation * factor,
-        )
-        for photo in capture.photos
-    )  # fmt: skip
-    coverage = replace(capture.coverage, centre=_three(capture.coverage.centre, factor))
-    return replace(capture, photos=photos, coverage=coverage, trial=_trial(capture.trial, factor))
 
 
 def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -> float:
@@ -269,30 +164,3 @@ def _numbers(text: str) -> list[float]:
     except ValueError:
         return []
     return found if all(map(math.isfinite, found)) else []
-
-
-def _camera(camera: StoredCamera, factor: float) -> StoredCamera:
-    given, motion = camera.given_T_world_camera, camera.motion
-    return replace(
-        camera, T_world_camera=_rows(camera.T_world_camera, factor),
-        given_T_world_camera=None if given is None else _rows(given, factor),
-        motion=None if motion is None else _motion(motion, factor),
-    )  # fmt: skip
-
-
-def _rows(rows: MatrixRows, factor: float) -> MatrixRows:
-    return (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3])
-
-
-def _motion(motion: RowMotion, factor: float) -> RowMotion:
-    a, b, c, d, e, f = motion
-    return a * factor, b * factor, c * factor, d, e, f
-
-
-def _trial(trial: HeldOutTrial, factor: float) -> HeldOutTrial:
-    return replace(trial, translation=trial.translation * factor)
-
-
-def _three(numbers: Sequence[float], factor: float) -> tuple[float, float, float]:
-    x, y, z = numbers
-    return x * factor, y * factor, z * factor

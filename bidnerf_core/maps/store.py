@@ -1,0 +1,289 @@
+"""The files of a map: JSON and safetensors, which cannot run code when they are read.
+
+``map.json`` describes the map and names the files of its parts. Files are written under new names first and ``map.json`` is
+replaced atomically at the end: whenever writing stops, the folder holds one complete map.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import secrets
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from safetensors.torch import save as tensors_to_bytes
+from torch import Tensor, nn
+
+from bidnerf_core.backend import UpgradingField
+from bidnerf_core.captures import CaptureReport
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.fields import RadianceField, ScaledField, trained_field
+from bidnerf_core.io import (
+    from_plain,
+    load_part,
+    output_folder,
+    packed,
+    read_json,
+    read_tensors,
+    to_plain,
+    write_file,
+)
+from bidnerf_core.mapping import (
+    LandmarkMap,
+    SurfaceMap,
+    landmark_tensors,
+    landmarks_from_tensors,
+    surface_from_tensors,
+    surface_tensors,
+)
+from bidnerf_core.maps.anchor import ANCHOR
+from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, PART_NAMES, MapInfo, load_info
+from bidnerf_core.training import TrainingState
+
+PARTS = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
+BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
+OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
+"""Names of the files that saving may leave behind, of earlier versions as well; other files are never removed."""
+ATTEMPTS = 5
+"""Number of times that a map is read while a training run replaces it between the reading of its description and of its parts.
+Checkpoints are seconds apart, so that each further failure takes a disk slower than that."""
+LARGEST_WEIGHT = 1e9
+"""Limit of a field's parameters, beyond which products would overflow in float32; trained ones stay far below it."""
+
+
+def write_parts(
+    folder: Path,
+    info: MapInfo,
+    state: TrainingState | None = None,
+    surface: SurfaceMap | None = None,
+    landmarks: LandmarkMap | None = None,
+    capture: CaptureReport | None = None,
+) -> MapInfo:
+    """Write parts of the map that ``info`` describes, and return its description with their names.
+
+    With ``state``, this is a whole map, which replaces the one in the folder: parts that are not given, such as a surface that
+    was baked from earlier weights, are dropped. Without, the parts are added to the map in the folder, in place of those that
+    it has; what ``info`` says about landmarks (their source, the field's errors on their images) is written with these. The
+    caller holds the lock of the folder.
+
+    Raises ``InputError`` for landmarks whose detector has no name by which a query could find it, and if the map was retrained
+    while a part was built.
+    """
+    if landmarks is not None and not landmarks.features:
+        raise InputError("the landmarks' detector has no name;", where=folder, expected="a registered one")
+    parts: dict[str, Callable[[], bytes]] = {}
+    if state is not None:
+        parts["weights"] = lambda: tensors_to_bytes(packed(state.field))
+        if not info.complete:
+            parts["training"] = lambda: tensors_to_bytes(packed(state.optimizer))
+    if surface is not None:
+        parts["surface"] = lambda: tensors_to_bytes(surface_tensors(surface))
+    if landmarks is not None:
+        parts["landmarks"] = lambda: tensors_to_bytes(landmark_tensors(landmarks))
+    if capture is not None:
+        parts["capture"] = lambda: _json(capture)
+    names: dict[str, Any] = {
+        part: f"{part}-{info.step:08d}-{secrets.token_hex(4)}.{'json' if part == 'capture' else 'safetensors'}"
+        for part in parts
+    }
+    if state is not None:
+        names = dict.fromkeys(PART_NAMES) | names
+    else:
+        stored = load_info(folder)
+        if stored.weights != info.weights:
+            raise InputError(
+                f"was retrained while its {next(iter(parts))} was built; bake it again", where=folder
+            )
+        info, given = stored, info
+        if landmarks is not None:
+            names |= {
+                "landmark_features": landmarks.features,
+                "landmark_source": given.landmark_source,
+                "colour_noise": given.colour_noise,
+            }
+    if state is not None and landmarks is None:
+        names |= {"landmark_source": None, "colour_noise": None}
+    info = replace(info, **names)
+    description = _json(info)
+    folder.mkdir(parents=True, exist_ok=True)
+    _adopt_anchor(folder)
+    try:
+        for part, content in parts.items():
+            write_file(folder / names[part], content())
+        write_file(folder / DESCRIPTION, description)
+    finally:
+        _sweep(folder)
+    return info
+
+
+def read_parts(
+    folder: Path, baked: bool = True
+) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None]:
+    """Read the description, the weights and, if ``baked``, the surface and the landmarks of a map.
+
+    They belong together even while a training run replaces the map. Raises ``InputError`` if one of them is damaged.
+    """
+    info = load_info(folder)
+    for _ in range(ATTEMPTS):
+        try:
+            weights = read_tensors(folder / info.weights, EXPECTED_PART)
+            if not baked:
+                return info, weights, None, None
+            return info, weights, load_surface(folder, info), load_landmarks(folder, info)
+        except InputError as error:
+            before, info = info, load_info(folder)
+            if replace(before, bidnerf="") == replace(info, bidnerf=""):
+                raise
+            latest = error
+    raise InputError(
+        "is being replaced faster than it can be read; try again later", where=folder
+    ) from latest
+
+
+def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
+    """Return the state from which the interrupted training of ``field`` can be resumed."""
+    if info.training is None:
+        raise InputError(
+            f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder
+        )
+    path = folder / info.weights
+    weights = checked_weights(trained_field(field), read_tensors(path, EXPECTED_PART), path)
+    return TrainingState(info.step, weights, read_tensors(folder / info.training, EXPECTED_PART))
+
+
+def load_surface(folder: Path, info: MapInfo) -> SurfaceMap | None:
+    """Load the baked surface of a map; None if it has none. Raises ``InputError`` if the file does not hold one."""
+    if info.surface is None:
+        return None
+    return load_part(folder / info.surface, surface_from_tensors, "a baked surface", BAKED)
+
+
+def load_landmarks(folder: Path, info: MapInfo) -> LandmarkMap | None:
+    """Load the landmarks of a map; None if it has none. Raises ``InputError`` if the file does not hold their tensors."""
+    if info.landmarks is None:
+        return None
+    return with_images(load_part(folder / info.landmarks, landmarks_from_tensors, "landmarks", BAKED), info)
+
+
+def load_capture(folder: Path, info: MapInfo) -> CaptureReport | None:
+    """Load the capture record of a map; None if it has none. Raises ``InputError`` if the file does not hold one."""
+    if info.capture is None:
+        return None
+    path = folder / info.capture
+    expected = "a capture record, which 'bidnerf bake' with --data can recreate"
+    return from_plain(CaptureReport, read_json(path, expected), str(path))
+
+
+def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
+    """Return the landmarks with what a map's description records about the images they were built from."""
+    cameras = tuple(camera.intrinsics for camera in info.cameras)
+    return replace(landmarks, cameras=cameras, features=info.landmark_features)
+
+
+def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Return a field's tensors from a file, checked, and upgraded if an earlier version stored them.
+
+    Their names, shapes and values are checked against the field here, since torch's own message would take many lines.
+    """
+    if isinstance(field, UpgradingField):
+        tensors = field.upgraded_state(tensors)
+    module = cast(nn.Module, field)
+    expected = module.state_dict()
+    for name, value in expected.items():
+        if name not in tensors:
+            raise InputError(f"no tensor {name!r}", where=path, expected=f"one of shape {list(value.shape)}")
+        found = tensors[name]
+        if found.shape != value.shape:
+            raise InputError(
+                f"tensor {name!r} has shape {list(found.shape)}", where=path, expected=list(value.shape)
+            )
+        if found.is_floating_point() != value.is_floating_point():
+            kinds = [str(kind).removeprefix("torch.") for kind in (found.dtype, value.dtype)]
+            raise InputError(f"tensor {name!r} has dtype {kinds[0]}", where=path, expected=kinds[1])
+    if surplus := sorted(tensors.keys() - expected.keys()):
+        raise InputError(
+            f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path
+        )
+    for name, _ in module.named_parameters():
+        if name in tensors and not bool((tensors[name].abs() <= LARGEST_WEIGHT).all()):
+            raise InputError(
+                f"tensor {name!r} holds NaN, infinity or numbers above {LARGEST_WEIGHT:g}",
+                where=path,
+                expected="trained weights",
+            )
+    for name, _ in module.named_buffers():
+        if name in tensors and bool(tensors[name].isnan().any()):
+            raise InputError(f"tensor {name!r} holds NaN", where=path, expected="numbers")
+    return tensors
+
+
+def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:
+    """Return a hexadecimal digest of a map's content."""
+    trained = trained_field(field)
+    parts: list[Mapping[str, Tensor]] = []
+    if isinstance(trained, nn.Module):
+        parts.append(packed(trained.state_dict()))
+    if isinstance(field, ScaledField):
+        parts.append({"scale": torch.tensor(field.scale, dtype=torch.float64)})
+    parts += [] if surface is None else [packed(surface_tensors(surface))]
+    parts += [] if landmarks is None else [packed(landmark_tensors(landmarks))]
+    hashed = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        hashed.update(tensors_to_bytes(dict(part)))
+    return hashed.hexdigest()
+
+
+@contextlib.contextmanager
+def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
+    """Prepare a folder for a map, and hold its lock: see ``output_folder``."""
+
+    def is_leftover(file: Path) -> bool:
+        """Whether a process that was killed before the map was complete left the file behind."""
+        return OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
+
+    def describe(folder: Path) -> str | None:
+        try:
+            stopped = load_info(folder).interruption
+        except InputError:
+            return None
+        return None if stopped is None else f"holds a map, and {stopped}"
+
+    with output_folder(out, overwrite, is_leftover, describe):
+        yield
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(to_plain(value), indent=1, allow_nan=False).encode()
+
+
+def _adopt_anchor(folder: Path) -> None:
+    """Move the content of ``anchor.json``, if users wrote one, into the description of their map.
+
+    It thus never lies beside the description of another map, whenever writing stops.
+    """
+    if (folder / ANCHOR).exists():
+        with contextlib.suppress(InputError):  # no map that the anchor could be of, or a damaged one
+            write_file(folder / DESCRIPTION, _json(load_info(folder)))
+            (folder / ANCHOR).unlink()
+
+
+def _sweep(folder: Path) -> None:
+    """Remove the files of earlier and interrupted saves that ``map.json`` does not name; none if it is damaged."""
+    kept = set[str]()
+    if os.path.lexists(folder / DESCRIPTION):
+        try:
+            found = read_json(folder / DESCRIPTION, "the description of a map")
+            kept = {name for part in (*PART_NAMES, "anchor") if isinstance(name := found.get(part), str)}
+        except (InputError, AttributeError):
+            return
+    for file in list(folder.iterdir()):
+        if OURS.fullmatch(file.name) and file.name not in kept:
+            with contextlib.suppress(OSError):  # a left-over file does no harm
+                file.unlink()
