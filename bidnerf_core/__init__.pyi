@@ -63,9 +63,9 @@ from .progress import ProgressCallback as ProgressCallback
 from .registry import list_plugins as list_plugins
 from .registry import load_plugin as load_plugin
 from .registry import register as register
+from .results import Answers as Answers
 from .results import PosedImage as PosedImage
 from .results import PoseError as PoseError
-from .results import TrackedPath as TrackedPath
 from .results import export_map as export_map
 from .results import overlay as overlay
 from .results import pose_error as pose_error

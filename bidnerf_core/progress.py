@@ -56,6 +56,10 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
         raise InputError(
             f"cancel is a {type(cancel).__name__}", expected="a function, such as the is_set of an event"
         )
+    if progress is not None and not callable(progress):
+        raise InputError(
+            f"progress is a {type(progress).__name__}", expected="a function that takes a Progress"
+        )
     outer = _JOB.get()
     token = _JOB.set(Job(progress or outer.progress, cancel or outer.cancel))
     try:

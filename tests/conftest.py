@@ -136,7 +136,7 @@ def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are files without content, since drawing them takes most of a report's time."""
-    target = "bidnerf_core.results.plot_style.write_figure"
+    target = "bidnerf_core.results.plots.write_figure"
     monkeypatch.setattr(target, lambda figure, path, **options: path.write_text("<svg/>"))
 
 

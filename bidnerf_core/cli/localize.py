@@ -251,7 +251,7 @@ class _Output:
         self._stored, self._out, self._draw, self._json, self._total = stored, out, draw, json, total
         self._not_drawn = 0
         self.stage = "localizing" if draw is None else "localizing and rendering"
-        self.answers = Answers(stored.info.backend, stored.unit)
+        self.answers = Answers(stored)
 
     def show(self, query: Query, answer: Answer | Failure, start: SE3 | None) -> None:
         """Print an answer and draw it."""

@@ -16,10 +16,9 @@ from bidnerf_core.io import IMAGE_SUFFIXES
 from bidnerf_core.maps import MapCollection, maps_in
 from bidnerf_core.results import (
     Answer,
+    Answers,
     Failure,
-    PlacedAnswer,
-    Placements,
-    place_each,
+    localize_each,
     pose_format,
     standard_deviations,
 )
@@ -79,19 +78,19 @@ def localize_in_several(
 
     Raises ``InputError`` if a query failed.
     """
-    answers, total = Placements(), len(source.names)
+    answers, total = Answers(maps), len(source.names)
 
     def answered(query: Query, answer: Answer | Failure) -> None:
         if isinstance(answer, Failure):
             say(f"{answer.name}: {answer.reason}")
         if json:
             print_json(answers.plain(answer))
-        elif isinstance(answer, PlacedAnswer):
+        elif isinstance(answer, Answer):
             _show(answer, total == 1)
 
     try:
         with counted("localizing", "images", total) as report:
-            place_each(
+            localize_each(
                 maps, source, seed=seed, answers=answers, each=answered,
                 progress=lambda p: report(p.done, p.total),
             )  # fmt: skip
@@ -105,7 +104,7 @@ def localize_in_several(
         raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
 
 
-def _show(answer: PlacedAnswer, full: bool) -> None:
+def _show(answer: Answer, full: bool) -> None:
     placement, found = answer.placement, answer.found
     assert placement is not None
     where = f"in {placement.map}" if found.converged else f"in none of the maps; nearest {placement.map}"

@@ -37,7 +37,7 @@ from bidnerf_core.localization import USUAL_METHOD, Localizer, Tracker, TrackerC
 from bidnerf_core.maps import Map, load_map
 from bidnerf_core.results import (
     BAD_INPUT,
-    TrackedPath,
+    Answers,
     TrackingVideo,
     check_video,
     opened_for,
@@ -147,7 +147,7 @@ def run(arguments: list[str]) -> None:
             settings_of(USUAL_METHOD, {"depth_sensor": depth_sensor, "risk": risk}),
         )
         stored = load_map(map)
-        path, began = TrackedPath.of(stored), clocks.perf_counter()
+        path, began = Answers(stored, is_sequence=True), clocks.perf_counter()
         localizer = Localizer(stored, config=settings)
         try:
             with nullcontext() if video is None else TrackingVideo(video, stored) as drawn:
@@ -170,7 +170,7 @@ def run(arguments: list[str]) -> None:
                     frames = frames if split is None else _of_split(frames, split)
                     with counted("tracking", "frames", -(-len(frames) // every)) as report:
                         track_frames(
-                            localizer, frames, config=config, start=begin, depth=depth, every=every, path=path,
+                            Tracker(localizer, config, begin), frames, every=every, depth=depth, answers=path,
                             each=None if drawn is None else drawn.add, progress=lambda p: report(p.done, p.total),
                         )  # fmt: skip
         finally:  # whatever ended it: the frames so far are written
@@ -183,7 +183,7 @@ def run(arguments: list[str]) -> None:
     parse("track", track, arguments)
 
 
-def _finish(path: TrackedPath, stored: Map, out: Path | None, plot: Path | None, seconds: float | None, config: TrackerConfig
+def _finish(path: Answers, stored: Map, out: Path | None, plot: Path | None, seconds: float | None, config: TrackerConfig
 ) -> None:  # fmt: skip
     """Write and draw the frames so far, if any; if ``seconds`` are given, print a summary of the run."""
     if not path.given:
@@ -216,7 +216,7 @@ def _of_split(frames: FrameSequence, split: str) -> FileSequence:
 
 
 def _follow(
-    source: str, tracker: Tracker, path: TrackedPath, video: TrackingVideo | None, depth: bool, camera: CameraSource,
+    source: str, tracker: Tracker, path: Answers, video: TrackingVideo | None, depth: bool, camera: CameraSource,
     sensor: DepthCamera | None,
 ) -> None:  # fmt: skip
     """Answer each frame on arrival with one JSON object on a line of its own."""

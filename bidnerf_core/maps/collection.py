@@ -60,11 +60,23 @@ class Placement:
     runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
     ranking: tuple[MapSimilarity, ...]  # all maps, most similar first
     asked: tuple[str, ...]  # maps in which the image was localized, in order
+    backend: str = ""  # of the map
 
     @property
     def converged(self) -> bool:
         """Whether the image was localized in a map."""
         return self.found.converged
+
+    def plain(self) -> dict[str, Any]:
+        """Return the JSON values of the map, its similarity, and the runner-up."""
+        cosines = {similarity.map: round(similarity.cosine, 4) for similarity in self.ranking}
+        runner_up = None
+        if self.runner_up is not None:
+            name, other = self.runner_up
+            runner_up = {
+                "map": name, "outcome": str(other.outcome), "converged": other.converged, "similarity": cosines[name],
+            }  # fmt: skip
+        return {"map": self.map, "similarity": cosines[self.map], "runner_up": runner_up}
 
     @property
     def rival(self) -> str | None:
@@ -174,7 +186,8 @@ class MapCollection:
         others = [name for name in quick if name != chosen]
         second = max(others, key=lambda name: _merit(quick[name]), default=None)
         runner_up = None if second is None else (second, quick[second])
-        return Placement(chosen, found, runner_up, tuple(ranking), tuple(quick))
+        backend = self._infos[chosen].backend
+        return Placement(chosen, found, runner_up, tuple(ranking), tuple(quick), backend)
 
     def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
         """Localize a frame with the landmarks of a map; the full method is used for maps without landmarks,

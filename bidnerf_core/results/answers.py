@@ -1,18 +1,20 @@
-"""The answers to a run of images: as JSON, and as a pose file."""
+"""The answers to a run of images, photos or frames of a sequence, in one map or in several: as JSON, pose files and summaries."""
 
 from __future__ import annotations
 
 import json
 import logging
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.captures import UpDirection, as_given
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.depth import noise_remark
 from bidnerf_core.errors import InputError, UsageError, amount
@@ -25,12 +27,22 @@ from bidnerf_core.localization import (
     Localization,
     Localizer,
     Outcome,
+    SceneMap,
     unit_of,
 )
-from bidnerf_core.progress import Cancel, ProgressCallback, counter
-from bidnerf_core.results.errors import PoseError, pose_error, rotation_angle
-from bidnerf_core.results.other_world import world_of_truth
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.maps import MapCollection, Placement
+from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
+from bidnerf_core.results.errors import (
+    PoseError,
+    pose_error,
+    rotation_angle,
+    standard_deviations,
+    within,
+)
+from bidnerf_core.results.plots import draw_path
 from bidnerf_core.results.pose_files import PosedImage, pose_format, write_poses
+from bidnerf_core.results.trajectory import TrajectoryErrors, spans, world_of_truth
 
 log = logging.getLogger("bidnerf")
 
@@ -43,6 +55,8 @@ SEVERAL = 3
 
 BAD_INPUT = "bad input"
 """Outcome of an image that could not be read."""
+SAME_POSE = 1e-4
+"""Difference between the matrices of two poses (metres) that rounding in files may cause."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +70,26 @@ class Answer:
     truth: SE3 | None = None  # T_world_camera
     time: float | None = None  # seconds
     file: Path | None = None
+    placement: Placement | None = None  # in one of several maps
 
     @staticmethod
-    def of(
-        frame: Frame, number: int, found: Localization, *, truth: SE3 | None = None, time: float | None = None,
-        file: Path | None = None,
-    ) -> Answer:  # fmt: skip
-        """Build the answer for a frame.
+    def of(frame: Frame, number: int, found: Localization, **about: Any) -> Answer:
+        """Build the answer for a frame; ``about`` holds further attributes of the answer.
 
         Only the final pose is kept: intermediate ones take up a lot of memory in long sequences.
         """
         intrinsics = found.frame_as_taken(frame).intrinsics
-        found = replace(found, poses=found.poses[-1:])
-        return Answer(frame.name, number, intrinsics, found, truth, time, file)
+        return Answer(frame.name, number, intrinsics, replace(found, poses=found.poses[-1:]), **about)
 
     @property
     def accepted(self) -> bool:
         """Whether the localization converged to a finite pose."""
-        return self.found.converged and bool(self.found.T_world_camera.matrix().isfinite().all())
+        return self.found.converged and self.is_finite
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the pose consists of finite numbers."""
+        return bool(self.found.T_world_camera.matrix().isfinite().all())
 
     @property
     def error(self) -> PoseError | None:
@@ -96,10 +112,6 @@ class Answer:
             found.unit,
         )
 
-    def plain(self, backend: str) -> dict[str, Any]:
-        """Return the JSON object that ``bidnerf localize --json`` prints."""
-        return {"frame": self.name} | plain_localization(self.found, backend, self.error)
-
 
 @dataclass(frozen=True)
 class Failure:
@@ -109,21 +121,26 @@ class Failure:
     method: str
     reason: str
 
-    def plain(self, backend: str, unit: LengthUnit = "units") -> dict[str, Any]:
-        """Return an object with the keys of ``Answer.plain``, whose outcome is "bad input"."""
-        return {
-            "frame": self.name, "T_world_camera": None, "converged": False, "outcome": BAD_INPUT,
-            "reason": self.reason, "steps": 0, "seconds": 0.0, "covariance": None, "loss": None, "method": self.method,
-            "focal_factor": 1.0, "intrinsics": None, "confidence": None, "unit": unit, "backend": backend, "error": None,
-        }  # fmt: skip
-
 
 class Answers:
-    """The answers to the images of a run, in order, for a map with the given ``backend``."""
+    """The answers to the images of a run, in order: photos in one map or in several, or the frames of a sequence.
 
-    def __init__(self, backend: str, unit: LengthUnit = "units") -> None:
-        self.backend, self.unit = backend, unit
+    Poses of images in several maps are in the frames of these.
+    """
+
+    def __init__(self, scene: SceneMap | MapCollection | None = None, is_sequence: bool = False) -> None:
+        """Start without answers in the given map or maps. With ``is_sequence``, losses and recoveries are logged."""
+        self.scene, self.is_sequence = scene, is_sequence
         self.given: list[Answer | Failure] = []
+        self.unread = 0  # frames of a sequence whose files could not be read
+        self._lost_at: int | None = None
+        self._camera_sources: set[str] = set()
+
+    @property
+    def unit(self) -> LengthUnit:
+        """The unit of the poses; "units" for several maps, whose units may differ."""
+        scene = self.scene
+        return "units" if scene is None or isinstance(scene, MapCollection) else unit_of(scene)
 
     def __len__(self) -> int:
         return len(self.given)
@@ -132,13 +149,60 @@ class Answers:
         """Keep an answer."""
         self.given.append(answer)
 
+    def add(
+        self,
+        frame: Frame,
+        found: Localization,
+        time: float | None = None,
+        truth: SE3 | None = None,
+        number: int | None = None,
+    ) -> Answer:
+        """Add the answer to the next frame of a sequence, and return it.
+
+        ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in
+        seconds, ``truth`` is the true T_world_camera.
+        """
+        if number is None:
+            number = self.answers[-1].number + 1 if self.given else 0
+        if frame.camera_source and frame.camera_source not in self._camera_sources:
+            self._camera_sources.add(frame.camera_source)
+            log.info("%s: %s", frame.name, frame.camera_source)
+        answer = Answer.of(frame, number, found, truth=truth, time=time)
+        self.append(answer)
+        if not found.converged and self._lost_at is None:
+            self._lost_at = len(self)
+            log.info("frame %d (%s): %s: %s", number + 1, frame.name, found.outcome, found.reason)
+        elif found.converged and self._lost_at is not None:
+            missed = amount(len(self) - self._lost_at, "frame")
+            log.info("frame %d (%s): tracking again after %s", number + 1, frame.name, missed)
+            self._lost_at = None
+        return answer
+
     def plain(self, answer: Answer | Failure) -> dict[str, Any]:
-        """Return an answer as JSON values; numbers and matrices that are not finite are None."""
-        return (
-            answer.plain(self.backend, self.unit)
-            if isinstance(answer, Failure)
-            else answer.plain(self.backend)
-        )
+        """Return an answer as the JSON object that ``bidnerf localize --json`` prints: with ``time`` for a frame of a sequence,
+        with the map and the runner-up for an image in several maps.
+
+        Numbers and matrices that are not finite are None. For an image that could not be read, the outcome is "bad input".
+        """
+        backend = getattr(getattr(self.scene, "info", None), "backend", "")
+        placement, values = None, dict[str, Any](frame=answer.name)
+        if self.is_sequence:
+            values |= {"time": answer.time if isinstance(answer, Answer) else None}
+        if isinstance(answer, Answer):
+            placement = answer.placement
+            backend = backend if placement is None else placement.backend
+            values |= plain_localization(answer.found, backend, answer.error)
+        else:
+            values |= {
+                "T_world_camera": None, "converged": False, "outcome": BAD_INPUT, "reason": answer.reason, "steps": 0,
+                "seconds": 0.0, "covariance": None, "loss": None, "method": answer.method, "focal_factor": 1.0,
+                "intrinsics": None, "confidence": None, "unit": self.unit, "backend": backend, "error": None,
+            }  # fmt: skip
+        if placement is not None:
+            values |= placement.plain()
+        elif isinstance(self.scene, MapCollection):
+            values |= {"map": None, "similarity": None, "runner_up": None}
+        return values
 
     @property
     def accepted(self) -> list[Answer]:
@@ -155,7 +219,10 @@ class Answers:
         """A question to append to a summary: empty unless there are several images and none shows the scene
         of the map.
         """
-        return question_about_scene([answer.found for answer in self.answers])
+        found = [answer.found for answer in self.answers]
+        if len(found) < SEVERAL or any(map(_shows_scene, found)):
+            return ""
+        return "; do they show the scene of this map?"
 
     @property
     def remark(self) -> str | None:
@@ -167,9 +234,7 @@ class Answers:
         if worlds is None:
             return None
         T = worlds.T_target_source
-        turn, shift = (
-            float(part) for part in (rotation_angle(T.rotation), torch.linalg.vector_norm(T.translation))
-        )
+        turn, shift = float(rotation_angle(T.rotation)), float(torch.linalg.vector_norm(T.translation))
         return (
             f"all {len(known)} accepted poses differ from the dataset's by one transformation (a rotation by"
             f" {math.degrees(turn):.3g}°, a scale of {worlds.scale:.4g} and a shift of {shift:.3g} {symbol(self.unit)}): the"
@@ -191,24 +256,106 @@ class Answers:
         accepted = self.accepted
         write_poses(path, [answer.posed for answer in accepted])
         if left_out := len(self) - len(accepted):
-            log.info(
-                "%s: %s; %d without an accepted pose are left out",
-                path,
-                amount(len(accepted), "pose"),
-                left_out,
-            )
+            poses = amount(len(accepted), "pose")
+            log.info("%s: %s; %d without an accepted pose are left out", path, poses, left_out)
+
+    @property
+    def lost(self) -> list[tuple[int, int]]:
+        """The first and the last index of each run of frames without an accepted pose."""
+        return spans([not answer.accepted for answer in self.answers])
+
+    @property
+    def without_times(self) -> bool:
+        """Whether no frame has a time stamp."""
+        return all(answer.time is None for answer in self.answers)
+
+    def errors(self) -> TrajectoryErrors | None:
+        """Return the errors of the accepted poses whose truth is known, or None if there are none."""
+        known = [(a.found.T_world_camera, a.truth) for a in self.accepted if a.truth is not None]
+        if not known:
+            return None
+        return TrajectoryErrors.of(SE3.stack([found for found, _ in known]), SE3.stack([t for _, t in known]))
+
+    def consistency(self) -> float | None:
+        """Return the fraction of accepted poses whose error lies within the 95 % bound of their covariance,
+        or None if unknown.
+        """
+        inside = [
+            bool(within(answer.found.T_world_camera, answer.truth, answer.found.covariance))
+            for answer in self.accepted
+            if answer.truth is not None and answer.found.covariance is not None
+        ]
+        return sum(inside) / len(inside) if inside else None
+
+    def trained_on(self) -> int:
+        """Return the number of frames that are training images of the map, judging by names and true poses."""
+        info = getattr(self.scene, "info", None)
+        cameras = () if info is None else as_given(info.cameras)
+        given = {camera.name: camera.pose.translated(self._origin).matrix() for camera in cameras}
+        return sum(
+            answer.truth is not None
+            and answer.name in given
+            and torch.allclose(given[answer.name], answer.truth.matrix(), rtol=0, atol=SAME_POSE)
+            for answer in self.answers
+        )
+
+    @property
+    def _origin(self) -> Tensor:
+        return torch.tensor(getattr(self.scene, "origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
+
+    def plot(
+        self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None
+    ) -> None:
+        """Draw the path over the surface of its map, as PNG or SVG by file extension.
+
+        ``up`` is the upward direction of the scene (``Map.up``), by default estimated from the surface and
+        the cameras. Raises ``InputError`` without matplotlib or without any finite pose.
+        """
+        drawn = [answer for answer in self.answers if answer.is_finite]
+        if not drawn:
+            raise InputError("not drawn, since no frame was tracked", where=file)
+        covariances = [answer.found.covariance for answer in drawn]
+        deviations = [math.nan if c is None else standard_deviations(c)[0] for c in covariances]
+        draw_path(
+            SE3.stack([answer.found.T_world_camera for answer in drawn]).translated(-self._origin),
+            torch.tensor([answer.accepted for answer in drawn]),
+            torch.tensor(deviations, dtype=torch.float64),
+            [None if answer.truth is None else answer.truth.translated(-self._origin) for answer in drawn],
+            Path(file),
+            surface,
+            up,
+            self.unit,
+        )
+
+    def summary(self, seconds: float) -> list[tuple[str, str]]:
+        """Return the rows of a table that describes a run that took ``seconds``: frames, losses, errors."""
+        total, accepted, lost = len(self), len(self.accepted), self.lost
+        longest = max((last - first + 1 for first, last in lost), default=0)
+        losses = f"{amount(len(lost), 'time')}, at most for {amount(longest, 'frame')}" if lost else "never"
+        rows = [
+            ("frames", f"{total}, {total / max(seconds, 1e-9):.1f} per second"),
+            ("tracked", f"{accepted} ({accepted / max(1, total):.1%})"),
+            ("not read", amount(self.unread, "frame") if self.unread else ""),
+            ("lost", losses),
+        ]
+        unit = symbol(self.unit)
+        if (errors := self.errors()) is not None:
+            rows.append(("raw error", errors.raw.text(unit)))
+            if errors.ate is not None:
+                rows.append(("ATE", f"{errors.ate:.4f} {unit} (root mean square, rigidly aligned)"))
+            if errors.rpe is not None:
+                rows.append(("RPE per frame", errors.rpe.text(unit)))
+        if (share := self.consistency()) is not None:
+            rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
+        if seen := self.trained_on():
+            no_test = "errors on training frames of the map are no test"
+            rows.append(("trained on", f"{amount(seen, 'frame')}; {no_test}"))
+        return [(name, text) for name, text in rows if text]
 
 
 def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
     """Return the JSON values of a localization, the backend of its map, and its error if known."""
     return found.plain() | {"backend": backend, "error": None if error is None else error.plain()}
-
-
-def question_about_scene(found: Collection[Localization]) -> str:
-    """Return a question to append to a summary: empty unless there are several images and none was recognized."""
-    if len(found) < SEVERAL or any(map(_shows_scene, found)):
-        return ""
-    return "; do they show the scene of this map?"
 
 
 def _shows_scene(found: Localization) -> bool:
@@ -221,11 +368,8 @@ def _shows_scene(found: Localization) -> bool:
     return found.outcome in RECOGNISED
 
 
-AnswersT = TypeVar("AnswersT", bound=Answers)
-
-
 def localize_each(
-    localizer: Localizer,
+    localizer: Localizer | MapCollection,
     queries: QuerySource,
     *,
     start: Callable[[Query], SE3 | None] | None = None,
@@ -235,68 +379,65 @@ def localize_each(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Answers:
-    """Localize each query. One that cannot be read or localized does not stop the others; a single one raises its error.
+    """Localize each query in a map, or in the one of several maps that it shows.
 
-    ``start`` returns the start of a query, T_world_camera; method ``auto`` needs none. ``answers`` collects
-    the answers, by default a new object; it holds those so far if an error ends the run. ``each`` is called
-    with each query and its answer; for a failure the query has only a name. Raises ``InputError``, and
-    ``Cancelled`` once ``cancel`` returns True.
+    A query that cannot be read or localized does not stop the others; a single one raises its error. ``start`` returns
+    the start of a query, T_world_camera; method ``auto`` needs none, and several maps take none. ``answers`` collects
+    the answers, by default a new object; it holds those so far if an error ends the run. ``each`` is called with each
+    query and its answer; for a failure the query has only a name. Raises ``InputError``, and ``Cancelled`` once
+    ``cancel`` returns True.
     """
-    answers = (
-        Answers(getattr(getattr(localizer.scene, "info", None), "backend", ""), unit_of(localizer.scene))
-        if answers is None
-        else answers
-    )
+    several = isinstance(localizer, MapCollection)
+    if answers is None:
+        answers = Answers(localizer if isinstance(localizer, MapCollection) else localizer.scene)
     bare_before = False
-
-    def localize(query: Query, number: int) -> Answer:
-        nonlocal bare_before
-        bare = [view.frame.name for view in query.views if not view.frame.has_depth]
-        if bare and query.truth is not None and query.depth_rays is None and not bare_before:
-            bare_before = True
-            log.info("%s: no measured depth; colour only", ", ".join(bare))
-        if number == 0:
-            _log_depth_noise(query, localizer)
-        found = localizer(query.views, None if start is None else start(query), query.depth_rays, seed)
-        if not bool(found.T_world_camera.matrix().isfinite().all()):
-            raise InputError(
-                f"{found.method} diverged to a pose that is not finite; is the map valid?", where=query.name
-            )
-        frame = query.frame.replace(name=query.name)
-        return Answer.of(frame, number, found, truth=query.truth, file=query.file)
-
-    return answer_each(queries, localize, answers, localizer.method, each, progress, cancel)
-
-
-def answer_each(
-    queries: QuerySource,
-    localize: Callable[[Query, int], Answer],
-    answers: AnswersT,
-    method: str,
-    each: Callable[[Query, Answer | Failure], None] | None,
-    progress: ProgressCallback | None,
-    cancel: Cancel | None,
-) -> AnswersT:
-    """Answer each query and its number; one that cannot be read or localized does not stop the others, if there are any."""
-    total = len(queries.names)
-    count = counter("localizing", "images", progress, cancel)
-    for number, name in enumerate(queries.names):
-        answer: Answer | Failure
-        query = Query(name, ())
-        try:
-            query = queries.read(number)
-            answer = localize(query, number)
-        except UsageError:
-            raise
-        except InputError as error:
-            if total == 1:
+    with job_context(progress, cancel):
+        count, total = counter("localizing", "images"), len(queries.names)
+        for number, name in enumerate(queries.names):
+            answer: Answer | Failure
+            query, placement = Query(name, ()), None
+            try:
+                query = queries.read(number)
+                if isinstance(localizer, MapCollection):
+                    placement = _placement(localizer, query, seed)
+                    found = placement.found
+                else:
+                    bare = [view.frame.name for view in query.views if not view.frame.has_depth]
+                    if bare and query.truth is not None and query.depth_rays is None and not bare_before:
+                        bare_before = True
+                        log.info("%s: no measured depth; colour only", ", ".join(bare))
+                    if number == 0:
+                        _log_depth_noise(query, localizer)
+                    begin = None if start is None else start(query)
+                    found = localizer(query.views, begin, query.depth_rays, seed)
+                frame = query.frame.replace(name=query.name)
+                truth = None if several else query.truth
+                answer = Answer.of(frame, number, found, truth=truth, file=query.file, placement=placement)
+                if not (several or answer.is_finite):
+                    raise InputError(
+                        f"{found.method} diverged to a pose that is not finite; is the map valid?", where=name
+                    )
+            except UsageError:
                 raise
-            answer = Failure(name, method, str(error))
-        answers.append(answer)
-        if each is not None:
-            each(query, answer)
-        count(number + 1, total)
+            except InputError as error:
+                if total == 1:
+                    raise
+                answer = Failure(name, localizer.method, str(error))
+            answers.append(answer)
+            if each is not None:
+                each(query, answer)
+            count(number + 1, total)
     return answers
+
+
+def _placement(maps: MapCollection, query: Query, seed: int) -> Placement:
+    if len(query.views) != 1 or query.depth_rays is not None:
+        raise InputError(
+            "is a rig or has points from a sensor",
+            where=query.name,
+            expected="single images for several maps",
+        )
+    return maps(query.views[0].frame, seed)
 
 
 def _log_depth_noise(query: Query, localizer: Localizer) -> None:

@@ -14,11 +14,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, fit_similarity
+from bidnerf_core.geometry import SE3, Similarity, fit_similarity
 from bidnerf_core.results.errors import PoseError, pose_error
 
 LEAST_POSES = 3
 """Minimum number of poses that determine an alignment."""
+LEAST_FOR_WORLDS = 3
+"""Smallest number of poses for which a common transformation means anything: it has seven degrees of freedom."""
+UNEXPLAINED = 0.1
+"""Largest error, relative to the median error, that may remain in any pose after the transformation."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,13 @@ class ErrorSummary:
         if not errors.translation.numel():
             raise InputError("no errors to summarize", expected="those of at least one pose")
         return ErrorSummary(*_three(errors.translation), *_three(errors.rotation_deg))
+
+    def text(self, unit: str) -> str:
+        """Return the summary in words; ``unit`` is the symbol of the translations' unit."""
+        return (
+            f"median {self.translation_median:.4f} {unit}, {self.rotation_deg_median:.3f} deg;"
+            f" 95 % within {self.translation_p95:.4f} {unit}, {self.rotation_deg_p95:.3f} deg"
+        )
 
 
 @dataclass(frozen=True)
@@ -97,6 +108,32 @@ def relative_errors(found: SE3, true: SE3, apart: int = 1) -> PoseError:
     found, true = found.to(torch.float64), true.to(torch.float64)
     moved = [T[:-apart].inverse() @ T[apart:] for T in (found, true)]
     return pose_error(moved[0], moved[1])
+
+
+def world_of_truth(found: SE3, true: SE3) -> Similarity | None:
+    """Return the similarity that maps the world of the ``true`` poses to that of the ``found`` ones (n each).
+
+    None unless it explains all errors. Its rotation is the mean of those between the orientations, so that the
+    positions confirm it.
+    """
+    if len(found.translation) < LEAST_FOR_WORLDS:
+        return None
+    found, true = found.to(torch.float64), true.to(torch.float64)
+    u, _, vh = torch.linalg.svd((found.rotation @ true.rotation.mT).sum(0))
+    sign = torch.ones(3, dtype=u.dtype)
+    sign[2] = torch.sign(torch.linalg.det(u @ vh))
+    rotation = (u * sign) @ vh
+    source, target = true.translation @ rotation.mT, found.translation
+    from_mean, to_mean = source - source.mean(0), target - target.mean(0)
+    scale = float((from_mean * to_mean).sum() / from_mean.square().sum())
+    if not scale > 0:
+        return None
+    worlds = Similarity(scale, SE3(rotation, target.mean(0) - scale * source.mean(0)))
+    left, error = (
+        torch.linalg.vector_norm(source - target, dim=-1)
+        for source in (worlds.apply(true.translation), true.translation)
+    )
+    return worlds if bool(left.max() < UNEXPLAINED * error.median()) else None
 
 
 def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ from bidnerf_core.frames import BLACK
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
-from bidnerf_core.results import Answer, localize_each, place_each
+from bidnerf_core.results import Answer, localize_each
 from bidnerf_core.service import geopose, wire
 from bidnerf_core.service.settings import ChosenMethod
 from bidnerf_core.service.upload import Upload
@@ -134,7 +134,7 @@ class Worker:
         photos, start = upload.read(CameraSource(assumed=maps.cameras), BLACK, folder, self.max_pixels)
         if start is not None:
             raise InputError("start was given without map", expected=f"map as one of {', '.join(self.maps)}")
-        answers = place_each(maps, photos, seed=upload.seed)
+        answers = localize_each(maps, photos, seed=upload.seed)
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}
 

@@ -6,7 +6,7 @@ EXIF, or a typical one, and is estimated with the poses. A given camera is kept 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +28,7 @@ from bidnerf_core.camera import (
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import read_header, read_image
 from bidnerf_core.mapping import Keypoints, Sift
+from bidnerf_core.progress import counter
 from bidnerf_core.structure.library import to_colmap
 from bidnerf_core.structure.sources import SourceImage
 
@@ -139,14 +140,12 @@ def _unknown(guess: Intrinsics, number: int, pycolmap: Any) -> Any:
     )
 
 
-def write_keypoints(
-    database: Any, found: Described, pycolmap: Any, count: Callable[[int, int], None]
-) -> dict[str, str]:
+def write_keypoints(database: Any, found: Described, pycolmap: Any) -> dict[str, str]:
     """Find the keypoints missing from the database, and return by name why photos could not be decoded.
 
-    ``count`` receives the number of photos done, and may raise to stop; keypoints found until then are
-    stored.
+    Keypoints found until the job is cancelled are stored.
     """
+    count = counter("finding keypoints", "photos")
     missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
     done, total = len(found.photos) - len(missing), len(found.photos)
     unusable = dict[str, str]()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import torch
 from bidnerf_core.captures import up_direction
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import SE3
+from bidnerf_core.progress import counter
 from bidnerf_core.structure.keypoints import Described, ListedPhoto
 from bidnerf_core.structure.matching import Overlaps
 
@@ -44,13 +45,12 @@ class Models:
 
 
 def reconstructed(
-    database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any,
-    count: Callable[[int, int], None],
-) -> Models:  # fmt: skip
+    database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any
+) -> Models:
     """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to
     ``folder``.
 
-    ``count`` receives the number of registered photos, and may raise to stop. There may be no model at all.
+    There may be no model at all.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,
@@ -63,7 +63,7 @@ def reconstructed(
         options.constant_cameras = set(found.cameras)
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    total, placed = len(found.photos), 0
+    total, placed, count = len(found.photos), 0, counter("placing photos", "photos")
 
     def begin() -> None:
         nonlocal placed

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bidnerf_core.progress import counter
 from bidnerf_core.structure.keypoints import key
 from bidnerf_core.structure.pairs import Pairs
 
@@ -17,15 +18,13 @@ FROM_ONE_PLACE = ("PANORAMIC", "PLANAR_OR_PANORAMIC")
 """Configurations of pairs without parallax."""
 
 
-def match(
-    database: Path, numbers: Sequence[int], pairs: Pairs, threads: int, pycolmap: Any,
-    count: Callable[[int, int], None],
-) -> None:  # fmt: skip
+def match(database: Path, numbers: Sequence[int], pairs: Pairs, threads: int, pycolmap: Any) -> None:
     """Match the ``pairs`` of photos that are missing from the database; ``numbers`` are the photos' numbers
     there.
 
-    ``count`` receives the number of pairs done, and may raise to stop; matches found until then are stored.
+    Matches found until the job is cancelled are stored.
     """
+    count = counter("matching photos", "pairs")
     with pycolmap.Database.open(database) as stored:
         todo = [(i, j) for i, j in pairs if not stored.exists_two_view_geometry(numbers[i], numbers[j])]
     done, size = len(pairs) - len(todo), FIRST_BATCH

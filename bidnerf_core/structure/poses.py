@@ -7,7 +7,7 @@ import json
 import logging
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from bidnerf_core.camera import UPRIGHT, Intrinsics
 from bidnerf_core.datasets import is_video
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io import output_folder, write_file
-from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 from bidnerf_core.structure import video_frames
 from bidnerf_core.structure.agreement import agreement
 from bidnerf_core.structure.keypoints import Described, described, write_cameras, write_keypoints
@@ -94,12 +94,12 @@ def find_poses(
     if known is not None:
         log.info(f"{folder}: already has the poses of these photos")
         return known
-    with _folder(folder, inputs, overwrite):
+    with job_context(progress, cancel), _folder(folder, inputs, overwrite):
         if overwrite and not reuse:
             clear(folder)
         work = begin(folder, inputs, video=is_video(source))
         try:
-            return _Search(source, folder, work, inputs, camera, progress, cancel, pycolmap).run(images)
+            return _Search(source, folder, work, inputs, camera, pycolmap).run(images)
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
@@ -146,12 +146,16 @@ class _Search:
     """A single search for the poses of some photos."""
 
     def __init__(
-        self, source: Path, folder: Path, work: Path, inputs: str, camera: Intrinsics | str | Path | None,
-        progress: ProgressCallback | None, cancel: Cancel | None, pycolmap: Any,
-    ) -> None:  # fmt: skip
+        self,
+        source: Path,
+        folder: Path,
+        work: Path,
+        inputs: str,
+        camera: Intrinsics | str | Path | None,
+        pycolmap: Any,
+    ) -> None:
         self._source, self._folder, self._work, self._inputs = source, folder, work, inputs
-        self._camera, self._progress, self._cancel = camera, progress, cancel
-        self._pycolmap, self._began = pycolmap, time.monotonic()
+        self._camera, self._pycolmap, self._began = camera, pycolmap, time.monotonic()
         self._database = without_damage(work / DATABASE)
         self._threads = max(1, torch.get_num_threads())
 
@@ -162,7 +166,6 @@ class _Search:
         found = self._described(images)
         keypoints = self._keypoints(found)
         self._match(found, keypoints, ordered)
-        count = self._counter("placing photos", "photos")
         models = reconstructed(
             self._database,
             self._work / "models",
@@ -170,7 +173,6 @@ class _Search:
             self._camera is not None,
             self._threads,
             self._pycolmap,
-            count,
         )
         with self._pycolmap.Database.open(self._database) as database:
             overlaps = Overlaps(database, self._pycolmap)
@@ -178,22 +180,18 @@ class _Search:
             raise InputError(f"{_unplaced(found, overlaps)};", where=self._source, expected=GOOD_PHOTOS)
         return self._written(images, found, models, left_out(found, models, overlaps, keypoints))
 
-    def _counter(self, stage: str, unit: str) -> Callable[[int, int], None]:
-        return counter(stage, unit, self._progress, self._cancel)
-
     def _frames(self) -> list[SourceImage]:
         """Return the chosen frames of a video, written as images unless that was done before."""
         listed = self._work / "frames.json"
         known = stored_rows(listed, tuple[str, str, float])
         if known is not None and all(Path(file).is_file() for _, file, _ in known):
             return [SourceImage(name, Path(file), at) for name, file, at in known]
-        measures = video_frames.measured(self._source, self._counter("measuring frames", "frames"))
+        measures = video_frames.measured(self._source)
         wanted = video_frames.chosen(measures)
         log.info(
             f"{self._source}: {len(wanted)} of {amount(len(measures), 'frame')} chosen by motion and sharpness"
         )
-        count = self._counter("writing frames", "frames")
-        images = video_frames.write_frames(self._source, self._folder / FRAMES, wanted, count)
+        images = video_frames.write_frames(self._source, self._folder / FRAMES, wanted)
         rows = [[image.name, str(image.file), image.time] for image in images]
         write_file(listed, json.dumps(rows).encode())
         return images
@@ -225,11 +223,10 @@ class _Search:
 
     def _keypoints(self, found: Described) -> dict[int, int]:
         """Fill the database, and return the number of keypoints of each photo by its number."""
-        count = self._counter("finding keypoints", "photos")
         with self._pycolmap.Database.open(self._database) as database:
             if not database.num_images():
                 write_cameras(database, found, self._camera is not None, self._pycolmap)
-            found.unusable.update(write_keypoints(database, found, self._pycolmap, count))
+            found.unusable.update(write_keypoints(database, found, self._pycolmap))
             found.photos[:] = [photo for photo in found.photos if photo.image.name not in found.unusable]
             self._require_enough(found, len(found.photos) + len(found.unusable))
             return {photo.number: database.num_keypoints_for_image(photo.number) for photo in found.photos}
@@ -238,14 +235,7 @@ class _Search:
         numbers = [photo.number for photo in found.photos]
         pairs = self._pairs(numbers, ordered)
         pairs = [(i, j) for i, j in pairs if keypoints[numbers[i]] and keypoints[numbers[j]]]
-        match(
-            self._database,
-            numbers,
-            pairs,
-            self._threads,
-            self._pycolmap,
-            self._counter("matching photos", "pairs"),
-        )
+        match(self._database, numbers, pairs, self._threads, self._pycolmap)
 
     def _pairs(self, numbers: list[int], ordered: bool) -> Pairs:
         if few(len(numbers), ordered):

@@ -9,7 +9,7 @@ turns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from PIL import Image
 from bidnerf_core.camera import reduced_size
 from bidnerf_core.captures import sharpness
 from bidnerf_core.datasets import frame_count, pictures
+from bidnerf_core.progress import counter
 from bidnerf_core.structure.sources import SourceImage
 
 STEP = 0.04
@@ -49,8 +50,9 @@ class FrameMeasure:
     sharpness: float
 
 
-def measured(video: Path, count: Callable[[int, int], None]) -> list[FrameMeasure]:
-    """Measure each frame of a video; ``count`` receives the number of frames done, and may raise to stop."""
+def measured(video: Path) -> list[FrameMeasure]:
+    """Measure each frame of a video."""
+    count = counter("measuring frames", "frames")
     total = frame_count(video)
     path, found = _Motion(), list[FrameMeasure]()
     for time, pixels in pictures(video):
@@ -73,12 +75,10 @@ def chosen(frames: Sequence[FrameMeasure]) -> list[int]:
     return sorted(found)
 
 
-def write_frames(
-    video: Path, folder: Path, wanted: Sequence[int], count: Callable[[int, int], None]
-) -> list[SourceImage]:
+def write_frames(video: Path, folder: Path, wanted: Sequence[int]) -> list[SourceImage]:
     """Write the frames with indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
     folder.mkdir(parents=True, exist_ok=True)
-    asked, found = set(wanted), list[SourceImage]()
+    asked, found, count = set(wanted), list[SourceImage](), counter("writing frames", "frames")
     for number, (time, pixels) in enumerate(pictures(video)):
         if number in asked:
             image = SourceImage(f"{number:06d}", folder / f"{number:06d}.jpg", time)

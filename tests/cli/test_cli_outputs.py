@@ -29,7 +29,7 @@ from bidnerf_core.cli.folders import check_folder, check_output
 from bidnerf_core.cli.interruptions import Interrupted, interruptions, uninterrupted
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
-from bidnerf_core.results import TrackedPath
+from bidnerf_core.results import Answers
 from commands import Run, assert_refused
 from flights import flight
 from stored_ground import open_ground, write_flight
@@ -240,7 +240,7 @@ def test_a_frame_that_is_not_finite_is_null_and_the_others_are_written(
 
 
 def test_a_path_of_no_finite_pose_has_no_plot(tmp_path: Path) -> None:
-    path = TrackedPath()
+    path = Answers(is_sequence=True)
     path.add(
         Frame("a", torch.zeros((3, 4, 3)), CAMERA),
         replace(FOUND, T_world_camera=SE3(T.rotation, T.translation * math.nan)),

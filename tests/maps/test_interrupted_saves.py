@@ -74,7 +74,7 @@ def posed(path: Path, number: int) -> None:
 
 
 def answers(path: Path, number: int) -> None:
-    given = Answers("map")
+    given = Answers()
     for n in range(number):
         given.append(Answer.of(bn.Frame(f"{n}", torch.zeros((6, 8, 3)), CAMERA), n, FOUND))
     given.save(path)

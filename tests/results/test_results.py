@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 import bidnerf_core as bn
 import drawn
-from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome, TrackedPath
+from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import Photos, write_transforms
 from bidnerf_core.frames import View
@@ -50,7 +50,7 @@ def scene() -> Any:
 def test_a_sequence_is_tracked_in_a_thread_of_any_kind(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    reports, paths = list[Progress](), list[TrackedPath]()
+    reports, paths = list[Progress](), list[Answers]()
     with caplog.at_level(logging.INFO, "bidnerf"):
         worker = threading.Thread(
             target=lambda: paths.append(bn.track(scene(), folder, progress=reports.append))
@@ -72,17 +72,17 @@ def test_a_sequence_is_tracked_in_a_thread_of_any_kind(
 
 
 def test_a_cancelled_and_an_interrupted_tracking_leave_their_frames(folder: Path) -> None:
-    path, done = TrackedPath(), threading.Event()
+    path, done = Answers(is_sequence=True), threading.Event()
     with pytest.raises(bn.Cancelled):
-        bn.track(scene(), folder, path=path, each=lambda frame, answer: done.set(), cancel=done.is_set)
+        bn.track(scene(), folder, answers=path, each=lambda frame, answer: done.set(), cancel=done.is_set)
     assert len(path) == 1
 
     def broken(progress: Progress) -> None:
         raise ZeroDivisionError("of the callback")
 
-    path = TrackedPath()
+    path = Answers(is_sequence=True)
     with pytest.raises(ZeroDivisionError, match="of the callback"):
-        bn.track(scene(), folder, path=path, progress=broken)
+        bn.track(scene(), folder, answers=path, progress=broken)
     assert len(path) == 1
 
 
@@ -231,7 +231,7 @@ def test_ambiguous_images_raise_the_question_if_hardly_more_matches_than_by_chan
 ) -> None:
     measured = {part.name: 0.5 for part in fields(Evidence)}
     evidence = Evidence(**measured | {"inliers": 30, "by_chance": by_chance})  # type: ignore[arg-type]
-    answers = Answers("hashgrid")
+    answers = Answers()
     for number in range(3):
         answers.append(Answer(f"{number}", number, CAMERA, replace(FOUND, diagnostics=evidence)))
     assert bool(answers.question) is asked
@@ -240,7 +240,7 @@ def test_ambiguous_images_raise_the_question_if_hardly_more_matches_than_by_chan
 def test_answers_in_a_format_of_poses_hold_the_accepted_ones(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    answers = Answers("hashgrid")
+    answers = Answers()
     frame = Frame("a", torch.zeros((3, 4, 3)), CAMERA)
     for found in (FOUND, replace(FOUND, outcome=Outcome.CONVERGED)):
         answers.append(Answer.of(frame, len(answers), found))
@@ -252,7 +252,7 @@ def test_answers_in_a_format_of_poses_hold_the_accepted_ones(
 
 def answers_with(poses: list[SE3], truths: list[SE3]) -> Answers:
     found, frame = replace(FOUND, outcome=Outcome.CONVERGED), Frame("a", torch.zeros((3, 4, 3)), CAMERA)
-    answers = Answers("hashgrid")
+    answers = Answers()
     for pose, truth in zip(poses, truths, strict=True):
         moved = replace(found, T_world_camera=pose)
         answers.append(replace(Answer.of(frame, len(answers), moved), truth=truth))

@@ -11,10 +11,10 @@ import torch
 
 from bidnerf_core import SE3
 from bidnerf_core.results import TrajectoryErrors, spans
+from bidnerf_core.results.plots import draw_path
 
 # Inside: errors after each alignment, compared with evo's, and the paths that are drawn
 from bidnerf_core.results.trajectory import ErrorSummary, alignment_errors, relative_errors, rigid_alignment
-from bidnerf_core.results.trajectory_plot import PlottedPath, plot_path
 from refusals import refused
 
 
@@ -118,6 +118,6 @@ def test_a_path_is_drawn_with_lost_frames_and_truth(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     poses = walk(12)
     accepted = torch.arange(12) % 5 != 0
-    path = PlottedPath(poses, accepted, torch.full((12,), 0.01), [None, *[poses[i] for i in range(11)]])
-    plot_path(path, None, tmp_path / "path.png")
+    truth = [None, *[poses[i] for i in range(11)]]
+    draw_path(poses, accepted, torch.full((12,), 0.01), truth, tmp_path / "path.png")
     assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")

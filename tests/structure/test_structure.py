@@ -409,14 +409,14 @@ def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path)
                 image = cv2.blur(image, (9, 1))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
-    measures = measured(tmp_path / "clip.mp4", lambda done, total: None)
+    measures = measured(tmp_path / "clip.mp4")
     assert len(measures) == len(poses)
     rest = measures[35].motion - measures[16].motion
     assert rest < 0.2 * measures[-1].motion
     frames = chosen(measures)
     assert sum(16 <= number < 36 for number in frames) <= 2
     assert sum(number % 3 == 1 for number in frames) <= len(frames) / 6
-    written = write_frames(tmp_path / "clip.mp4", tmp_path / "images", frames, lambda done, total: None)
+    written = write_frames(tmp_path / "clip.mp4", tmp_path / "images", frames)
     assert [int(image.name) for image in written] == frames
     assert written[-1].time == pytest.approx(frames[-1] / 30, abs=1e-3)
     assert lacks_poses(tmp_path / "clip.mp4")

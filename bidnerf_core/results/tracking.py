@@ -1,0 +1,90 @@
+"""Tracking a whole sequence."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, open_sequence
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization import Localizer, SceneMap, Tracker, landmark_cameras
+from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
+from bidnerf_core.results.answers import Answer, Answers
+
+TRIED = 3
+"""Number of unreadable frames at the beginning of a sequence after which tracking is given up: probably none
+can be read."""
+
+
+def track(
+    scene: SceneMap | Localizer | Tracker,
+    sequence: FrameSequence | str | Path,
+    *,
+    every: int = 1,
+    depth: bool = True,
+    answers: Answers | None = None,
+    each: Callable[[Frame, Answer], None] | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Answers:
+    """Find the poses of a sequence's frames in a map, in chronological order.
+
+    ``scene``: a map, a localizer with its own settings, or a tracker with its own settings and start. ``sequence``: the
+    result of ``open_sequence``, or the path of a dataset, a folder of images or a video, whose images use the map's
+    cameras if they have none of their own. ``every``: use only every n-th frame. ``depth``: whether measured depth is
+    used. ``answers``: collects the answers, by default a new object; it holds those so far if an error ends the
+    tracking. ``each`` is called with each frame and its answer, ``progress`` after each frame.
+
+    A frame whose files cannot be read is left out with an ``InputWarning`` and counted in ``unread``. Raises
+    ``InputError`` if none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.
+    """
+    if every < 1:
+        raise InputError(f"every is {every}", expected="1 or more")
+    tracker = scene
+    if not isinstance(tracker, Tracker):
+        tracker = Tracker(tracker if isinstance(tracker, Localizer) else Localizer(tracker))
+    if not isinstance(sequence, FrameSequence):
+        sequence = opened_for(tracker.localizer.scene, sequence)
+    if answers is None:
+        answers = Answers(tracker.localizer.scene, is_sequence=True)
+    total = -(-len(sequence) // every)
+    with job_context(progress, cancel):
+        count = counter("tracking", "frames")
+        for number, timed in enumerate(_every(sequence, every)):
+            if isinstance(timed, TimedFrame):
+                frame = timed.frame if depth else timed.frame.replace(depth=None)
+                found = tracker(frame, timed.time)
+                answer = answers.add(frame, found, timed.time, timed.truth, every * number)
+                if each is not None:
+                    each(timed.frame, answer)
+            elif not answers.answers and number + 1 >= min(TRIED, total):
+                first = (
+                    "the first frame cannot" if number == 0 else f"none of the first {number + 1} frames can"
+                )
+                raise InputError(f"{first} be read: {timed}")
+            else:
+                warnings.warn(f"{timed}; left out", InputWarning, stacklevel=2)
+                answers.unread += 1
+            count(number + 1, total)
+    return answers
+
+
+def opened_for(scene: SceneMap, path: str | Path, **options: Any) -> FrameSequence:
+    """Open a sequence as ``open_sequence`` does, with the map's background and its cameras for images that have none."""
+    return open_sequence(path, assumed=landmark_cameras(scene), background=scene.bounds.background, **options)
+
+
+def _every(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
+    """Yield every n-th frame; if each has its own files, an unreadable one is yielded as an error."""
+    if not isinstance(frames, FileSequence):
+        yield from islice(frames, 0, None, every)
+        return
+    for place in range(0, len(frames), every):
+        try:
+            yield frames[place]
+        except InputError as error:
+            yield error
