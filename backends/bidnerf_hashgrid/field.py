@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Concentrated, FieldValues, RaySampler, SceneBounds
+from bidnerf_core.fields import Concentrated, FieldValues, RaySampler, SceneBounds, spherical_harmonics
 from bidnerf_core.settings import Count, Layers, NotNegative, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.networks import log_density_and_rgb
@@ -105,7 +105,7 @@ class HashGridField(nn.Module):
         """Return the values with the first ``active`` levels of the encoding only (None: all)."""
         shape = positions.shape[:-1]
         encoded = self.encode(positions.reshape(-1, 3), active)
-        harmonics = spherical_harmonics(directions.reshape(-1, 3))
+        harmonics = spherical_harmonics(directions.reshape(-1, 3), 9)
         log_density, rgb = log_density_and_rgb(self.geometry, self.colour, encoded, harmonics)
         # Per side of the scene, so that an untrained field is equally thin in any unit of length.
         density = log_density.clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
@@ -157,22 +157,3 @@ class CoarseField:
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         return self.fine.query_levels(positions, directions, self.fine.config.coarse_levels)
-
-
-def spherical_harmonics(directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 9"]:
-    """Return the real spherical harmonics of degrees 0 to 2 at unit directions."""
-    x, y, z = directions.unbind(-1)
-    return torch.stack(
-        [
-            torch.full_like(x, 0.28209479),
-            0.48860251 * y,
-            0.48860251 * z,
-            0.48860251 * x,
-            1.09254843 * x * y,
-            1.09254843 * y * z,
-            0.31539157 * (3 * z * z - 1),
-            1.09254843 * x * z,
-            0.54627422 * (x * x - y * y),
-        ],
-        dim=-1,
-    )

@@ -62,3 +62,31 @@ def query_network(
     raw, rgb = network(bounds.normalized(positions.reshape(-1, 3)), directions.reshape(-1, 3))
     density = functional.softplus(raw - THINNESS) * (SHARPNESS / bounds.side)
     return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+
+
+def spherical_harmonics(directions: Float[Tensor, "*p 3"], count: int) -> Float[Tensor, "*p k"]:
+    """Return the first ``count`` (1, 4, 9 or 16) real spherical harmonics at unit directions, without the Condon-Shortley phase."""
+    x, y, z = directions.unbind(-1)
+    found = [torch.full_like(x, 0.28209479177387814)]
+    if count > 1:
+        found += [0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x]
+    if count > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        found += [
+            1.0925484305920792 * x * y,
+            1.0925484305920792 * y * z,
+            0.31539156525252005 * (3 * zz - 1),
+            1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if count > 9:
+        found += [
+            0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            0.4570457994644658 * y * (5 * zz - 1),
+            0.3731763325901154 * z * (5 * zz - 3),
+            0.4570457994644658 * x * (5 * zz - 1),
+            1.445305721320277 * z * (xx - yy),
+            0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(found, dim=-1)

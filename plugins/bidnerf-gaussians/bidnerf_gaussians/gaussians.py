@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.fields import LEAST_ALPHA
 from bidnerf_gaussians.quaternions import product, quaternion_of
 from bidnerf_gaussians.spherical_harmonics import rotated
 
@@ -86,11 +87,6 @@ class Dropped:
         return ", ".join(parts)
 
 
-LEAST_OPACITY = 1 / 255
-"""Opacity below which a Gaussian is never visible; also the threshold on alpha along a ray, as in the
-original 3DGS code."""
-
-
 def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
     """Return the Gaussians that can be rendered, and how many were left out.
 
@@ -104,7 +100,7 @@ def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
         )
     finite = _finite(found)
     turned = found.quaternions.abs().amax(-1) > 1e-12
-    visible = found.logits.sigmoid() >= LEAST_OPACITY
+    visible = found.logits.sigmoid() >= LEAST_ALPHA
     kept = finite & turned & visible
     dropped = Dropped(
         int((~finite).sum()), int((finite & ~turned).sum()), int((finite & turned & ~visible).sum())

@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.fields import Rays, SceneBounds, SplatField, render, scaled_field
+from bidnerf_core.fields import LEAST_ALPHA, Rays, SceneBounds, SplatField, render, scaled_field
 from bidnerf_core.geometry import SE3
 from bidnerf_gaussians import Gaussians, GaussiansConfig, GaussiansField, quaternions
-from bidnerf_gaussians.gaussians import LEAST_OPACITY
 from bidnerf_gaussians.spherical_harmonics import basis, colours
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.01, 10.0)
@@ -43,7 +42,7 @@ def by_each(gaussians: Gaussians, along: Rays) -> tuple[torch.Tensor, torch.Tens
     t = (Pd * away).sum(-1) / (Pd * d).sum(-1)
     x = t[..., None] * d - away
     alpha = gaussians.logits.double().sigmoid() * torch.exp(-0.5 * torch.einsum("rni,nij,rnj->rn", x, P, x))
-    alpha = torch.where((alpha >= LEAST_OPACITY) & (t > along.near[:, None]), alpha, 0)
+    alpha = torch.where((alpha >= LEAST_ALPHA) & (t > along.near[:, None]), alpha, 0)
     order = t.argsort(dim=1)
     alpha, t = alpha.gather(1, order), t.gather(1, order)
     seen = colours(gaussians.harmonics.double()[order], d.expand(*t.shape, 3))

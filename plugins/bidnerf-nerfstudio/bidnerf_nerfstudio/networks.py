@@ -141,30 +141,3 @@ def unit_cube(
 def density_of(raw: Float[Tensor, "p"], factor: float) -> Float[Tensor, "p"]:
     """Return the density (per training unit) for raw outputs: ``factor`` times their exponential."""
     return factor * raw.clamp(max=LARGEST_LOG_DENSITY).exp()
-
-
-def spherical_harmonics(directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 16"]:
-    """Return the real spherical harmonics of degrees 0 to 3 as polynomials of the components, which need not be of length 1."""
-    x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    return torch.stack(
-        [
-            torch.full_like(x, 0.28209479177387814),
-            0.4886025119029199 * y,
-            0.4886025119029199 * z,
-            0.4886025119029199 * x,
-            1.0925484305920792 * x * y,
-            1.0925484305920792 * y * z,
-            0.9461746957575601 * zz - 0.31539156525251999,
-            1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-            0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            0.4570457994644658 * y * (5 * zz - 1),
-            0.3731763325901154 * z * (5 * zz - 3),
-            0.4570457994644658 * x * (5 * zz - 1),
-            1.445305721320277 * z * (xx - yy),
-            0.5900435899266435 * x * (xx - 3 * yy),
-        ],
-        dim=-1,
-    )

@@ -9,14 +9,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import FieldValues, SceneBounds
+from bidnerf_core.fields import FieldValues, SceneBounds, spherical_harmonics
 from bidnerf_core.settings import Count, Layers, Positive, Settings
 from bidnerf_nerfstudio.networks import (
     HashConfig,
     HashNetwork,
     Perceptron,
     density_of,
-    spherical_harmonics,
     unit_cube,
 )
 from bidnerf_nerfstudio.placement import Placement
@@ -72,7 +71,7 @@ class Radiance(nn.Module):
             [1, self.head.layers[0].in_features - HARMONICS - len(self.appearance)], -1
         )
         # nerfstudio's torch implementation evaluates the harmonics at directions shifted to [0, 1].
-        harmonics = spherical_harmonics((directions + 1) / 2)
+        harmonics = spherical_harmonics((directions + 1) / 2, 16)
         code = self.appearance.expand(len(positions), -1)
         rgb = self.head(torch.cat([harmonics, features, code], dim=-1)).sigmoid()
         return density_of(raw[:, 0], self.factor) * inside, rgb
