@@ -38,7 +38,6 @@ from bidnerf_core.cli.starts import StartSpec
 from bidnerf_core.datasets import DepthPoints, Photos, Query, QuerySource, SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.evaluation import places_of
-from bidnerf_core.frames import BLACK
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.io import png_bytes, write_file
 from bidnerf_core.localization import (
@@ -198,7 +197,7 @@ def run(arguments: list[str]) -> None:
             check_for_several(given | {"--depth-points": depth_points is not None}, out)
             collection = collected(maps, method, config)
             photos = replace(photos, camera=replace(photos.camera, assumed=collection.cameras))
-            source = open_queries(query, photos, frames, BLACK, None)
+            source = open_queries(query, photos, frames, None, None)
             localize_in_several(collection, source, seed, out, json)
             return
         stored = load_map(map)

@@ -70,7 +70,7 @@ class FrameOptions:
 
 
 def open_queries(
-    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float],
+    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float] | None,
     points: DepthPoints | None,
 ) -> QuerySource:  # fmt: skip
     """Return the queries for the QUERY arguments: image files and folders of them, or one dataset.
@@ -94,7 +94,7 @@ def open_queries(
 
 
 def _dataset(
-    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float],
+    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float] | None,
     points: DepthPoints | None,
 ) -> QuerySource:  # fmt: skip
     if len(paths) > 1:

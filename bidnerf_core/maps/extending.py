@@ -198,6 +198,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
         raise InputError(f"none of {amount(len(unread), 'photo')} can be read: {unread[0][1]}")
     if not frames:
         raise InputError("no photos to add", expected="at least one")
+    frames = [frame.over(scene.bounds.background) for frame in frames]
     return [frame if side is None else frame.at_most(side) for frame in frames], unread
 
 
