@@ -3,126 +3,123 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
-from bidnerf_core.cli.camera_options import (
-    DatasetCamera,
-    DatasetDepthUnit,
-    MaskHides,
-    Masks,
-    RegisterDepth,
-    mask_folder,
-    stated_reading,
-)
 from bidnerf_core.cli.folders import require_outside_maps
-from bidnerf_core.cli.method_options import Preset, chosen_settings
-from bidnerf_core.cli.options import Device, Names, option, parse, require, wrong_usage
+from bidnerf_core.cli.options import Device, MethodOptions, Names, require, wrong_usage
 from bidnerf_core.cli.output import show
+from bidnerf_core.cli.parser import Option, Without, parse
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import UsageError, amount
-from bidnerf_core.evaluation import FAULTS, PROTOCOLS, Plan, Size, changed_settings, command_line, run_plan
-from bidnerf_core.localization import METHODS, USUAL_METHOD
 
-Place = Annotated[str, tyro.conf.Positional]
+if TYPE_CHECKING:
+    from bidnerf_core.evaluation import Size
+
 STOPPING = "waiting for the trials under way (Ctrl-C again: at once)"
 
 
-def run(arguments: list[str]) -> None:
-    """Run the command; its options include the settings of the method named in the arguments."""
-    settings = chosen_settings(arguments, USUAL_METHOD)
+@dataclass(frozen=True)
+class Evaluate:
+    """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
 
-    def evaluate(
-        map: Annotated[Place, option("MAP", "folder of a map, or demo:blobs")],
-        data: Annotated[
-            str | None,
-            tyro.conf.Positional,
-            option("[DATA]", "folder of a dataset, or demo:object, demo:room, demo:blobs", ""),
-        ] = None,
-        *,
-        out: Annotated[Path, option("RESULTS.jsonl", "results file; trials already in it are not run again")],
-        protocol: Annotated[str, option("NAME", "how starts are chosen: " + ", ".join(PROTOCOLS))] = "bid",
-        size: Annotated[
-            tuple[str, ...],
-            option("SIZE...", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's"),
-        ] = (),
-        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
-        trials: Annotated[
-            int | None,
-            option(
-                "N",
-                "number of trials per size; without a start, at most one per frame",
-                "the protocol's, 24 or 25",
-            ),
-        ] = None,
-        seed: Annotated[int | None, option("S", "seed of every random choice", "the protocol's, 0")] = None,
-        split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
-        frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
-        images: Annotated[int, option("K", "localize a sequence of K images around the object at once")] = 1,
-        angle: Annotated[float, option("DEGREES", "angle between neighbours of a sequence")] = 15.0,
-        depth: Annotated[bool, option(None, "use measured depth if available")] = True,
-        depth_points: Annotated[
-            Path | None,
-            option(
-                "MODEL", "COLMAP sparse model whose points, where frames observe them, are used as depth", ""
-            ),
-        ] = None,
-        camera: DatasetCamera = None,
-        register_depth: RegisterDepth = None,
-        depth_unit: DatasetDepthUnit = None,
-        masks: Masks = None,
-        mask_hides: MaskHides = "black",
-        fault: Annotated[
-            Names,
-            option(
-                "NAME:SIZE...",
-                "repeat every trial with each of these image faults; NAME:SIZE,SIZE gives several sizes,"
-                " A:SIZE+B:SIZE combines two, none leaves the images unchanged; names: " + ", ".join(FAULTS),
-                "none",
-            ),
-        ] = (),
-        device: Device = "cpu",
-        workers: Annotated[
-            int | None, option("N", "number of single-threaded processes", "one per core; one on a GPU")
-        ] = None,
-        dask: Annotated[
-            str | None, option("ADDRESS", "address of a dask scheduler whose workers run the trials", "")
-        ] = None,
-        shards: Annotated[int, option("N", "number of parts that the trials are split into")] = 1,
-        shard: Annotated[int, option("I", "the part to run, from 0")] = 0,
-        preset: Preset = None,
-        config: Any = None,
-    ) -> None:
-        """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
+    Finished trials are always kept: the same command resumes where it stopped. 'bidnerf report' makes tables and figures from the
+    results.
+    """
 
-        Finished trials are always kept: the same command resumes where it stopped. 'bidnerf report' makes
-        tables and figures from the results.
-        """
-        mask_folder(masks, mask_hides)  # rejects anything but a folder of masks
+    map: Annotated[str, Option("MAP", "folder of a map, or demo:blobs", positional=True)]
+    out: Annotated[Path, Option("RESULTS.jsonl", "results file; trials already in it are not run again")]
+    data: Annotated[
+        str | None,
+        Option("[DATA]", "folder of a dataset, or demo:object, demo:room, demo:blobs", positional=True),
+    ] = None
+    protocol: Annotated[
+        str, Option("NAME", "how starts are chosen: bid, bid-hard, inerf, parallel, perturb or none")
+    ] = "bid"
+    size: Annotated[
+        tuple[str, ...],
+        Option("SIZE...", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's"),
+    ] = ()
+    trials: Annotated[
+        int | None,
+        Option(
+            "N",
+            "number of trials per size; without a start, at most one per frame",
+            "the protocol's, 24 or 25",
+        ),
+    ] = None
+    seed: Annotated[int | None, Option("S", "seed of every random choice", "the protocol's, 0")] = None
+    frame: Annotated[Names, Option("NAME...", "try only these frames", "all of the split")] = ()
+    sequence: Annotated[
+        int, Option("K", "localize a sequence of K images around the object at once", name="images")
+    ] = 1
+    angle: Annotated[float, Option("DEGREES", "angle between neighbours of a sequence")] = 15.0
+    depth: Annotated[bool, Option(None, "use measured depth if available")] = True
+    depth_points: Annotated[
+        Path | None,
+        Option("MODEL", "COLMAP sparse model whose points, where frames observe them, are used as depth"),
+    ] = None
+    fault: Annotated[
+        Names,
+        Option(
+            "NAME:SIZE...",
+            "repeat every trial with each of these image faults, one of 'bidnerf plugins faults'; NAME:SIZE,SIZE gives"
+            " several sizes, A:SIZE+B:SIZE combines two, none leaves the images unchanged",
+            "none",
+        ),
+    ] = ()
+    device: Device = "cpu"
+    workers: Annotated[
+        int | None, Option("N", "number of single-threaded processes", "one per core; one on a GPU")
+    ] = None
+    dask: Annotated[
+        str | None, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")
+    ] = None
+    shards: Annotated[int, Option("N", "number of parts that the trials are split into")] = 1
+    shard: Annotated[int, Option("I", "the part to run, from 0")] = 0
+    reading: Annotated[DatasetOptions, Without("largest", "background")] = DatasetOptions(split="test")
+    method: MethodOptions = MethodOptions()
+
+    def run(self, arguments: list[str]) -> None:
+        from bidnerf_core.evaluation import Plan, changed_settings, command_line, run_plan
+
+        _ = self.reading.mask_folder  # rejects anything but a folder of masks
+        if self.data is None and not self.map.startswith("demo:"):
+            raise UsageError(f"no DATA after map {self.map}; only closed-form maps have their own data")
+        method = self.method
         with wrong_usage():
             plan = Plan(
-                map, data or _own_data(map), protocol, read_sizes(size) or None, method, changed_settings(method, config),
-                trials, seed, split, tuple(name for group in frame for name in group) or None, images, angle, device,
-                depth, None if depth_points is None else str(depth_points), None if masks is None else str(masks), mask_hides,
-                tuple(f for group in fault for f in group),
-                **stated_reading(camera, register_depth, depth_unit),
+                self.map, self.data or self.map, self.protocol, read_sizes(self.size) or None, method.method,
+                changed_settings(method.method, method.config), self.trials, self.seed, self.reading.split, self.frame or None,
+                self.sequence, self.angle, self.device, self.depth, None if self.depth_points is None else str(self.depth_points),
+                faults=self.fault, **stated_reading(self.reading),
             )  # fmt: skip
-            require("--workers", 1 if workers is None else workers, 1, 10_000)
-            require("--shards", shards, 1)
-            require("--shard", shard, 0, shards - 1)
-            if dask is not None and workers is not None:
+            require("--workers", 1 if self.workers is None else self.workers, 1, 10_000)
+            require("--shards", self.shards, 1)
+            require("--shard", self.shard, 0, self.shards - 1)
+            if self.dask is not None and self.workers is not None:
                 raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
-        require_outside_maps(out.parent, out)
+        require_outside_maps(self.out.parent, self.out)
         with Display() as display, stopped_by_ctrl_c(STOPPING) as cancel:
             found = run_plan(
-                plan, shard=shard, shards=shards, workers=workers, dask=dask, out=out,
+                plan, shard=self.shard, shards=self.shards, workers=self.workers, dask=self.dask, out=self.out,
                 command=command_line("bidnerf evaluate", arguments), progress=display, cancel=cancel,
             )  # fmt: skip
-        show(f"{amount(len(found.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
+        show(f"{amount(len(found.rows), 'trial')} in {self.out}; 'bidnerf report {self.out}' shows them")
 
-    parse("evaluate", evaluate, arguments, settings)
+
+def stated_reading(images: DatasetOptions) -> dict[str, Any]:
+    """Return the options with which a dataset is opened, as the plain values that a plan of trials stores."""
+    registration = images.registration
+    return {
+        "camera": None if images.camera is None else str(images.camera),
+        "register_depth": registration if registration in (None, False) else str(registration),
+        "depth_unit": images.depth_unit,
+        "masks": None if images.masks is None else str(images.masks),
+        "mask_hides": images.mask_hides,
+    }
 
 
 def read_sizes(words: Sequence[str]) -> tuple[Size, ...]:
@@ -133,7 +130,5 @@ def read_sizes(words: Sequence[str]) -> tuple[Size, ...]:
         raise UsageError(f"--size is {' '.join(words)}", expected="numbers such as 0.5, or 0.2:10") from error
 
 
-def _own_data(map: str) -> str:
-    if not map.startswith("demo:"):
-        raise UsageError(f"no DATA after map {map}; only closed-form maps have their own data")
-    return map
+def run(arguments: list[str]) -> None:
+    parse("evaluate", Evaluate, arguments).run(arguments)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from bidnerf_core.cli.options import Flag, MapFolder, option, parse
+from bidnerf_core.cli.folders import check_output
+from bidnerf_core.cli.options import Json, MapFolder
 from bidnerf_core.cli.output import print_json, show
+from bidnerf_core.cli.parser import Option, parse
 from bidnerf_core.errors import InputError
-from bidnerf_core.maps import Map, load_map
-from bidnerf_core.results import draw_capture
+
+if TYPE_CHECKING:
+    from bidnerf_core.maps import Map
 
 
 def run(arguments: list[str]) -> None:
@@ -18,12 +21,18 @@ def run(arguments: list[str]) -> None:
 
 def info(
     map: MapFolder,
-    json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
+    json: Json = False,
     draw: Annotated[
-        Path | None, option("PNG", "file for a picture of the capture from above", "no picture")
+        Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")
     ] = None,
 ) -> None:
     """Describe a map and the photos it was built from. The whole map is loaded, so that damage is detected."""
+    from bidnerf_core.maps import load_map
+
+    if draw is not None:
+        if draw.suffix.lower() != ".png":
+            raise InputError(where=draw, expected="the name of a PNG file")
+        check_output(draw, ())
     scene = load_map(map)
     summary = scene.describe()
     if draw is not None:
@@ -37,13 +46,13 @@ def info(
 
 def _draw(scene: Map, out: Path) -> None:
     """Draw the capture from above. Raises ``InputError`` if the map has no record of it."""
+    from bidnerf_core.results import draw_capture
+
     if scene.capture is None:
         raise InputError(
             "has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one",
             where=scene.folder,
         )
-    if out.suffix.lower() != ".png":
-        raise InputError(where=out, expected="the name of a PNG file")
     seen_by = None if scene.landmarks is None else scene.landmarks.views
     points = None if scene.landmarks is None else scene.landmarks.positions
     draw_capture(scene.capture, points, seen_by, out, scene.unit)

@@ -1,351 +1,349 @@
-"""``bidnerf localize``."""
+"""``bidnerf localize``: poses of images in one map, or in the one of several maps that each shows."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import tyro
-
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.cli.camera_options import (
-    CameraFile,
-    FieldOfView,
-    FocalLength,
-    MaskHides,
-    Masks,
-    RegisterDepth,
-    depth_registration,
-    mask_folder,
-)
 from bidnerf_core.cli.folders import check_output, check_pose_file, make_folder
 from bidnerf_core.cli.interruptions import uninterrupted
-from bidnerf_core.cli.method_options import Preset, chosen_settings
-from bidnerf_core.cli.options import Flag, MapFolder, Names, option, parse, require
+from bidnerf_core.cli.options import Json, MapFolder, MethodOptions, PointChoice, StartOptions, require
 from bidnerf_core.cli.output import print_json, say, show
-from bidnerf_core.cli.progress import counted
-from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
-from bidnerf_core.cli.several_maps import (
-    check_for_several,
-    collected,
-    localize_in_several,
-    named_maps,
-    no_query,
-)
-from bidnerf_core.cli.starts import StartSpec
-from bidnerf_core.datasets import DepthPoints, Photos, Query, QuerySource, SparseChoice, SparsePoints
-from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.evaluation import places_of
-from bidnerf_core.geometry import SE3, symbol
-from bidnerf_core.io import png_bytes, write_file
-from bidnerf_core.localization import (
-    METHODS,
-    USUAL_METHOD,
-    Localization,
-    Localizer,
-    landmark_cameras,
-    matches_landmarks,
-    require_start,
-    require_use_of_depth,
-)
-from bidnerf_core.maps import Map, load_map, maps_in
-from bidnerf_core.results import (
-    OPENCV_AXES,
-    Answer,
-    Answers,
-    Failure,
-    PoseError,
-    localize_each,
-    overlay,
-    pose_error,
-    pose_format,
-    read_poses,
-    standard_deviations,
-)
+from bidnerf_core.cli.parser import Option, Without, parse
+from bidnerf_core.cli.progress import displayed
+from bidnerf_core.cli.queries import QueryOptions
+from bidnerf_core.datasets import DatasetOptions
+from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 from bidnerf_core.settings import LARGEST_SEED
 
-one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start)")
+if TYPE_CHECKING:
+    from bidnerf_core.datasets import DepthPoints, Query
+    from bidnerf_core.geometry import SE3
+    from bidnerf_core.localization import Localizer
+    from bidnerf_core.maps import Map, MapCollection
+    from bidnerf_core.results import Answer, Answers, Failure, PoseError
 
 
-def run(arguments: list[str]) -> None:
-    """Parse with the settings of the method named in the arguments, and localize."""
-    settings = chosen_settings(arguments, USUAL_METHOD)
+@dataclass(frozen=True)
+class OutputOptions:
+    """What is written."""
 
-    def localize(
-        map: MapFolder,
-        query: Annotated[
-            tuple[Path, ...],
-            tyro.conf.Positional,
-            option(
-                "[MAP...] QUERY...",
-                "image files, folders of photos, or one dataset folder (required); before them, further"
-                " maps or folders of maps: each image is localized in the one it shows",
-                "",
-            ),
-        ],
-        *,
-        depth: Annotated[
-            tuple[Path, ...],
-            option(
-                "FILE...",
-                "depth images or .npy files of the photos, in the same order, or matched by name",
-                "",
-            ),
-        ] = (),
-        camera: CameraFile = None,
-        focal: FocalLength = None,
-        hfov: FieldOfView = None,
-        depth_unit: Annotated[
-            float | None,
-            option(
-                "METRES",
-                "metres per step of depth images",
-                "0.001 for integers, 1 for floats; or as in the dataset",
-            ),
-        ] = None,
-        register_depth: RegisterDepth = None,
-        masks: Masks = None,
-        mask_hides: MaskHides = "black",
-        frame: Annotated[
-            Names,
-            option("NAME...", "frames of a dataset, together as a rig", "each frame of the split on its own"),
-        ] = (),
-        split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
-        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
-        start: Annotated[
-            Path | None,
-            one_start,
-            option(
-                "POSE.json",
-                "file with a 4x4 T_world_camera to start from, or with one per query by name",
-                "",
-            ),
-        ] = None,
-        perturb: Annotated[
-            tuple[float, float] | None,
-            one_start,
-            option("T R", "start from the dataset's pose moved by T metres and R degrees", ""),
-        ] = None,
-        no_start: Annotated[Flag, one_start, option(None, "no start is known (the default)", "")] = False,
-        window: Annotated[
-            int, option("K", "combine each frame with those before it in the split, K in all, as a rig")
-        ] = 1,
-        depth_points: Annotated[
-            Path | None,
-            option(
-                "FILE",
-                "points measured by a sensor, in the camera frame, metres: rows of x y z, .npy, or .npz; or"
-                " the folder of a COLMAP sparse model, whose points are used where the frames observe them",
-                "",
-            ),
-        ] = None,
-        out: Annotated[
-            Path | None,
-            option(
-                "POSES",
-                "write poses to this file: .txt or .tum, transforms.json, images.txt (COLMAP), or .json with all details",
-                "",
-            ),
-        ] = None,
-        draw: Annotated[
-            Path | None, option("DIR", "draw each photo next to the map rendered from the pose found", "")
-        ] = None,
-        seed: Annotated[int, option("N", "seed of every random choice")] = 0,
-        json: Annotated[Flag, option(None, "print one JSON object per query, each on a line", "")] = False,
-        model_points: SparseChoice = SparseChoice(),
-        preset: Preset = None,
-        config: Any = None,
-    ) -> None:
-        """Find the poses of photos or dataset frames in a map, or in the one of several maps that they show.
+    out: Annotated[
+        Path | None,
+        Option(
+            "POSES",
+            "write poses to this file: .txt or .tum, transforms.json, images.txt (COLMAP), or .json with all details",
+        ),
+    ] = None
+    draw: Annotated[
+        Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")
+    ] = None
+    json: Json = False
 
-        QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it
-        is given; if EXIF has no focal length, method auto begins with the camera of the map's images. Dataset
-        frames named by --frame form a rig: their relative poses come from the dataset, and the pose found is
-        that of the last one's camera. Poses are camera to world with OpenCV axes (x right, y down, z
-        forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.
-        """
-        require("--seed", seed, 0, LARGEST_SEED)
-        if frame and not any(frame):
-            raise UsageError("--frame names no frame", expected="the stem of an image file")
-        photos = PhotoOptions(
-            depth, CameraSource(camera, focal, hfov), depth_unit, depth_registration(register_depth),
-            mask_folder(masks, mask_hides),
-        )  # fmt: skip
-        frames = FrameOptions(split, tuple(name for group in frame for name in group), window)
-        begin = StartSpec(None if start is None else read_poses(start), perturb, start)
-        for part in (frames, begin):
-            part.check()
-        maps, query = named_maps(map, query)
-        if not query:
-            raise no_query(maps)
-        require_start(method, begin.given)
-        if depth_points is not None:
+    def check(self, inputs: Sequence[Path | str | None]) -> None:
+        """Check, before any work, that the outputs can be written."""
+        if self.out is not None:
+            check_pose_file(self.out, inputs)
+        if self.draw is not None:
+            make_folder(self.draw, inputs)
+
+    def picture(self, name: str) -> Path:
+        """Return the file of a picture."""
+        assert self.draw is not None
+        return self.draw / f"overlay-{name}.png"
+
+
+@dataclass(frozen=True)
+class Localize:
+    """Find the poses of photos or dataset frames in a map, or in the one of several maps that they show.
+
+    QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF has no
+    focal length, method auto begins with the camera of the map's images. Dataset frames named by --frame form a rig: their
+    relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
+    OpenCV axes (x right, y down, z forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.
+    """
+
+    map: MapFolder
+    query: Annotated[
+        tuple[Path, ...],
+        Option(
+            "[MAP...] QUERY...",
+            "image files, folders of photos, or one dataset folder; before them, further maps or folders of maps: each"
+            " image is localized in the one it shows",
+            positional=True,
+        ),
+    ] = ()
+    output: OutputOptions = OutputOptions()
+    queries: QueryOptions = QueryOptions()
+    depth_points: Annotated[
+        Path | None,
+        Option(
+            "FILE",
+            "points measured by a sensor, in the camera frame, metres: rows of x y z, .npy, or .npz; or the folder of a"
+            " COLMAP sparse model, whose points are used where the frames observe them",
+        ),
+    ] = None
+    images: Annotated[DatasetOptions, Without("largest", "background")] = DatasetOptions(split="test")
+    start: StartOptions = StartOptions()
+    method: MethodOptions = MethodOptions()
+    seed: Annotated[int, Option("N", "seed of every random choice")] = 0
+    model_points: PointChoice = None
+    """which points of a COLMAP model are used"""
+
+    def run(self) -> None:
+        from bidnerf_core.datasets import Photos
+        from bidnerf_core.evaluation import perturb
+        from bidnerf_core.localization import (
+            Localizer,
+            landmark_cameras,
+            matches_landmarks,
+            require_start,
+            require_use_of_depth,
+        )
+        from bidnerf_core.maps import MapCollection, load_map, maps_in
+        from bidnerf_core.results import Answers, localize_each, pose_of, read_poses
+
+        require("--seed", self.seed, 0, LARGEST_SEED)
+        maps, paths = self._maps_and_paths()
+        start, images, output = self.start, self.images, self.output
+        start.check()
+        poses = None if start.start is None else read_poses(start.start)
+        method, config = self.method.method, self.method.config
+        require_start(method, start.given)
+        if self.depth_points is not None:
             require_use_of_depth(method)
-        inputs = (*query, *depth, camera, start, depth_points, register_depth)
-        if out is not None:
-            check_pose_file(out, inputs)
-        if draw is not None:
-            make_folder(draw, inputs)
-        if len(maps) > 1 or len(maps_in(map)) > 1 or maps_in(map) not in ([], [map]):
-            given = {
-                "--start": start is not None,
-                "--perturb": perturb is not None,
-                "--draw": draw is not None,
-            }
-            check_for_several(given | {"--depth-points": depth_points is not None}, out)
-            collection = collected(maps, method, config)
-            photos = replace(photos, camera=replace(photos.camera, assumed=collection.cameras))
-            source = open_queries(query, photos, frames, None, None)
-            localize_in_several(collection, source, seed, out, json)
-            return
-        stored = load_map(map)
-        points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
-        assumed = landmark_cameras(stored) if matches_landmarks(method, config) else ()
-        photos = replace(photos, camera=replace(photos.camera, assumed=assumed))
-        source = open_queries(query, photos, frames, stored.bounds.background, points)
-        if perturb is not None and isinstance(source, Photos):
+        files = (
+            *paths,
+            *self.queries.depth,
+            start.start,
+            self.depth_points,
+            images.camera,
+            images.register_depth,
+        )
+        inputs = [file for file in files if isinstance(file, str | Path)]
+        output.check(inputs)
+
+        def start_of(query: Query) -> SE3 | None:
+            if start.perturb is not None and query.truth is not None:
+                return perturb(query.truth, *start.perturb, self.seed)
+            return None if poses is None else pose_of(poses, query.name, start.start or "start")
+
+        if len(maps) > 1 or maps_in(maps[0]) not in ([], [maps[0]]):
+            self._check_for_several()
+            with displayed():
+                collection = MapCollection(maps, method, config)
+            finder: Localizer | MapCollection = collection
+            answers, source = (
+                Answers(collection),
+                self.queries.open(paths, images, "black", collection.cameras),
+            )
+        else:
+            scene = load_map(maps[0])
+            points = None if self.depth_points is None else self._points(scene)
+            cameras = landmark_cameras(scene) if matches_landmarks(method, config) else ()
+            source = self.queries.open(paths, images, scene.bounds.background, cameras, points)
+            answers = Answers(scene)
+            finder = Localizer(scene, method, config, warm_up=len(source.names) > 1)
+        if start.perturb is not None and isinstance(source, Photos):
             raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
-        if draw is not None:
+        if output.draw is not None:
             for name in source.names:
-                check_output(_picture_file(draw, name), inputs)
-        localizer = Localizer(stored, method, config, warm_up=len(source.names) > 1)
-        _localize(source, localizer, begin, seed, _Output(stored, out, draw, json, len(source.names)))
+                check_output(output.picture(name), inputs)
+        run = Run(output, answers, len(source.names), start_of)
+        with displayed(), run.saved():
+            localize_each(finder, source, start=start_of, seed=self.seed, answers=run.answers, each=run.show)
 
-    parse("localize", localize, arguments, settings)
+    def _maps_and_paths(self) -> tuple[list[Path], tuple[Path, ...]]:
+        """Split the arguments into the maps, or folders of maps, that they begin with, and the queries after them."""
+        from bidnerf_core.maps import maps_in
+
+        count = next((n for n, path in enumerate(self.query) if not _holds_maps(path)), len(self.query))
+        maps, paths = [self.map, *self.query[:count]], self.query[count:]
+        if paths:
+            return maps, paths
+        expected = "image files, folders of photos, or a folder of a dataset"
+        if len(maps) == 1:
+            raise UsageError("no QUERY", expected=expected)
+        if self.map.exists() and not maps_in(self.map):
+            raise UsageError(
+                f"{str(self.map)!r} is not a map, but {str(maps[1])!r} is: MAP comes first, then QUERY"
+            )
+        named = enumeration([repr(str(path)) for path in maps])
+        raise UsageError(f"{named} are maps, and no QUERY follows them;", expected=expected)
+
+    def _check_for_several(self) -> None:
+        """Raise ``UsageError`` for options that apply only to one map."""
+        from bidnerf_core.results import pose_format
+
+        start, out = self.start, self.output.out
+        given = {
+            "--start": start.start, "--perturb": start.perturb, "--draw": self.output.draw,
+            "--depth-points": self.depth_points,
+        }  # fmt: skip
+        for option, value in given.items():
+            if value is not None:
+                raise UsageError(f"{option} applies to one map, but several are given")
+        if out is not None and pose_format(out) != ".json":
+            raise UsageError(
+                "poses in several maps have different worlds", where=out, expected="a .json file"
+            )
+
+    def _points(self, scene: Map) -> DepthPoints:
+        from bidnerf_core.datasets import DepthPoints, SparsePoints
+        from bidnerf_core.evaluation import places_of
+
+        path = self.depth_points
+        assert path is not None
+        if not path.is_dir():
+            return DepthPoints(path, None)
+        sparse = SparsePoints(path, places_of(scene.info), self.model_points)
+        say(sparse.summary)
+        return DepthPoints(path, sparse)
 
 
-def _depth_points(path: Path, stored: Map, choice: SparseChoice) -> DepthPoints:
-    if not path.is_dir():
-        return DepthPoints(path, None)
-    sparse = SparsePoints(path, places_of(stored.info), choice)
-    say(sparse.summary)
-    return DepthPoints(path, sparse)
+def _holds_maps(path: Path) -> bool:
+    from bidnerf_core.datasets import find_reader
+    from bidnerf_core.io import IMAGE_SUFFIXES
+    from bidnerf_core.maps import maps_in
+
+    found = maps_in(path)
+    if not found or found == [path]:
+        return bool(found)
+    images = any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir())
+    return not images and find_reader(path) is None
 
 
-def _localize(
-    source: QuerySource, localizer: Localizer, begin: StartSpec, seed: int, output: _Output
-) -> None:
-    total = len(source.names)
-    with counted(output.stage, "images", total) as report:
-        try:
-            localize_each(
-                localizer, source, start=lambda query: begin.pose(query, seed), seed=seed, answers=output.answers,
-                each=lambda query, answer: output.show(query, answer, None if isinstance(answer, Failure) else begin.pose(query, seed)),
-                progress=lambda p: report(p.done, p.total),
-            )  # fmt: skip
-        except BaseException:  # whatever ended it: Ctrl-C, SIGTERM, a closed pipe, a full disk
-            with uninterrupted():
-                output.keep()
-            raise
-    with uninterrupted():
-        output.finish()
+@dataclass
+class Run:
+    """Answers as they come: printed, drawn, and written to the pose file however the run ends."""
 
+    output: OutputOptions
+    answers: Answers
+    total: int  # queries
+    start: Callable[[Query], SE3 | None]
+    not_drawn: int = 0
 
-class _Output:
-    """Output of answers: printed, drawn, and written to the pose file at the end."""
-
-    def __init__(self, stored: Map, out: Path | None, draw: Path | None, json: bool, total: int) -> None:
-        self._stored, self._out, self._draw, self._json, self._total = stored, out, draw, json, total
-        self._not_drawn = 0
-        self.stage = "localizing" if draw is None else "localizing and rendering"
-        self.answers = Answers(stored)
-
-    def show(self, query: Query, answer: Answer | Failure, start: SE3 | None) -> None:
+    def show(self, query: Query, answer: Answer | Failure) -> None:
         """Print an answer and draw it."""
+        from bidnerf_core.results import Failure
+
         if isinstance(answer, Failure):
             say(f"{answer.name}: {answer.reason}")
-        if self._json:
+        if self.output.json:
             print_json(self.answers.plain(answer))
         if isinstance(answer, Failure):
             return
-        if not self._json and self._total == 1:
-            _show_in_full(answer, start)
-        elif not self._json:
-            _show_in_short(answer)
-        if self._draw is not None:
-            self._write_picture(_picture_file(self._draw, query.name), query, answer, start)
+        if not self.output.json:
+            for line in answer_lines(answer, self.start(query), self.total == 1):
+                show(line)
+        if self.output.draw is not None:
+            self._draw(query, answer)
 
-    def _write_picture(self, file: Path, query: Query, answer: Answer, start: SE3 | None) -> None:
+    def _draw(self, query: Query, answer: Answer) -> None:
         """Draw an answer. A picture that cannot be written does not end the run."""
-        picture = overlay(self._stored, query.frame, answer.found, start)
+        from bidnerf_core.io import png_bytes, write_file
+        from bidnerf_core.maps import MapCollection
+        from bidnerf_core.results import overlay
+
+        file, scene = self.output.picture(query.name), self.answers.scene
+        assert scene is not None
+        assert not isinstance(scene, MapCollection)
+        picture = overlay(scene, query.frame, answer.found, self.start(query))
         try:
             write_file(file, png_bytes(picture))
         except OSError as error:
-            self._not_drawn += 1
+            self.not_drawn += 1
             say(f"{file}: not drawn: {error.strerror or error}")
 
-    def finish(self) -> None:
-        """Write the pose file, and print how many of several queries converged.
+    @contextlib.contextmanager
+    def saved(self) -> Iterator[None]:
+        """Write the pose file at the end, and print how many of several queries converged.
 
-        Raises ``InputError`` if a file of accepted poses would be empty, if a query failed, and if a picture
-        is missing.
+        A run that is stopped early writes the answers so far. Raises ``InputError`` if a file of accepted poses would be
+        empty, if a query failed, and if a picture is missing.
         """
-        answers, out, accepted = self.answers, self._out, len(self.answers.accepted)
-        if self._total > 1:
-            say(f"{accepted} of {self._total} converged{answers.question}")
-        if answers.remark is not None:
-            say(answers.remark)
-        if out is not None:
-            if not accepted and pose_format(out) != ".json":
+        from bidnerf_core.maps import MapCollection
+        from bidnerf_core.results import pose_format
+
+        answers, out, total = self.answers, self.output.out, self.total
+        takes_all = out is not None and pose_format(out) == ".json"
+        try:
+            yield
+        except BaseException:  # whatever ended it: Ctrl-C, SIGTERM, a closed pipe, a full disk
+            with uninterrupted():
+                if out is not None and (answers.accepted or (answers.given and takes_all)):
+                    answers.save(out)
+                    say(f"{out}: written after {len(answers)} of {total} images")
+            raise
+        with uninterrupted():
+            if total > 1:
+                scene = answers.scene
+                more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else answers.question
+                say(f"{len(answers.accepted)} of {total} converged{more}")
+            if answers.remark is not None:
+                say(answers.remark)
+            if out is not None and not takes_all and not answers.accepted:
                 raise InputError(
                     "not written, since no pose converged; a .json file takes all of them", where=out
                 )
-            answers.save(out)
+            if out is not None:
+                answers.save(out)
         if failed := len(answers) - len(answers.answers):
-            raise InputError(f"{failed} of {self._total} queries could not be read or localized, see above")
-        if self._not_drawn:
-            raise InputError(f"{amount(self._not_drawn, 'picture')} could not be written, see above")
-
-    def keep(self) -> None:
-        """Write the pose file with the answers so far, after a run that was stopped early."""
-        out, answers = self._out, self.answers
-        if out is None or not (answers.accepted or (answers.given and pose_format(out) == ".json")):
-            return
-        answers.save(out)
-        say(f"{out}: written after {len(answers)} of {self._total} images")
+            raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
+        if self.not_drawn:
+            raise InputError(f"{amount(self.not_drawn, 'picture')} could not be written, see above")
 
 
-def _picture_file(folder: Path, name: str) -> Path:
-    return folder / f"overlay-{name}.png"
+def answer_lines(answer: Answer, start: SE3 | None, full: bool) -> list[str]:
+    """Return an answer in words: one line, or with its errors if the truth is known, its uncertainty, and the matrix."""
+    from bidnerf_core.geometry import symbol
+    from bidnerf_core.results import OPENCV_AXES, pose_error, standard_deviations
 
+    def shown(error: PoseError) -> str:
+        return f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
 
-def _show_in_full(answer: Answer, start: SE3 | None) -> None:
-    """Print an answer on several lines: its errors if the truth is known, its uncertainty, the matrix."""
-    found = answer.found
-    show(f"{answer.name}: {_verdict(found)} ({found.reason})")
-    if answer.error is not None and answer.truth is not None:
-        show(
-            f"  start error  {'no start' if start is None else _shown(pose_error(start, answer.truth, found.unit))}"
+    found, error = answer.found, answer.error
+    placement = answer.placement
+    where = world = ""
+    if placement is not None:
+        where = (
+            f"in {placement.map}: " if found.converged else f"in none of the maps; nearest {placement.map}: "
         )
-        show(f"  final error  {_shown(answer.error)}")
+        world = f"in the frame of {placement.map}, "
+    verdict = "converged" if found.converged else f"NOT converged: {found.outcome.value}"
+    verdict = f"{where}{verdict} ({found.reason})"
+    took = f"{amount(found.steps, 'step')}, {found.seconds:.2f} s"
+    if full:
+        lines = [f"{answer.name}: {verdict}"]
+    else:
+        known = "" if error is None else f"error {shown(error)}; "
+        lines = [f"{answer.name}: {known}{verdict}; {took}"]
+    if placement is not None and placement.runner_up is not None:
+        name, other = placement.runner_up
+        lines.append(
+            f"  runner-up {name}: {'converged too' if other.converged else other.outcome} ({other.reason})"
+        )
+    if not full:
+        return lines
+    if error is not None and answer.truth is not None:
+        before = "no start" if start is None else shown(pose_error(start, answer.truth, found.unit))
+        lines += [f"  start error  {before}", f"  final error  {shown(error)}"]
     if found.covariance is not None:
         position, rotation = standard_deviations(found.covariance)
-        show(
+        lines.append(
             f"  uncertainty  {position:.4f} {symbol(found.unit)}, {math.degrees(rotation):.3f} deg (one standard deviation)"
         )
-    show(
-        f"  {amount(found.steps, 'step')}, {found.seconds:.2f} s, loss {found.loss:.5f}, method {found.method}"
-    )
     lengths = "metres" if found.unit == "metres" else "units of the map"
-    show(f"  T_world_camera ({OPENCV_AXES}; lengths in {lengths})")
-    for row in found.T_world_camera.matrix().tolist():
-        show("    " + " ".join(f"{value: .6f}" for value in row))
+    lines.append(f"  {took}, loss {found.loss:.5f}, method {found.method}")
+    lines.append(f"  T_world_camera ({world}{OPENCV_AXES}; lengths in {lengths})")
+    return lines + [
+        "    " + " ".join(f"{value: .6f}" for value in row) for row in found.T_world_camera.matrix().tolist()
+    ]
 
 
-def _show_in_short(answer: Answer) -> None:
-    """Print an answer in one line."""
-    found, error = answer.found, answer.error
-    known = "" if error is None else f"error {_shown(error)}; "
-    took = f"{amount(found.steps, 'step')}, {found.seconds:.2f} s"
-    show(f"{answer.name}: {known}{_verdict(found)} ({found.reason}); {took}")
-
-
-def _verdict(found: Localization) -> str:
-    """Return the outcome in words; the troubleshooting page of the documentation explains each one."""
-    return "converged" if found.converged else f"NOT converged: {found.outcome.value}"
-
-
-def _shown(error: PoseError) -> str:
-    return f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
+def run(arguments: list[str]) -> None:
+    parse("localize", Localize, arguments).run()

@@ -1,143 +1,111 @@
-"""Parsing of a command's arguments: options shared by several commands, their checks, and the help page."""
+"""Options that several commands share, as annotations and as dataclasses, and their checks."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import functools
-import io
 import math
-import os
-import re
-import shutil
-import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar
+from typing import Annotated, Any, TypeAlias
 
-import tyro
-
-from bidnerf_core.cli.help_page import Page, retyped, without_expert_settings
-from bidnerf_core.cli.parser_errors import refusals_in_a_line
+from bidnerf_core.cli.parser import FLAG, Option, Settings
 from bidnerf_core.errors import InputError, UsageError
 
-_T = TypeVar("_T")
-
 DEFAULT_BACKEND = "hashgrid"
-OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
-LEAST_WIDTH = 40
-"""Minimum line width of help, even in narrower terminals."""
-
-
-def option(metavar: str | None, help: str, default: str | None = None) -> Any:
-    """Describe an option for the help page; ``default`` explains a default value such as None in words."""
-    hint = None if default is None else default and f"(default: {default})"
-    return tyro.conf.arg(metavar=metavar, help=help, help_behavior_hint=hint)
-
+USUAL_METHOD = "auto"
 
 MapFolder: TypeAlias = Annotated[
-    Path, tyro.conf.Positional, option("MAP", "folder of a map, as written by 'bidnerf train'")
+    Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)
 ]
 FeaturesName: TypeAlias = Annotated[
-    str, option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
+    str, Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
 ]
-Device: TypeAlias = Annotated[str, option("NAME", "device on which the field computes: cpu, cuda ...")]
-Largest: TypeAlias = Annotated[
-    int | None,
-    option("PX", "longer side to which larger images are downscaled", "1600, or less if memory is short"),
-]
-DataFolder: TypeAlias = Annotated[
-    Path, tyro.conf.Positional, option("DATA", "folder of a dataset, or a .r3d file")
-]
-Flag: TypeAlias = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
-"""``--frame a b --frame c`` names three frames."""
+Device: TypeAlias = Annotated[str, Option("NAME", "device on which the field computes: cpu, cuda ...")]
+Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON: one value on a line")]
+Names: TypeAlias = tuple[str, ...]
 
 
-def parse(command: str, function: Callable[..., _T], arguments: list[str], config: Any = None) -> _T:
-    """Call ``function`` with the parsed arguments; wrong usage ends the program with status 2.
+def _bake_settings(*_: Any) -> Any:
+    from bidnerf_core.mapping import BakeConfig
 
-    ``config`` holds the default settings if their type is known only at run time, such as those of the method
-    or backend named in the arguments: the parameter ``config`` of ``function`` then takes its type and
-    default from them. ``--help`` shows all options except settings marked ``EXPERT``, and ``--help-all``
-    shows those as well.
-    """
-    if config is not None:
-        function = retyped(function, {"config": config})
-    if "--help-all" in arguments:
-        return _show_help(command, function, 0)
-    if {"-h", "--help"} & set(arguments):
-        return _show_help(command, *without_expert_settings(function))
-    return _called(command, _of_finite_settings(function), arguments)
+    return BakeConfig()
 
 
-def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
-    @functools.wraps(function)
-    def parsed(*given: Any, **options: Any) -> Callable[[], _T]:
-        return lambda: function(*given, **options)
+def _point_choice(*_: Any) -> Any:
+    from bidnerf_core.datasets import SparseChoice
 
-    name = f"bidnerf {command}"
-    with _wide_enough(), refusals_in_a_line(name, arguments, lambda: _options_of(command, function)):
-        call = tyro.cli(parsed, args=arguments, prog=name, config=(tyro.conf.OmitArgPrefixes,))
-    return call()
+    return SparseChoice()
 
 
-def _options_of(command: str, function: Callable[..., Any]) -> set[str]:
-    """Return the names of a command's options, from its help page."""
-    page = io.StringIO()
-    with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
-        _called(command, function, ["--help"])
-    return set(OPTION.findall(page.getvalue()))
+BakeSettings: TypeAlias = Annotated[Any, Settings(_bake_settings)]
+PointChoice: TypeAlias = Annotated[Any, Settings(_point_choice)]
 
 
-@contextlib.contextmanager
-def _wide_enough() -> Iterator[None]:
-    """Give the parser's help and messages a minimum width: in narrower terminals it never finishes breaking lines."""
-    before = os.environ.get("COLUMNS")
-    width = shutil.get_terminal_size().columns
-    if width < LEAST_WIDTH:
-        os.environ["COLUMNS"] = str(LEAST_WIDTH)
-    try:
-        yield
-    finally:
-        if before is not None:
-            os.environ["COLUMNS"] = before
-        elif width < LEAST_WIDTH:
-            del os.environ["COLUMNS"]
+def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
+    from bidnerf_core.localization import find_method
+
+    with wrong_usage():
+        return find_method(values["method"]).settings(values["preset"])
 
 
-def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
-    page = Page()
-    try:
-        with contextlib.redirect_stdout(page):
-            return _called(command, function, ["--help"])
-    finally:
-        if hidden:
-            page.write(f"\n{hidden} expert settings are not shown; --help-all shows them.\n")
-        sys.stdout.write(page.wrapped(max(LEAST_WIDTH, shutil.get_terminal_size().columns)))
+@dataclass(frozen=True)
+class MethodOptions:
+    """How poses are found."""
+
+    method: Annotated[str, Option("NAME", "how poses are found, one of 'bidnerf plugins methods'")] = (
+        USUAL_METHOD
+    )
+    preset: Annotated[
+        str | None,
+        Option("NAME", "method settings to begin with, such as the paper's (default: the usual ones)"),
+    ] = None
+    config: Annotated[Any, Settings(_method_settings)] = None
+    """settings of the method"""
 
 
-def _of_finite_settings(function: Callable[..., _T]) -> Callable[..., _T]:
-    """Return the function with a check that its settings are finite: training would otherwise fail hours later."""
+@dataclass(frozen=True)
+class StartOptions:
+    """Where to start (default: no start; at most one of these)."""
 
-    @functools.wraps(function)
-    def checked(*arguments: Any, **options: Any) -> _T:
-        for value in (*arguments, *options.values()):
-            _require_finite(value)
-        return function(*arguments, **options)
+    start: Annotated[
+        Path | None,
+        Option("POSE.json", "file with a 4x4 T_world_camera to start from, or with one per query by name"),
+    ] = None
+    perturb: Annotated[
+        tuple[float, float] | None,
+        Option("T R", "start from the dataset's pose moved by T metres and R degrees"),
+    ] = None
+    no_start: Annotated[bool, FLAG, Option(None, "no start is known")] = False
 
-    return checked
+    def __post_init__(self) -> None:
+        require_one({"--start": self.start, "--perturb": self.perturb, "--no-start": self.no_start or None})
+
+    def check(self) -> None:
+        """Raise ``UsageError`` for a perturbation out of range."""
+        from bidnerf_core.evaluation import FARTHEST_START
+
+        limits = (("T", "metres", FARTHEST_START), ("R", "degrees", 180.0))
+        for (what, unit, most), value in zip(limits, self.perturb or (), strict=False):
+            if not 0 <= value <= most:
+                raise UsageError(
+                    f"{what} is {value:g}", where="--perturb", expected=f"{unit} from 0 to {most:g}"
+                )
+
+    @property
+    def given(self) -> bool:
+        """Whether there is a start."""
+        return self.start is not None or self.perturb is not None
 
 
-def _require_finite(settings: Any) -> None:
-    if not dataclasses.is_dataclass(settings):
-        return
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if isinstance(value, float) and not math.isfinite(value):
-            raise UsageError(f"--{field.name.replace('_', '-')} is {value}", expected="a finite number")
-        _require_finite(value)
+def require_one(values: Mapping[str, object], required: bool = False) -> None:
+    """Raise ``UsageError`` if several options have a value or, where one is required, none has."""
+    given = [option for option, value in values.items() if value is not None]
+    if len(given) > 1:
+        raise UsageError(f"{given[0]} and {given[1]} exclude each other", expected="only one of them")
+    if required and not given:
+        raise UsageError(f"one of {', '.join(values)} is missing")
 
 
 def require(what: str, value: float, least: float, most: float = math.inf) -> None:
@@ -161,14 +129,3 @@ def wrong_usage() -> Iterator[None]:
         yield
     except InputError as error:
         raise UsageError(error) from error
-
-
-def value_of(option: str, arguments: Sequence[str]) -> str | None:
-    """Return the value of an option on which the parser itself depends; the last occurrence counts, as for the parser."""
-    found = None
-    for place, argument in enumerate(arguments):
-        if argument.startswith(option + "="):
-            found = argument[len(option) + 1 :]
-        elif argument == option and place + 1 < len(arguments):
-            found = arguments[place + 1]
-    return found

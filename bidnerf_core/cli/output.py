@@ -6,20 +6,11 @@ import io
 import json
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 from rich.console import Console
-from rich.segment import Segment, Segments
-from rich.table import Table
-from rich.text import Text
 
-from bidnerf_core.errors import InputError, printable
-
-if TYPE_CHECKING:
-    from bidnerf_core.datasets import Dataset
-    from bidnerf_core.frames import View
-else:
-    Dataset = View = Any  # their modules import torch, which commands such as 'backends' do not need
+from bidnerf_core.errors import printable
 
 
 class _Progress(Console):
@@ -48,36 +39,19 @@ def print_json(value: Any) -> None:
     sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
 
 
-def print_table(table: Table) -> None:
-    """Print a table on stdout."""
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str | None = None) -> None:
+    """Print a table on stdout. On narrow terminals the column ``wide`` is folded, by words, and the others are kept whole."""
+    from rich.table import Table
+
     screen = Console(highlight=False, markup=False)
-    parts = [
-        part if part.text.strip("\n") == "" else Segment(printable(part.text), part.style, part.control)
-        for part in screen.render(table)
-    ]
+    table = Table(box=None, pad_edge=False, show_header=any(columns))
+    for column in columns:
+        table.add_column(column, no_wrap=wide is not None and column != wide, overflow="fold")
+    for row in rows:
+        table.add_row(*map(printable, row))
     with screen.capture() as drawn:  # written below, since rich handles a closed pipe in its own way
-        screen.print(Segments(parts), end="")
+        screen.print(table)
     sys.stdout.write(drawn.get())
-
-
-def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None) -> list[View]:
-    """Read the views of a split, with a progress display if there are many. Raises ``InputError`` for an empty split."""
-    from bidnerf_core.datasets import with_all  # imported here, since it imports torch
-
-    dataset = with_all(dataset, split)
-    total = len(dataset.frame_names(split)) if names is None else len(names)
-    if total == 0:
-        raise InputError(f"split {split!r} has no frames", where=dataset.path)
-    if total <= 10:
-        return dataset.views(split, names)
-    with console.status("") as status:
-        return dataset.views(
-            split,
-            names,
-            lambda done, count: status.update(
-                Text(printable(f"reading {dataset.path.name}/{split}: {done}/{count}"))
-            ),
-        )
 
 
 class PrintableStream(io.TextIOBase):

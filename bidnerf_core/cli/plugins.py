@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import tyro
-from rich.table import Table
-
-from bidnerf_core.cli.options import Flag, option, parse
+from bidnerf_core.cli.options import Json
 from bidnerf_core.cli.output import print_json, print_table
+from bidnerf_core.cli.parser import Option, parse
 from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins
+
+KINDS = f"one kind of plugin: {', '.join(GROUPS)}"
 
 
 def run(arguments: list[str]) -> None:
@@ -17,40 +17,35 @@ def run(arguments: list[str]) -> None:
 
 
 def plugins(
-    group: Annotated[
-        tyro.conf.Positional[str | None],
-        option("[GROUP]", "one kind of plugin: " + ", ".join(GROUPS), "all kinds"),
-    ] = None,
-    json: Annotated[Flag, option(None, "print a JSON list", "")] = False,
+    group: Annotated[str | None, Option("[GROUP]", KINDS, "all kinds", positional=True)] = None,
+    json: Json = False,
 ) -> None:
     """List everything registered by name: backends, readers, methods, features, faults, writers, importers and exporters."""
     groups = list(GROUPS) if group is None else [group]
-    infos = [info for of in groups for info in list_plugins(of)]
+    print_infos(
+        [info for of in groups for info in list_plugins(of)], json, with_group=True, all_kinds=group is None
+    )
+
+
+def print_infos(
+    infos: list[PluginInfo], json: bool, with_group: bool = False, all_kinds: bool = False
+) -> None:
+    """Print plugins as a table, with their faults if any, or as a JSON list."""
+    rows = [
+        {
+            **({"group": info.group} if with_group else {}),
+            "name": info.name,
+            "summary": info.summary,
+            "distribution": info.distribution,
+            "version": info.version,
+            "value": info.value,
+            "fault": info.fault,
+        }
+        for info in infos
+    ]
     if json:
-        print_json([{"group": info.group} | plain(info) for info in infos])
-    else:
-        print_infos(infos, with_group=group is None)
-
-
-def print_infos(infos: list[PluginInfo], with_group: bool = False) -> None:
-    """Print a table of plugins, with their faults if any."""
+        print_json(rows)
+        return
     faults = ["fault"] if any(info.fault for info in infos) else []
-    groups = ["group"] if with_group else []
-    table = Table(*groups, "name", "summary", "distribution", "version", *faults, box=None, pad_edge=False)
-    for info in infos:
-        fault = [info.fault or ""] if faults else []
-        of = [info.group] if with_group else []
-        table.add_row(*of, info.name, info.summary, info.distribution, info.version, *fault)
-    print_table(table)
-
-
-def plain(info: PluginInfo) -> dict[str, str | None]:
-    """Return a plugin's description as JSON values."""
-    return {
-        "name": info.name,
-        "summary": info.summary,
-        "distribution": info.distribution,
-        "version": info.version,
-        "value": info.value,
-        "fault": info.fault,
-    }
+    columns = [*(["group"] if all_kinds else []), "name", "summary", "distribution", "version", *faults]
+    print_table(columns, [[row[column] or "" for column in columns] for row in rows], wide="summary")

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import Flag, option, parse
+from bidnerf_core.cli.options import Json
 from bidnerf_core.cli.output import print_json
-from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.io import to_plain
-from bidnerf_core.structure import find_poses
+from bidnerf_core.cli.parser import Flag, Option, parse
+from bidnerf_core.cli.progress import working
+
+STOPPING = "stopping (Ctrl-C again: at once); what was found is kept"
 
 
 def run(arguments: list[str]) -> None:
@@ -20,30 +19,29 @@ def run(arguments: list[str]) -> None:
 
 
 def poses(
-    photos: Annotated[
-        Path, tyro.conf.Positional, option("PHOTOS", "folder of photos, or a video, without poses")
-    ],
-    out: Annotated[Path, option("DATASET", "folder for the dataset")],
+    photos: Annotated[Path, Option("PHOTOS", "folder of photos, or a video, without poses", positional=True)],
+    out: Annotated[Path, Option("DATASET", "folder for the dataset")],
     camera: Annotated[
         Path | None,
-        option(
+        Option(
             "CAMERA.json",
             "file with the intrinsics of all photos, which are then kept fixed",
             "estimated, starting from EXIF",
         ),
     ] = None,
-    overwrite: Annotated[Flag, option(None, "replace the poses in --out", "")] = False,
-    json: Annotated[Flag, option(None, "print what was found as a JSON object", "")] = False,
+    overwrite: Annotated[Flag, Option(None, "replace the poses in --out")] = False,
+    json: Json = False,
 ) -> None:
     """Find the poses of photos by structure from motion, and write them as a dataset.
 
-    The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The
-    unit of length is arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs
-    this step first.
+    The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The unit of length is
+    arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs this step first.
     """
+    from bidnerf_core.io import to_plain
+    from bidnerf_core.structure import find_poses
+
     check_folder(out, (photos,))
-    stopping = "stopping (Ctrl-C again: at once); what was found is kept"
-    with stopped_by_ctrl_c(stopping) as cancel, Display() as progress:
-        found = find_poses(photos, out, camera, overwrite, progress, cancel)
+    with working(STOPPING):
+        found = find_poses(photos, out, camera, overwrite)
     if json:
         print_json(to_plain(found))

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import FrameType
 
 from rich.progress import (
@@ -22,9 +22,10 @@ from rich.progress import Progress as Bar
 
 from bidnerf_core.cli.output import console, say
 from bidnerf_core.errors import Cancelled
-from bidnerf_core.progress import Cancel, Progress, duration_text
+from bidnerf_core.progress import Cancel, Progress, duration_text, job_context
 
 LINE_EVERY = 10.0  # seconds, if stderr is not a terminal
+STEP = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)"
 
 
 class Display:
@@ -51,7 +52,7 @@ class Display:
             self._begin(now)
         elapsed = time.monotonic() - self._began
         each = elapsed / max(1, now.done - self._first)
-        rate = f"{each:.1f} s each" if each >= 1 else f"{1 / max(each, 1e-9):.1f} per second"
+        rate = f"{each:.1f} s each" if each >= 1 else f"{1 / each:.1f} per second" if each > 1e-6 else ""
         text = now.text or rate
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=now.done, total=now.total, text=text)
@@ -82,22 +83,18 @@ class Display:
 
 
 @contextlib.contextmanager
-def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
-    """Show how many of ``unit`` are done. Yields a function of (done, total)."""
-    with Display() as display:
-        if total is not None:
-            display(Progress(what, 0, total, unit))
-        yield lambda done, of: display(Progress(what, done, of, unit))
+def displayed() -> Iterator[None]:
+    """Display the progress of the work in the context."""
+    with Display() as display, job_context(display):
+        yield
 
 
 @contextlib.contextmanager
-def stopped_by_ctrl_c(
-    announcement: str = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)",
-) -> Iterator[Cancel]:
-    """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises ``KeyboardInterrupt``
-    at once.
+def stopped_by_ctrl_c(announcement: str = STEP) -> Iterator[Cancel]:
+    """Let Ctrl-C stop the work in the context once it can; a second Ctrl-C raises ``KeyboardInterrupt`` at once.
 
-    Work that stopped for that reason ends as interrupted, after the line that says what was kept.
+    Yields a function that returns whether Ctrl-C was pressed. Work that stopped for that reason ends as interrupted, after
+    the line that says what was kept.
     """
     pressed, announced = threading.Event(), threading.Event()
 
@@ -115,7 +112,8 @@ def stopped_by_ctrl_c(
     in_main = threading.current_thread() is threading.main_thread()
     previous = signal.signal(signal.SIGINT, interrupt) if in_main else None
     try:
-        yield cancel
+        with job_context(cancel=cancel):
+            yield cancel
     except Cancelled as stopped:
         say(str(stopped))
         raise KeyboardInterrupt from stopped
@@ -125,8 +123,7 @@ def stopped_by_ctrl_c(
 
 
 @contextlib.contextmanager
-def timed(what: str) -> Iterator[None]:
-    """Print how long the work in the context took."""
-    began = time.monotonic()
-    yield
-    say(f"{what}: {time.monotonic() - began:.1f} s")
+def working(announcement: str = STEP) -> Iterator[None]:
+    """Display the progress of the work in the context, and let Ctrl-C stop it."""
+    with stopped_by_ctrl_c(announcement), displayed():
+        yield

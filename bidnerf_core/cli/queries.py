@@ -1,120 +1,118 @@
-"""The arguments of ``bidnerf localize`` that specify its queries: the user's own photos, or frames of a dataset."""
+"""The images that ``localize`` and ``view`` look for: the user's own photos, or frames of a dataset."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.cli.options import require, require_different
-from bidnerf_core.datasets import (
-    DatasetFrames,
-    DepthPoints,
-    DepthRegistration,
-    Photos,
-    QuerySource,
-    ReadOptions,
-    depth_files,
-    find_reader,
-    open_dataset,
-    photo_files,
-)
+from bidnerf_core.cli.options import Names, require, require_different, require_one
+from bidnerf_core.cli.parser import Option
 from bidnerf_core.errors import UsageError
-from bidnerf_core.frames import MaskFolder
-from bidnerf_core.io import IMAGE_SUFFIXES
+
+if TYPE_CHECKING:
+    from bidnerf_core.camera import CameraSource, Intrinsics
+    from bidnerf_core.datasets import DatasetOptions, DepthPoints, QuerySource
+    from bidnerf_core.io import Background
 
 
 @dataclass(frozen=True)
-class PhotoOptions:
-    """Options for reading photos."""
+class CameraOptions:
+    """The camera of images whose format stores none (default: from EXIF or the map)."""
 
-    depth: tuple[Path, ...] = ()
-    camera: CameraSource = CameraSource()
-    depth_unit: float | None = None  # metres per step
-    registration: DepthRegistration | None = None
-    masks: MaskFolder | None = None
+    focal: Annotated[float | None, Option("PX", "focal length in pixels of the image file")] = None
+    hfov: Annotated[float | None, Option("DEG", "horizontal field of view of the upright image")] = None
 
-    @property
-    def for_photos(self) -> list[str]:
-        """The given options that do not apply to datasets, as written on the command line."""
-        values = {"--depth": self.depth or None, "--focal": self.camera.focal, "--hfov": self.camera.hfov}
-        return [option for option, value in values.items() if value is not None]
+    def __post_init__(self) -> None:
+        require_one({"--focal": self.focal, "--hfov": self.hfov})
 
-    def check_depth(self) -> None:
-        """Raise ``UsageError`` for options of depth images if none are given."""
-        for option, value in (("--depth-unit", self.depth_unit), ("--register-depth", self.registration)):
+    def source(self, images: DatasetOptions, assumed: Sequence[Intrinsics] = ()) -> CameraSource:
+        """Return the source of the cameras of single images."""
+        from bidnerf_core.camera import CameraSource
+
+        require_one({"--camera": images.camera, "--focal": self.focal, "--hfov": self.hfov})
+        assert images.camera is None or isinstance(images.camera, str | Path)
+        return CameraSource(images.camera, self.focal, self.hfov, tuple(assumed))
+
+
+@dataclass(frozen=True)
+class QueryOptions:
+    """Photos and frames."""
+
+    camera: CameraOptions = CameraOptions()
+    depth: Annotated[
+        tuple[Path, ...],
+        Option("FILE...", "depth images or .npy files of the photos, in the same order, or matched by name"),
+    ] = ()
+    frame: Annotated[
+        Names,
+        Option(
+            "NAME...", "frames of a dataset, together as a rig (default: each frame of the split on its own)"
+        ),
+    ] = ()
+    window: Annotated[
+        int, Option("K", "combine each frame with those before it in the split, K in all, as a rig")
+    ] = 1
+
+    def __post_init__(self) -> None:
+        require_different("--frame", self.frame)
+        require("--window", self.window, 1)
+        if self.window > 1 and len(self.frame) > 1:
+            raise UsageError(
+                f"--window {self.window} with {len(self.frame)} frames",
+                expected="one: the last of the window",
+            )
+
+    def open(
+        self, paths: Sequence[Path], images: DatasetOptions, background: Background, assumed: Sequence[Intrinsics],
+        points: DepthPoints | None = None,
+    ) -> QuerySource:  # fmt: skip
+        """Return the queries for the QUERY arguments: image files and folders of them, or one dataset.
+
+        Raises ``InputError`` if there is nothing of either kind, and ``UsageError`` for options that belong to the other kind.
+        """
+        from bidnerf_core.datasets import Photos, depth_files, find_reader, photo_files
+        from bidnerf_core.io import IMAGE_SUFFIXES
+
+        is_dataset = (p.suffix.lower() not in IMAGE_SUFFIXES and find_reader(p) is not None for p in paths)
+        if self.frame or any(is_dataset):
+            return self._frames(paths, images, background, points)
+        if self.window > 1:
+            raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
+        files = photo_files(paths, self.depth)
+        _check_points(points, len(files), "photos; expected one photo")
+        depth = depth_files(files, self.depth)
+        for option, value in (("--depth-unit", images.depth_unit), ("--register-depth", images.registration)):
             if value and not self.depth:
                 raise UsageError(
                     f"{option} was given without --depth", expected="the depth image that it belongs to"
                 )
+        source, sensor = self.camera.source(images, assumed), images.sensor("--register-depth")
+        return Photos(files, source, depth, images.depth_unit, sensor, background, points, images.mask_folder)
 
+    def _frames(
+        self,
+        paths: Sequence[Path],
+        images: DatasetOptions,
+        background: Background,
+        points: DepthPoints | None,
+    ) -> QuerySource:
+        from bidnerf_core.datasets import DatasetFrames
 
-@dataclass(frozen=True)
-class FrameOptions:
-    """The choice of dataset frames used as queries."""
-
-    split: str = "test"
-    names: tuple[str, ...] = ()  # a rig; empty: each frame of the split on its own
-    window: int = 1
-
-    def check(self) -> None:
-        """Raise ``UsageError`` for names and a window that contradict each other."""
-        require_different("--frame", self.names)
-        require("--window", self.window, 1)
-        if self.window > 1 and len(self.names) > 1:
-            raise UsageError(
-                f"--window {self.window} with {len(self.names)} frames",
-                expected="one: the last of the window",
-            )
-
-
-def open_queries(
-    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float] | None,
-    points: DepthPoints | None,
-) -> QuerySource:  # fmt: skip
-    """Return the queries for the QUERY arguments: image files and folders of them, or one dataset.
-
-    Raises ``InputError`` if there is nothing of either kind, and ``UsageError`` for options that belong to
-    the other kind.
-    """
-    datasets = [
-        path for path in paths if path.suffix.lower() not in IMAGE_SUFFIXES and find_reader(path) is not None
-    ]
-    if frames.names or datasets:
-        return _dataset(paths, photos, frames, background, points)
-    if frames.window > 1:
-        raise UsageError(f"--window {frames.window} needs known relative poses", expected="a dataset")
-    files = photo_files(paths, photos.depth)
-    _check_points(points, len(files), "photos; expected one photo")
-    depth = depth_files(files, photos.depth)
-    photos.check_depth()
-    sensor = ReadOptions(register_depth=photos.registration).sensor("--register-depth")
-    return Photos(files, photos.camera, depth, photos.depth_unit, sensor, background, points, photos.masks)
-
-
-def _dataset(
-    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float] | None,
-    points: DepthPoints | None,
-) -> QuerySource:  # fmt: skip
-    if len(paths) > 1:
-        raise UsageError(f"{len(paths)} queries including a dataset", expected="only the dataset")
-    if photos.for_photos:
-        raise UsageError(
-            f"{photos.for_photos[0]} is for photos, but {paths[0]} is a dataset, which has its own; to use"
-            " its images as photos, name the files"
-        )
-    dataset = open_dataset(
-        paths[0],
-        background,
-        camera=photos.camera.camera,
-        register_depth=photos.registration,
-        depth_unit=photos.depth_unit,
-        masks=photos.masks,
-    )
-    source = DatasetFrames(dataset, frames.split, frames.names, frames.window, points)
-    _check_points(points, len(source.names), "frames; name one by --frame")
-    return source
+        if len(paths) > 1:
+            raise UsageError(f"{len(paths)} queries including a dataset", expected="only the dataset")
+        given = {"--depth": self.depth or None, "--focal": self.camera.focal, "--hfov": self.camera.hfov}
+        for option, value in given.items():
+            if value is not None:
+                raise UsageError(
+                    f"{option} is for photos, but {paths[0]} is a dataset, which has its own; to use its images as"
+                    " photos, name the files"
+                )
+        dataset = replace(images, background=background).open(paths[0])
+        source = DatasetFrames(dataset, images.split, self.frame, self.window, points)
+        _check_points(points, len(source.names), "frames; name one by --frame")
+        return source
 
 
 def _check_points(points: DepthPoints | None, queries: int, expected: str) -> None:

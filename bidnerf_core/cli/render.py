@@ -4,87 +4,83 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
-import torch
-from rich.text import Text
-
-from bidnerf_core.cli.camera_options import (
-    DatasetCamera,
-    DatasetDepthUnit,
-    RegisterDepth,
-    depth_registration,
-)
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import DataFolder, Flag, MapFolder, Names, option, parse
-from bidnerf_core.cli.output import console, read_views, say, show
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.errors import InputError, printable
-from bidnerf_core.fields import RenderedImage
-from bidnerf_core.frames import View
-from bidnerf_core.geometry import symbol
-from bidnerf_core.io import output_folder, png_bytes, write_file
-from bidnerf_core.maps import Map, RenderingScores, load_map, rendering_scores
+from bidnerf_core.cli.options import MapFolder, Names
+from bidnerf_core.cli.output import say, show
+from bidnerf_core.cli.parser import Flag, Option, Without, parse
+from bidnerf_core.cli.progress import displayed
+from bidnerf_core.datasets import DatasetOptions
+from bidnerf_core.errors import InputError
+from bidnerf_core.progress import counter
+
+if TYPE_CHECKING:
+    from bidnerf_core.fields import RenderedImage
+    from bidnerf_core.frames import View
+    from bidnerf_core.maps import Map
 
 DEEPEST = 65.535  # largest depth in metres that a 16-bit image in millimetres can hold
 
 
-def run(arguments: list[str]) -> None:
-    parse("render", _render, arguments)
-
-
-def _render(
-    map: MapFolder,
-    data: DataFolder,
-    out: Annotated[Path, option("DIR", "folder for the images")],
-    split: Annotated[str, option("NAME", "split of the dataset; all: every image")] = "test",
-    frame: Annotated[Names, option("NAME...", "render only these frames", "all of the split")] = (),
-    camera: DatasetCamera = None,
-    register_depth: RegisterDepth = None,
-    depth_unit: DatasetDepthUnit = None,
-    level: Annotated[
-        int | None, option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
-    ] = None,
-    overwrite: Annotated[Flag, option(None, "replace images in --out", "")] = False,
-) -> None:
+@dataclass(frozen=True)
+class Render:
     """Render a map from the poses of a dataset.
 
-    Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) per
-    frame into --out, and prints PSNR and depth error against the dataset's images.
+    Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) per frame into --out, and
+    prints PSNR and depth error against the dataset's images.
     """
-    check_folder(out, (map, data))
-    with output_folder(out, overwrite):
-        scene = load_map(map)
-        names = [name for group in frame for name in group]
-        registration = depth_registration(register_depth)
-        dataset = open_dataset(
-            data, scene.bounds.background, camera=camera, register_depth=registration, depth_unit=depth_unit
-        )
-        views = read_views(dataset, split, names or None)
-        _check_file_names([view.frame.name for view in views])
-        _render_views(scene, level, views, out)
 
+    map: MapFolder
+    data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)]
+    out: Annotated[Path, Option("DIR", "folder for the images")]
+    frame: Annotated[Names, Option("NAME...", "render only these frames", "all of the split")] = ()
+    level: Annotated[
+        int | None, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
+    ] = None
+    overwrite: Annotated[Flag, Option(None, "replace images in --out")] = False
+    images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")] = (
+        DatasetOptions(split="test")
+    )
 
-def _check_file_names(names: Sequence[str]) -> None:
-    """Raise ``InputError`` if one frame's colour image would have the same name as another's depth image."""
-    for name in {f"{name}.depth" for name in names} & set(names):
-        raise InputError(
-            f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one"
-            " by one with --frame, into different folders"
-        )
+    def run(self) -> None:
+        from bidnerf_core.datasets import with_all
+        from bidnerf_core.io import output_folder
+        from bidnerf_core.maps import load_map
+
+        check_folder(self.out, (self.map, self.data))
+        with output_folder(self.out, self.overwrite), displayed():
+            scene = load_map(self.map)
+            dataset = replace(self.images, background=scene.bounds.background).open(self.data)
+            dataset = with_all(dataset, self.images.split)
+            names = list(self.frame) or dataset.frame_names(self.images.split)
+            if not names:
+                raise InputError(f"split {self.images.split!r} has no frames", where=self.data)
+            views = dataset.views(self.images.split, names, counter("reading", "images"))
+            names = [view.frame.name for view in views]
+            for name in {f"{name}.depth" for name in names} & set(names):
+                raise InputError(
+                    f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one by one"
+                    " with --frame, into different folders"
+                )
+            _render_views(scene, self.level, views, self.out)
 
 
 def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Path) -> None:
-    scores = []
-    with console.status("") as status:
-        for number, view in enumerate(views):
-            status.update(Text(printable(f"rendering {number + 1}/{len(views)}: {view.frame.name}")))
-            image = scene.render(view, level)
-            write_images(out, view.frame.name, image)
-            scores.append(rendering_scores(image, view.frame, scene.unit))
-            show(f"{view.frame.name}  {scores[-1]}")
+    import torch
+
+    from bidnerf_core.geometry import symbol
+    from bidnerf_core.maps import RenderingScores, rendering_scores
+
+    scores, count = [], counter("rendering", "images")
+    for number, view in enumerate(views):
+        image = scene.render(view, level)
+        write_images(out, view.frame.name, image)
+        scores.append(rendering_scores(image, view.frame, scene.unit))
+        show(f"{view.frame.name}  {scores[-1]}")
+        count(number + 1, len(views))
     errors = torch.cat([score.depth_errors for score in scores])
     mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors)
     error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
@@ -95,11 +91,19 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
     """Write ``NAME.png`` and ``NAME.depth.png``."""
+    import numpy as np
+    import torch
+
+    from bidnerf_core.io import png_bytes, write_file
+
     write_file(out / f"{name}.png", png_bytes((image.rgb * 255).round().to(torch.uint8).numpy()))
     if float(image.depth.max()) > DEEPEST:
         say(
-            f"{name}: depth beyond {DEEPEST} units does not fit a 16-bit image in steps of 0.001 and is"
-            " clipped"
+            f"{name}: depth beyond {DEEPEST} units does not fit a 16-bit image in steps of 0.001 and is clipped"
         )
     millimetres = (image.depth.clamp(0, DEEPEST) * 1000).round().numpy().astype(np.uint16)
     write_file(out / f"{name}.depth.png", png_bytes(millimetres))
+
+
+def run(arguments: list[str]) -> None:
+    parse("render", Render, arguments).run()

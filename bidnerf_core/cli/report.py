@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
 
-import tyro
-
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import option, parse, wrong_usage
+from bidnerf_core.cli.options import wrong_usage
 from bidnerf_core.cli.output import console, show
+from bidnerf_core.cli.parser import Option, parse
 from bidnerf_core.errors import InputError, UsageError
 
 CriterionName = Literal["10%", "5deg 0.05", "1deg 0.02"]
@@ -24,16 +23,16 @@ def run(arguments: list[str]) -> None:
 
 def report(
     results: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, option("RESULTS...", "files written by 'bidnerf evaluate'", "")
-    ],
-    out: Annotated[Path, option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
+        tuple[Path, ...], Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True)
+    ] = (),
+    out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[
         CriterionName | None,
-        option(None, "success criterion for displays that use only one", "10%; 5deg 0.05 if trials had no start"),
+        Option(None, "success criterion for displays that use only one", "10%; 5deg 0.05 if trials had no start"),
     ] = None,
-    title: Annotated[str, option("TEXT", "title of the page")] = "Localization results",
+    title: Annotated[str, Option("TEXT", "title of the page")] = "Localization results",
     view: Annotated[
-        Path | None, option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", "")
+        Path | None, Option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", "")
     ] = None,
 ) -> None:  # fmt: skip
     """Write tables, figures and statistical tests of results as one page that works offline.

@@ -2,89 +2,88 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-import tyro
+from typing import TYPE_CHECKING, Annotated
 
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import MapFolder, option, parse
+from bidnerf_core.cli.options import MapFolder, require_one
 from bidnerf_core.cli.output import say, show
+from bidnerf_core.cli.parser import Option, parse
 from bidnerf_core.errors import UsageError
-from bidnerf_core.maps import Map, factor_of_distance, factor_of_poses, load_info, load_map, map_folder
-from bidnerf_core.results import read_positions
 
-one_way = tyro.conf.create_mutex_group(required=True, title="length of a unit (one of them)")
-
-
-def run(arguments: list[str]) -> None:
-    parse("scale", scale, arguments)
+if TYPE_CHECKING:
+    from bidnerf_core.maps import Map
 
 
-def scale(
-    map: MapFolder,
+@dataclass(frozen=True)
+class Scale:
+    """Convert a map to metres: its field, bounds, surface, landmarks, capture record and anchor.
+
+    Poses, covariances and errors are then in metres, and the depth of sensors fits. One of --distance, --poses and --factor
+    gives the length of a unit.
+    """
+
+    map: MapFolder
     distance: Annotated[
         tuple[str, str, str] | None,
-        one_way,
-        option(
+        Option(
             "A B METRES",
-            "true distance between two places: camera names, NAME@U,V for what a camera shows at a pixel,"
-            " or X,Y,Z",
-            "",
+            "true distance between two places: camera names, NAME@U,V for what a camera shows at a pixel, or X,Y,Z",
         ),
-    ] = None,
+    ] = None
     poses: Annotated[
         Path | None,
-        one_way,
-        option(
+        Option(
             "JSON",
             "file with the true positions of three or more of the map's cameras in metres, in any world:"
             " {NAME: [x, y, z], ...}, or poses as localize --out POSES.json writes them",
-            "",
         ),
-    ] = None,
+    ] = None
     factor: Annotated[
-        float | None,
-        one_way,
-        option("F", "metres per unit of the map; 1 states that its unit is the metre", ""),
-    ] = None,
-    out: Annotated[Path | None, option("MAP2", "leave the map unchanged and write a new one", "")] = None,
-) -> None:
-    """Convert a map to metres: its field, bounds, surface, landmarks, capture record and anchor.
+        float | None, Option("F", "metres per unit of the map; 1 states that its unit is the metre")
+    ] = None
+    out: Annotated[Path | None, Option("MAP2", "leave the map unchanged and write a new one")] = None
 
-    Poses, covariances and errors are then in metres, and the depth of sensors fits.
-    """
-    if out is not None:
-        check_folder(out, (map,))
-    load_info(map)  # raises if there is no map
-    place = out or map
-    with map_folder(
-        place, overwrite=out is None
-    ):  # locked before it is read, so that nobody changes it meanwhile
-        scene = load_map(map)
-        found = _factor(scene, distance, poses, factor)
-        stored = scene.scaled(found).stored_in(place)
-    sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
-    show(f"{place}: all lengths multiplied by {found:.6g}; the scene is now in metres, in a box of {sides}")
+    def __post_init__(self) -> None:
+        given = {"--distance": self.distance, "--poses": self.poses, "--factor": self.factor}
+        require_one(given, required=True)
+
+    def run(self) -> None:
+        from bidnerf_core.maps import load_info, load_map, map_folder
+
+        if self.out is not None:
+            check_folder(self.out, (self.map,))
+        load_info(self.map)  # raises if there is no map
+        place = self.out or self.map
+        # Locked before it is read, so that nobody changes it meanwhile.
+        with map_folder(place, overwrite=self.out is None):
+            scene = load_map(self.map)
+            factor = self._factor(scene)
+            stored = scene.scaled(factor).stored_in(place)
+        sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
+        show(
+            f"{place}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}"
+        )
+
+    def _factor(self, scene: Map) -> float:
+        from bidnerf_core.maps import factor_of_distance, factor_of_poses
+        from bidnerf_core.results import read_positions
+
+        if self.poses is not None:
+            fit = factor_of_poses(scene, read_positions(self.poses))
+            say(f"{self.poses}: {fit}")
+            return fit.factor
+        if self.distance is None:
+            assert self.factor is not None
+            return self.factor
+        first, second, length = self.distance
+        try:
+            metres = float(length)
+        except ValueError as error:
+            raise UsageError(f"METRES is {length!r}", where="--distance", expected="a number") from error
+        return factor_of_distance(scene, first, second, metres)
 
 
-def _factor(
-    scene: Map, distance: tuple[str, str, str] | None, poses: Path | None, factor: float | None
-) -> float:
-    if poses is not None:
-        fit = factor_of_poses(scene, read_positions(poses))
-        say(f"{poses}: {fit}")
-        return fit.factor
-    if distance is not None:
-        first, second, length = distance
-        return factor_of_distance(scene, first, second, _metres(length))
-    if factor is None:
-        raise UsageError(expected="one of --distance, --poses and --factor")
-    return factor
-
-
-def _metres(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise UsageError(f"METRES is {word!r}", where="--distance", expected="a number") from error
+def run(arguments: list[str]) -> None:
+    parse("scale", Scale, arguments).run()

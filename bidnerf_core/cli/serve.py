@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from bidnerf_core.cli.options import Device, option, parse, require
+from bidnerf_core.cli.options import USUAL_METHOD, Device, require
 from bidnerf_core.cli.output import say
+from bidnerf_core.cli.parser import Option, parse
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.io import read_file, read_record
 from bidnerf_core.service import LEAST_TOKEN, PORT, ServiceLimits
@@ -20,68 +20,74 @@ TOKEN = "BIDNERF_TOKEN"
 the machine."""
 
 
-def run(arguments: list[str]) -> None:
-    parse("serve", serve, arguments)
-
-
-def serve(
-    maps: Annotated[
-        tuple[str, ...],
-        tyro.conf.Positional,
-        option(
-            "MAP...",
-            "folders of maps; NAME=MAP serves one under another name than its folder's (required)",
-            "",
-        ),
-    ],
-    *,
-    host: Annotated[
-        str | None,
-        option(
-            "ADDRESS",
-            "listen on this address, such as 0.0.0.0; clients then need a token",
-            "this machine only",
-        ),
-    ] = None,
-    port: Annotated[int, option("N", "port to listen on; 0 picks a free one")] = PORT,
-    token_file: Annotated[
-        Path | None,
-        option(
-            "FILE",
-            f"file with the token that clients must send, at least {LEAST_TOKEN} characters; or set {TOKEN} to the token",
-            "none, but with --host one is generated and printed",
-        ),
-    ] = None,
-    method: Annotated[str, option("NAME", "how poses are found, one of 'bidnerf plugins methods'")] = "auto",
-    config: Annotated[
-        Path | None,
-        option(
-            "FILE",
-            "JSON object with settings of the method, as 'bidnerf localize --method NAME --help' lists them:"
-            ' {"refine_steps": 20}',
-            "the method's own",
-        ),
-    ] = None,
-    device: Device = "cpu",
-    limits: ServiceLimits = ServiceLimits(),
-) -> None:
+@dataclass(frozen=True)
+class Serve:
     """Serve localization over HTTP: photos in, the JSON of 'bidnerf localize' out. Ctrl-C stops it.
 
     A photo is sent as a form or as the body of a request, with its camera, depth image or start if known:
     curl -F photo=@photo.jpg -F hfov=68 http://127.0.0.1:8000/localize
 
-    /openapi.json describes all paths, /health and /metrics are for monitoring, and /geopose implements the
-    GeoPose Protocol. Each request is logged as a line of JSON on stderr.
+    /openapi.json describes all paths, /health and /metrics are for monitoring, and /geopose implements the GeoPose Protocol. Each
+    request is logged as a line of JSON on stderr.
     """
-    require("--port", port, 0, 65535)
-    if not maps:
-        raise UsageError("no MAP", expected="folders of maps")
-    given = _token(token_file)
-    serve_maps(
-        _named(maps), host=host, port=port, token=given, method=method, device=device, limits=limits,
-        config=None if config is None else read_record(config).values,
-        ready=lambda address, token: _announce(address, "TOKEN, the one that was given" if given else token),
-    )  # fmt: skip
+
+    maps: Annotated[
+        tuple[str, ...],
+        Option(
+            "MAP...",
+            "folders of maps; NAME=MAP serves one under another name than its folder's",
+            positional=True,
+        ),
+    ] = ()
+    host: Annotated[
+        str | None,
+        Option(
+            "ADDRESS",
+            "listen on this address, such as 0.0.0.0; clients then need a token",
+            "this machine only",
+        ),
+    ] = None
+    port: Annotated[int, Option("N", "port to listen on; 0 picks a free one")] = PORT
+    token_file: Annotated[
+        Path | None,
+        Option(
+            "FILE",
+            f"file with the token that clients must send, at least {LEAST_TOKEN} characters; or set {TOKEN} to the token",
+            "none, but with --host one is generated and printed",
+        ),
+    ] = None
+    method: Annotated[str, Option("NAME", "how poses are found, one of 'bidnerf plugins methods'")] = (
+        USUAL_METHOD
+    )
+    config: Annotated[
+        Path | None,
+        Option(
+            "FILE",
+            "JSON object with settings of the method, as 'bidnerf localize --method NAME --help-all' lists them:"
+            ' {"refine_steps": 20}',
+            "the method's own",
+        ),
+    ] = None
+    device: Device = "cpu"
+    limits: ServiceLimits = ServiceLimits()
+
+    def run(self) -> None:
+        require("--port", self.port, 0, 65535)
+        if not self.maps:
+            raise UsageError("no MAP", expected="folders of maps")
+        given = _token(self.token_file)
+
+        def announce(address: str, token: str | None) -> None:
+            """Print where the service is, and a token that was generated; a given one must not be logged."""
+            say(f"serving at {address}; Ctrl-C ends")
+            if token is not None:
+                shown = "TOKEN, the one that was given" if given else token
+                say(f"clients need the header  Authorization: Bearer {shown}")
+
+        serve_maps(
+            _named(self.maps), host=self.host, port=self.port, token=given, method=self.method, device=self.device,
+            limits=self.limits, config=None if self.config is None else read_record(self.config).values, ready=announce,
+        )  # fmt: skip
 
 
 def _named(maps: tuple[str, ...]) -> dict[str, str | Path]:
@@ -111,8 +117,5 @@ def _token(file: Path | None) -> str | None:
     return token
 
 
-def _announce(address: str, token: str | None) -> None:
-    """Print where the service is. ``token``: only a generated one, since a given token must not be logged."""
-    say(f"serving at {address}; Ctrl-C ends")
-    if token is not None:
-        say(f"clients need the header  Authorization: Bearer {token}")
+def run(arguments: list[str]) -> None:
+    parse("serve", Serve, arguments).run()

@@ -2,228 +2,178 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
-from bidnerf_core.backend import load_backend
-from bidnerf_core.captures import RefinementChoice
-from bidnerf_core.cli.camera_options import (
-    DatasetCamera,
-    DatasetDepthUnit,
-    MaskHides,
-    Masks,
-    RegisterDepth,
-    depth_registration,
-    mask_folder,
-)
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import (
-    DEFAULT_BACKEND,
-    Device,
-    FeaturesName,
-    Flag,
-    Largest,
-    option,
-    parse,
-    require,
-    value_of,
-    wrong_usage,
-)
-from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.datasets import DatasetOptions, SparseChoice, open_dataset
-from bidnerf_core.devices import working_device
+from bidnerf_core.cli.options import DEFAULT_BACKEND, Device, FeaturesName, PointChoice, require, wrong_usage
+from bidnerf_core.cli.parser import Flag, Option, Settings, parse
+from bidnerf_core.cli.progress import working
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.io import Background, background_colour, from_plain
-from bidnerf_core.mapping import USUAL_FEATURES
-from bidnerf_core.maps import (
-    CHECKPOINT_SECONDS,
-    DESCRIPTION,
-    Images,
-    MapInfo,
-    OtherSettings,
-    TrainOptions,
-    interrupted,
-    load_info,
-    longest_side,
-)
-from bidnerf_core.maps import resume as resume_training
-from bidnerf_core.maps import train as train_map
-from bidnerf_core.settings import to_flat
-from bidnerf_core.structure import lacks_poses
+
+if TYPE_CHECKING:
+    from bidnerf_core.maps import MapInfo
+
+USUAL_FEATURES = "sift"
 
 
-def run(arguments: list[str]) -> None:
-    """Parse with the options of the backend named in the arguments, and train."""
-    named = value_of("--backend", arguments)
-    resumed = None if named else _resumed_map(arguments)
-    name = named or (resumed[1].backend if resumed else DEFAULT_BACKEND)
-    default = load_backend(name, str(resumed[0]) if resumed else "").config_type()
+def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
+    """Return the default settings of the backend: the one named, or that of the map to resume."""
+    from bidnerf_core.backend import load_backend
 
-    def train(
-        data: Annotated[
-            Path,
-            tyro.conf.Positional,
-            option("DATA", "folder of a dataset or of photos without poses, or a video"),
-        ],
-        out: Annotated[Path, option("MAP", "folder for the map")],
-        backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
-        split: Annotated[str, option("NAME", "split of the dataset to train on; all: every image")] = "train",
-        camera: DatasetCamera = None,
-        register_depth: RegisterDepth = None,
-        depth_unit: DatasetDepthUnit = None,
-        masks: Masks = None,
-        mask_hides: MaskHides = "black",
-        largest: Largest = None,
-        background: Annotated[
-            str | None,
-            option("COLOUR", "colour behind images with alpha: white or black", "as in the dataset"),
-        ] = None,
-        resume: Annotated[Flag, option(None, "continue the interrupted training in --out", "")] = False,
-        overwrite: Annotated[Flag, option(None, "replace the map in --out", "")] = False,
-        checkpoint_every: Annotated[
-            float,
-            option("SECONDS", "time between checkpoints: the most work lost if the program is killed"),
-        ] = CHECKPOINT_SECONDS,
-        depth_points: Annotated[
-            Path | None,
-            option("MODEL", "COLMAP sparse model whose points provide depth for images without any", ""),
-        ] = None,
-        refine_poses: Annotated[
-            RefinementChoice,
-            option(
-                "WHEN",
-                "refine the given poses with the keypoints that images share: always, never, or auto (if"
-                " inconsistent)",
-            ),
-        ] = "auto",
-        trust_poses: Annotated[
-            Flag, option(None, "train even if the given poses contradict most pairs of photos", "")
-        ] = False,
-        landmark_features: FeaturesName = USUAL_FEATURES,
-        device: Device = "cpu",
-        no_bake: Annotated[
-            Flag, option(None, "leave the surface and landmarks to 'bidnerf bake'", "")
-        ] = False,
-        model_points: SparseChoice = SparseChoice(),
-        config: Any = None,
-    ) -> None:
-        """Build a map from a dataset, or from photos without poses.
+    name, out = values["backend"], values["out"]
+    resumed = _resumed(out) if values["resume"] and name is None else None
+    if resumed is not None:
+        return load_backend(resumed.backend, str(out)).config_type()
+    return load_backend(name or DEFAULT_BACKEND).config_type()
 
-        Poses that photos or video frames lack are found first, as by 'bidnerf poses', and kept in the folder
-        MAP-poses. Ctrl-C stops after a step and saves the map; --resume continues from there, or from the
-        last checkpoint if the program was killed, with the same result as an uninterrupted training. It also
-        bakes a map that is trained but not baked.
-        """
-        require("--checkpoint-every", checkpoint_every, 0)
-        if resume and overwrite:
+
+def _resumed(out: Any) -> MapInfo | None:
+    """Return the description of the map to resume, None if there is none that can be read, which is reported later."""
+    from bidnerf_core.maps import load_info
+
+    try:
+        return load_info(out) if isinstance(out, Path) else None
+    except InputError:
+        return None
+
+
+@dataclass(frozen=True)
+class Train:
+    """Build a map from a dataset, or from photos without poses.
+
+    Poses that photos or video frames lack are found first, as by 'bidnerf poses', and kept in the folder MAP-poses. Ctrl-C stops
+    after a step and saves the map; --resume continues from there, or from the last checkpoint if the program was killed, with
+    the same result as an uninterrupted training. It also bakes a map that is trained but not baked.
+    """
+
+    data: Annotated[
+        Path, Option("DATA", "folder of a dataset or of photos without poses, or a video", positional=True)
+    ]
+    out: Annotated[Path, Option("MAP", "folder for the map")]
+    backend: Annotated[str | None, Option("NAME", "one of 'bidnerf backends'", DEFAULT_BACKEND)] = None
+    resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
+    overwrite: Annotated[Flag, Option(None, "replace the map in --out")] = False
+    device: Device = "cpu"
+    no_bake: Annotated[Flag, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
+    refine_poses: Annotated[
+        Literal["auto", "always", "never"],
+        Option(
+            "WHEN",
+            "refine the given poses with the keypoints that images share: always, never, or auto (if inconsistent)",
+        ),
+    ] = "auto"
+    trust_poses: Annotated[
+        Flag, Option(None, "train even if the given poses contradict most pairs of photos")
+    ] = False
+    landmark_features: FeaturesName = USUAL_FEATURES
+    checkpoint_every: Annotated[
+        float, Option("SECONDS", "time between checkpoints: the most work lost if the program is killed")
+    ] = 60.0
+    depth_points: Annotated[
+        Path | None,
+        Option("MODEL", "COLMAP sparse model whose points provide depth for images without any"),
+    ] = None
+    images: DatasetOptions = DatasetOptions()
+    model_points: PointChoice = None
+    """which points of a COLMAP model are used"""
+    config: Annotated[Any, Settings(_backend_settings)] = None
+    """size and training of the field: settings of the backend, such as --steps"""
+
+    def __post_init__(self) -> None:
+        require("--checkpoint-every", self.checkpoint_every, 0)
+        if self.resume and self.overwrite:
             raise UsageError(
                 "--resume continues a map, --overwrite starts a new one; expected only one of them"
             )
-        if largest is not None:
-            require("--largest", largest, 1)
-        if background is not None:
+        if self.images.largest is not None:
+            require("--largest", self.images.largest, 1)
+
+    def run(self) -> None:
+        from bidnerf_core.devices import working_device
+        from bidnerf_core.io import background_colour
+        from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
+        from bidnerf_core.structure import lacks_poses
+
+        images, out = self.images, self.out
+        if images.background is not None:
             with wrong_usage():
-                background_colour(background)
-        check_folder(out, (data,), may_be_map=True)
-        working_device(device)
-        begun: Background | None = background
-        photos = lacks_poses(data)
-        if photos and (depth_unit is not None or register_depth is not None):
+                background_colour(images.background)
+        check_folder(out, (self.data,), may_be_map=True)
+        working_device(self.device)
+        photos = lacks_poses(self.data)
+        if photos and (images.depth_unit is not None or images.register_depth is not None):
             raise UsageError(
-                f"{data}: photos without poses have no depth; leave out --depth-unit and --register-depth"
+                f"{self.data}: photos without poses have no depth; leave out --depth-unit and --register-depth"
             )
-        if photos and masks is not None:
+        if photos and images.masks is not None:
             raise UsageError(
-                f"{data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
+                f"{self.data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
             )
-        if photos and not (out / DESCRIPTION).exists():
-            resume = False  # it was interrupted during pose estimation, which resumes by itself
-        if resume:
-            info = interrupted(out, not no_bake)
-            _check_unchanged(out, info, named, default, config)
-            _check_refinement(out, info, refine_poses)
-            if largest is not None and largest != longest_side(info):
-                raise UsageError(
-                    f"{out}: was started with images of {longest_side(info)} px, got --largest {largest}; leave"
-                    " it out"
-                )
-            if landmark_features not in (USUAL_FEATURES, info.landmark_features):
-                began = f"--landmark-features {info.landmark_features}"
-                raise UsageError(f"{out}: was started with {began}, got {landmark_features}; leave it out")
-            begun = info.bounds.background if background is None else background
-        images: Images = data
-        if not photos:
-            registration, hidden = depth_registration(register_depth), mask_folder(masks, mask_hides)
-            images = open_dataset(
-                data, begun, camera=camera, register_depth=registration, depth_unit=depth_unit, masks=hidden
-            )
-        with stopped_by_ctrl_c() as cancel, Display() as progress:
-            options = TrainOptions(
-                DatasetOptions(
-                    split=split,
-                    largest=largest,
-                    camera=camera if photos else None,
-                    background=begun if photos else None,
-                ),
-                landmark_features,
-                device,
-                overwrite,
-                refine_poses,
-                trust_poses,
-                depth_points,
-                model_points,
-                checkpoint_every,
-            )
-            same: dict[str, Any] = {
-                "bake": not no_bake, "options": options, "progress": progress, "cancel": cancel,
-            }  # fmt: skip
-            if not resume:
-                train_map(images, name, out, config, **same)
+        # What was interrupted during pose estimation resumes by itself.
+        resumed = self.resume and not (photos and not (out / DESCRIPTION).exists())
+        if resumed:
+            info = self._interrupted()
+            images = replace(images, background=images.background or info.bounds.background)
+        options = TrainOptions(
+            images, self.landmark_features, self.device, self.overwrite, self.refine_poses, self.trust_poses,
+            self.depth_points, self.model_points, self.checkpoint_every,
+        )  # fmt: skip
+        with working():
+            if not resumed:
+                train(
+                    self.data, self.backend or DEFAULT_BACKEND, out, self.config, bake=not self.no_bake, options=options
+                )  # fmt: skip
                 return
             try:
-                resume_training(out, images, **same)
+                resume(out, self.data, bake=not self.no_bake, options=options)
             except OtherSettings as error:
                 raise UsageError(error) from error
 
-    parse("train", train, arguments, default)
+    def _interrupted(self) -> MapInfo:
+        """Return the description of the map to resume. Raises ``UsageError`` for options that differ from its own, since they
+        would be ignored.
+        """
+        from bidnerf_core.backend import load_backend
+        from bidnerf_core.io import from_plain
+        from bidnerf_core.maps import interrupted, longest_side
+        from bidnerf_core.settings import to_flat
 
-
-def _resumed_map(arguments: list[str]) -> tuple[Path, MapInfo] | None:
-    """Return the folder and description of the map to resume, if the arguments name one that can be read."""
-    out = value_of("--out", arguments)
-    if "--resume" not in arguments or out is None:
-        return None
-    try:
-        return Path(out), load_info(Path(out))
-    except InputError:  # reported later, if the arguments are otherwise valid
-        return None
-
-
-def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any, config: Any) -> None:
-    """Raise ``UsageError`` for settings that differ from those of the interrupted training, since they would
-    be ignored.
-    """
-    if backend not in (None, info.backend):
-        raise UsageError(f"{out}: uses backend {info.backend!r}, cannot resume it with {backend!r}")
-    began = from_plain(type(config), info.config, f"{out}: config")
-    stored, given, usual = (to_flat(settings) for settings in (began, config, default))
-    for key, value in given.items():
-        if value not in (usual[key], stored[key]):
+        out, info = self.out, interrupted(self.out, not self.no_bake)
+        if self.backend not in (None, info.backend):
+            raise UsageError(f"{out}: uses backend {info.backend!r}, cannot resume it with {self.backend!r}")
+        kind: Any = load_backend(info.backend, str(out)).config_type
+        began: Any = from_plain(kind, info.config, f"{out}: config")
+        usual = kind()
+        stored, given, unchanged = (to_flat(settings) for settings in (began, self.config, usual))
+        for key, value in given.items():
+            if value not in (unchanged[key], stored[key]):
+                raise UsageError(
+                    f"{out}: was started with {key} {stored[key]}, got {value}; --resume keeps settings, --overwrite"
+                    " starts again"
+                )
+        refinement = info.pose_refinement
+        if refinement is not None:  # None: "never", or too few keypoints for any
+            refined = refinement.refined or bool(refinement.replaced)
+            if self.refine_poses == ("never" if refined else "always"):
+                raise UsageError(
+                    f"{out}: was started with {'refined' if refined else 'given'} poses, got --refine-poses"
+                    f" {self.refine_poses}; --resume keeps the poses"
+                )
+        largest, features = self.images.largest, self.landmark_features
+        if largest is not None and largest != longest_side(info):
             raise UsageError(
-                f"{out}: was started with {key} {stored[key]}, got {value}; --resume keeps settings,"
-                " --overwrite starts again"
+                f"{out}: was started with images of {longest_side(info)} px, got --largest {largest}; leave it out"
             )
+        if features not in (USUAL_FEATURES, info.landmark_features):
+            raise UsageError(
+                f"{out}: was started with --landmark-features {info.landmark_features}, got {features}; leave it out"
+            )
+        return info
 
 
-def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) -> None:
-    """Raise ``UsageError`` for a choice of pose refinement that differs from that of the interrupted training."""
-    if info.pose_refinement is None:  # "never", or too few keypoints for any
-        return
-    refined = info.pose_refinement.refined or bool(info.pose_refinement.replaced)
-    if refinement == ("never" if refined else "always"):
-        has = "refined" if refined else "given"
-        raise UsageError(
-            f"{out}: was started with {has} poses, got --refine-poses {refinement}; --resume keeps the poses"
-        )
+def run(arguments: list[str]) -> None:
+    parse("train", Train, arguments).run()

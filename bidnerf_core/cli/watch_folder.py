@@ -7,12 +7,15 @@ import time as clocks
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.depth import DepthCamera
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame, photos_in
-from bidnerf_core.io import IMAGE_SUFFIXES, Background, parse_record
+
+if TYPE_CHECKING:
+    from bidnerf_core.camera import CameraSource
+    from bidnerf_core.depth import DepthCamera
+    from bidnerf_core.frames import Frame
+    from bidnerf_core.io import Background
 
 STDIN = "-"
 POLL = 0.05
@@ -35,6 +38,8 @@ class FrameRequest:
     @staticmethod
     def parse(line: str) -> FrameRequest:
         """Parse the request in a line ``{"image": path, "depth": path, "time": s}``; only the image is required."""
+        from bidnerf_core.io import parse_record
+
         request = parse_record("request", line, '{"image": path, "depth": path, "time": seconds}')
         image, depth = request.text("image"), request.text("depth")
         if image is None:
@@ -53,6 +58,8 @@ class FrameRequest:
 
     def read(self, camera: CameraSource, sensor: DepthCamera | None, background: Background) -> Frame:
         """Read the image and its depth. Raises ``InputError`` if they cannot be read or the camera is unknown."""
+        from bidnerf_core.frames import Frame
+
         return Frame.read(
             self.image, camera, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
             background=background, mask=self.mask,
@@ -80,6 +87,8 @@ def _lines() -> Iterator[FrameRequest | InputError]:
 
 def _arriving(folder: Path) -> Iterator[FrameRequest]:
     """Yield the images of a folder in natural name order, and later ones as they arrive."""
+    from bidnerf_core.frames import photos_in
+
     if not folder.is_dir():
         raise InputError(
             "no such folder", where=folder, expected=f"one that receives images, or {STDIN} for stdin"
@@ -99,6 +108,8 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
 
 def _is_depth_of(photo: Path, file: Path) -> bool:
     """Return whether a file next to a photo is its depth, rather than something else about it, such as ``NAME.json``."""
+    from bidnerf_core.io import IMAGE_SUFFIXES
+
     return file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)
 
 

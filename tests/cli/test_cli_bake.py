@@ -17,11 +17,7 @@ import tiny
 from bidnerf_core import train
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import located
-
-# Inside: the map that the command loads is replaced by a ball, so that nothing is trained
-from bidnerf_core.cli import bake as command
 from bidnerf_core.cli import main
-from bidnerf_core.cli.output import read_views
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
@@ -75,13 +71,13 @@ def _ball(monkeypatch: pytest.MonkeyPatch) -> None:
     def ball(folder: Path, *place: str, **options: bool) -> Map:
         return replace(load_map(folder, *place, **options), field=HomogeneousBall(0.5, 300.0))
 
-    monkeypatch.setattr(command, "load_map", ball)
+    monkeypatch.setattr("bidnerf_core.maps.load_map", ball)
 
 
 @pytest.fixture
 def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The surface is left alone, and what the map renders is as sharp as photos."""
-    photos = read_views(open_dataset(sharp / "data", tiny.BACKGROUND), "train")
+    photos = open_dataset(sharp / "data", tiny.BACKGROUND).views("train")
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
     monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     monkeypatch.setattr("bidnerf_core.maps.baking.rendered_views", lambda *_: photos[:12])

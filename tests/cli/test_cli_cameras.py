@@ -10,9 +10,6 @@ import pytest
 import torch
 
 import tiny
-
-# Inside: how each value of an option is read, before a dataset is opened with it
-from bidnerf_core.cli.camera_options import depth_registration
 from bidnerf_core.datasets import open_dataset
 from commands import Run, assert_refused
 from tum_folder import Recorded, write_recording
@@ -107,8 +104,3 @@ def test_options_of_datasets_need_one(bidnerf: Run, shared: Path, given: Path, t
     assert_refused(found, 2, "--camera", photo)
     words = ["evaluate", "demo:blobs", "--out", tmp_path / "r.jsonl", "--depth-unit", 0.001]
     assert_refused(bidnerf(*words), 1, "camera, register_depth and depth_unit")
-
-
-@pytest.mark.parametrize("option", [None, "no", "sensor.json"])
-def test_depth_registration_is_measured_none_or_a_file(option: str | None) -> None:
-    assert depth_registration(option) == {None: None, "no": False, "sensor.json": Path("sensor.json")}[option]

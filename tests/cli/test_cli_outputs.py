@@ -22,7 +22,6 @@ import pytest
 import torch
 
 # Inside: signals within sections that a command passes in microseconds, and paths that it must refuse
-import bidnerf_core.cli.localize as localize_module
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf_core.cli import main
 from bidnerf_core.cli.folders import check_folder, check_output
@@ -204,7 +203,7 @@ def test_a_picture_that_cannot_be_written_does_not_end_the_run(
         read = DatasetFrames.read
         monkeypatch.setattr(DatasetFrames, "read", lambda self, n: replace(read(self, n), name="x" * 250))
     else:
-        monkeypatch.setattr(localize_module, "write_file", no_space)
+        monkeypatch.setattr("bidnerf_core.io.write_file", no_space)
     found = bidnerf("localize", "MAP", data, "--draw", tmp_path / "drawn", "--out", tmp_path / "poses.txt")
     assert found.status == 1
     assert found.err.count(f"not drawn: {fault}") == FRAMES

@@ -17,7 +17,7 @@ from bidnerf_core import SE3, View
 from bidnerf_core.captures import PoseConsistency, TrainingPoses, as_given, stored_cameras
 from bidnerf_core.captures import prepared as prepared_for_training
 from bidnerf_core.cli import main
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import TrackedViews, tracked_views
 from bidnerf_core.maps import cameras_of, load_capture, load_info, read_views
@@ -156,8 +156,8 @@ def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPat
 
 def test_datasets_tell_the_unit_of_their_depth(shared: Path) -> None:
     assert read_views(shared / "data").depth_unit == 0.001
-    centimetres = open_dataset(shared / "data", depth_unit=0.01)
-    assert read_views(centimetres, "all").depth_unit == 0.01
+    centimetres = DatasetOptions(split="all", depth_unit=0.01)
+    assert read_views(shared / "data", centimetres).depth_unit == 0.01
 
 
 @pytest.mark.data

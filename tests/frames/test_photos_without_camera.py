@@ -19,6 +19,7 @@ from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.results import pose_error
 from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen
 from commands import Run
+from stored_ground import open_map
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def stored(monkeypatch: pytest.MonkeyPatch, landmarks: LandmarkMap | None) -> No
     """Let the command load the textured ground with these landmarks, whatever the folder."""
     known, info = textured_map(surface=True), MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground")
     ground = Map(info, known.field, known.surface, landmarks)
-    monkeypatch.setattr("bidnerf_core.cli.localize.load_map", lambda folder: ground)
+    open_map(monkeypatch, ground)
 
 
 def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:

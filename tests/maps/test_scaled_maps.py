@@ -173,15 +173,15 @@ def test_a_map_that_is_being_changed_is_not_read(
 ) -> None:
     """What another process writes between reading and writing would be lost."""
     bn.train(tiny.views(3), out=tmp_path / "map", config=tiny.config(2), bake=False)
-    refused = list[str]()
+    refused, read = list[str](), bn.load_map
 
     def load(folder: Path) -> Map:
         with pytest.raises(FileInUse) as found, locked(folder):
             pass
         refused.append(str(found.value))
-        return bn.load_map(folder)
+        return read(folder)
 
-    monkeypatch.setattr("bidnerf_core.cli.scale.load_map", load)
+    monkeypatch.setattr("bidnerf_core.maps.load_map", load)
     assert bidnerf("scale", tmp_path / "map", "--factor", "2")[0] == 0
     monkeypatch.setattr("bidnerf_core.maps.extending.load_map", load)
     bidnerf("extend", tmp_path / "map", tmp_path)

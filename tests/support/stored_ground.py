@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf_core import SE3, Frame, Intrinsics, View, evaluation
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.geometry import LengthUnit
@@ -47,8 +47,14 @@ def open_ground(
         scatter = torch.full((4,), 0.001, dtype=torch.float64)
         landmarks = replace(landmarks, cameras=assumed, calibration_scatter=scatter)
     ground = StoredGround(known.field, known.bounds, landmarks, known.surface, cameras=tuple(cameras))
-    for command in ("localize", "track"):
-        patch.setattr(f"bidnerf_core.cli.{command}.load_map", lambda folder: ground)
+    open_map(patch, ground)
+
+
+def open_map(patch: pytest.MonkeyPatch, scene: object) -> None:
+    """Let commands open a map, whatever folder they name."""
+    for name in evaluation.__all__:  # which would otherwise be imported with what is patched, and keep it
+        getattr(evaluation, name)
+    patch.setattr("bidnerf_core.maps.load_map", lambda folder: scene)
 
 
 def write_flight(folder: Path, frames: Sequence[tuple[Frame, SE3]]) -> Path:

@@ -1,0 +1,403 @@
+"""The parser of a command: its arguments are the parameters of a function or a dataclass, and the fields of nested dataclasses.
+
+Options are named as the parameters are, ``--depth-unit`` for ``depth_unit``, whichever dataclass declares them. The help of each
+is its ``Option``, or the docstring or comment beside the field.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import functools
+import inspect
+import math
+import re
+import shutil
+import sys
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
+
+from bidnerf_core.errors import InputError, UsageError, spelling_hint
+from bidnerf_core.settings import Expert
+
+T = TypeVar("T")
+
+HELP, HELP_ALL = "--help", "--help-all"
+LEAST_WIDTH = 40
+"""Minimum line width of help, even in narrower terminals."""
+NEGATIVE = re.compile(r"-[\d.]")
+"""Begins a value, such as -1,0,2, that is not an option."""
+KINDS = {
+    int: ("INT", "a whole number"),
+    float: ("FLOAT", "a number"),
+    str: ("TEXT", "text"),
+    Path: ("PATH", "a path"),
+}
+
+
+@dataclass(frozen=True)
+class Option:
+    """How an argument is called and described; without ``help``, by the docstring or the comment beside it."""
+
+    metavar: str | None = None
+    help: str = ""
+    default: str | None = None  # in words; None: the value itself; empty: it is not mentioned
+    positional: bool = False
+    name: str | None = None  # if it is not the parameter's
+
+
+@dataclass(frozen=True)
+class Without:
+    """The options of a nested dataclass that a command does not take."""
+
+    names: frozenset[str]
+
+    def __init__(self, *names: str) -> None:
+        object.__setattr__(self, "names", frozenset(names))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A parameter that takes a dataclass of settings, known only once the other arguments are, or slow to import.
+
+    ``load`` returns the default settings for the values of the options parsed so far, by parameter name, and all words.
+    ``--help-all`` describes their options, ``--help`` says only that there are some.
+    """
+
+    load: Callable[[Mapping[str, Any], Sequence[str]], Any]
+
+
+FLAG = "flag"
+"""Marks a bool that has an option for True alone."""
+Flag = Annotated[bool, FLAG]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a command, or a field of its options."""
+
+    name: str
+    hint: Any
+    notes: tuple[Any, ...]
+    default: Any  # MISSING if it is required
+    doc: str
+
+    def note(self, kind: type[T]) -> T | None:
+        """Return the first annotation of a kind."""
+        return next((note for note in self.notes if isinstance(note, kind)), None)
+
+    @property
+    def option(self) -> Option:
+        return self.note(Option) or Option(
+            next((n for n in self.notes if isinstance(n, str) and n != FLAG), None)
+        )
+
+
+def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T:
+    """Call ``target``, a function or a dataclass, with the parsed arguments.
+
+    Raises ``UsageError`` for arguments that do not fit, and ``SystemExit`` after help was printed.
+    """
+    words = [_with_hyphens(word) for word in arguments]
+    if {"-h", HELP, HELP_ALL} & set(words):
+        loaded = _loaded(command, target, words) if HELP_ALL in words else None
+        sys.stdout.write(_Parser(command, target, loaded, for_help=True).format_help())
+        raise SystemExit(0)
+    loaded = _loaded(command, target, words)
+    return _built(target, _Parser(command, target, loaded).values(words), loaded)
+
+
+def _loaded(command: str, target: Callable[..., Any], words: Sequence[str]) -> dict[str, Any]:
+    """Return the default settings that depend on other arguments, by parameter name."""
+    pending = {p.name: note for p, _ in _walk(target, {}) if (note := p.note(Settings)) is not None}
+    if not pending:
+        return {}
+    given = _Parser(command, target, {}, options_only=True).parse_known_args(_escaped(words))[0]
+    values = {p.name: p.default for p, _ in _walk(target, {})} | vars(given)
+    return {name: note.load(values, words) for name, note in pending.items()}
+
+
+def _walk(
+    target: Any, loaded: Mapping[str, Any], default: Any = None, left_out: frozenset[str] = frozenset()
+) -> Iterator[tuple[Parameter, Any]]:
+    """Yield the parameters of ``target`` and of nested dataclasses, each with the default of the dataclass that it is, if any."""
+    for parameter in parameters_of(target):
+        if parameter.name in left_out:
+            continue
+        if default is not None:
+            parameter = dataclasses.replace(parameter, default=getattr(default, parameter.name))
+        group = loaded.get(parameter.name, parameter.default)
+        group = group if dataclasses.is_dataclass(group) else None
+        yield parameter, group
+        if group is not None:
+            without = parameter.note(Without)
+            yield from _walk(type(group), loaded, group, frozenset() if without is None else without.names)
+
+
+def _built(
+    target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[str, Any], default: Any = None
+) -> T:
+    """Call ``target`` with the values given for its parameters, and for those of nested dataclasses."""
+    values = dict[str, Any]()
+    for parameter in parameters_of(target):
+        usual = parameter.default if default is None else getattr(default, parameter.name)
+        group = loaded.get(parameter.name, usual)
+        if dataclasses.is_dataclass(group):
+            value = _built(type(group), given, loaded, group)
+            if value is not usual:
+                values[parameter.name] = value
+        elif parameter.name in given:
+            values[parameter.name] = given[parameter.name]
+    if default is None:
+        return target(**values)
+    try:
+        return dataclasses.replace(default, **values) if values else default
+    except InputError as error:
+        raise UsageError(error) from error
+
+
+class _Parser(argparse.ArgumentParser):
+    """The options of a command. ``loaded`` holds the settings that depend on other arguments; None: they are only announced."""
+
+    def __init__(
+        self, command: str, target: Callable[..., Any], loaded: Mapping[str, Any] | None, *,
+        for_help: bool = False, options_only: bool = False,
+    ) -> None:  # fmt: skip
+        self.width = max(LEAST_WIDTH, shutil.get_terminal_size().columns)
+        super().__init__(
+            f"bidnerf {command}", add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS,
+            description=self._filled(inspect.getdoc(target) or ""),
+            formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, 2, 24, self.width),
+        )  # fmt: skip
+        self.names, self._short, self._options_only = set[str](), for_help and loaded is None, options_only
+        own = self.add_argument_group("options")
+        announced, groups = list[str](), dict[str, Any]()  # group of each parameter
+        for parameter, default in _walk(target, loaded or {}):
+            if default is not None:
+                text = parameter.doc or (inspect.getdoc(type(default)) or "").split("\n\n")[0]
+                group = self.add_argument_group(parameter.name.replace("_", " "), self._filled(text, 2))
+                groups |= {inner.name: group for inner in parameters_of(type(default))}
+            elif parameter.note(Settings) is not None:
+                announced.append(parameter.doc)
+            else:
+                self._add(parameter, groups.get(parameter.name, own))
+        if for_help:
+            own.add_argument("-h", HELP, action="store_true", help="show the usual options")
+            more = "show all options" + (f", also {' and '.join(announced)}" if announced else "")
+            own.add_argument(HELP_ALL, action="store_true", help=more)
+        positional = [str(action.metavar) for action in self._get_positional_actions()]
+        required = [f"{a.option_strings[0]} {a.metavar}" for a in self._get_optional_actions() if a.required]
+        usage = " ".join([f"bidnerf {command} [OPTIONS]", *positional, *required])
+        self.usage = textwrap.fill(usage, self.width - len("usage: "), subsequent_indent="  ").replace(
+            "%", "%%"
+        )
+
+    def _filled(self, text: str, indent: int = 0) -> str:
+        """Return paragraphs with lines that fit the terminal."""
+        paragraphs = (" ".join(part.replace("``", "'").split()) for part in text.split("\n\n"))
+        fill = functools.partial(textwrap.fill, width=self.width - indent, break_on_hyphens=False)
+        return "\n\n".join(map(fill, paragraphs))
+
+    def _add(self, parameter: Parameter, group: Any) -> None:
+        option, default = parameter.option, parameter.default
+        nargs, convert, metavar = conversion(parameter.hint)
+        shown, is_required = option.metavar or metavar, default is MISSING
+        expert = any(isinstance(note, Expert) for note in parameter.notes) and self._short
+        common: dict[str, Any] = {
+            "type": convert,
+            "metavar": shown,
+            "help": argparse.SUPPRESS if expert else _description(parameter),
+        }
+        if option.positional:
+            if not self._options_only:
+                nargs = nargs if is_required else {None: "?", "+": "*"}[nargs]  # type: ignore[index]
+                self.add_argument(parameter.name, nargs=nargs, **common)
+            return
+        flag = f"--{option.name or parameter.name.rstrip('_').replace('_', '-')}"
+        self.names.add(flag)
+        if parameter.hint is bool:
+            pair = FLAG not in parameter.notes
+            self.names |= {f"--no-{flag[2:]}"} if pair else set()
+            action = argparse.BooleanOptionalAction if pair else "store_true"
+            group.add_argument(flag, action=action, dest=parameter.name, help=common["help"])
+            return
+        common["metavar"] = tuple(shown.split()) if isinstance(nargs, int) else shown.removesuffix("...")
+        group.add_argument(
+            flag, action="extend" if nargs == "+" else "store", nargs=nargs, dest=parameter.name,
+            required=is_required and not self._options_only, **common,
+        )  # fmt: skip
+
+    def values(self, words: Sequence[str]) -> dict[str, Any]:
+        """Return the values of the arguments that were given. Raises ``UsageError``."""
+        self._words = words
+        found, more = self.parse_known_intermixed_args(_escaped(words))
+        if more:
+            self.error(f"unexpected argument {more[0].strip()!r}")
+        return {
+            name: tuple(value) if isinstance(value, list) else value for name, value in vars(found).items()
+        }
+
+    def error(self, message: str) -> NoReturn:
+        """Raise ``UsageError``; an option that does not exist is named first, since it explains the rest."""
+        message = re.sub(r"^argument (\S+): ", r"\1 ", message)
+        for word in getattr(self, "_words", ()):
+            name = word.split("=")[0]
+            if name.startswith("--") and len(name) > 2 and name not in self.names:
+                message = f"no option {name!r}{spelling_hint(name, self.names)}"
+                break
+        raise UsageError(f"{message}; '{self.prog} {HELP}' describes all arguments")
+
+
+def _description(parameter: Parameter) -> str:
+    """Return the help of a parameter, with its default."""
+    option, default = parameter.option, parameter.default
+    words = option.default
+    if words is None and default is not MISSING and default not in (None, (), "", False):
+        words = " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+    text = " ".join((option.help or parameter.doc).replace("``", "'").split())
+    if default is MISSING and not option.positional:
+        text += " (required)"
+    return (f"{text} (default: {words})" if words else text).replace("%", "%%")
+
+
+def _with_hyphens(word: str) -> str:
+    """Return an option with hyphens in its name, which may be written with underscores as in Python."""
+    name, equals, value = word.partition("=")
+    return name.replace("_", "-") + equals + value if word.startswith("--") else word
+
+
+def _escaped(words: Sequence[str]) -> list[str]:
+    """Return the words such that values like -1,0,2 are not taken for options: argparse takes none with a space for one."""
+    return [f" {word}" if NEGATIVE.match(word) else word for word in words]
+
+
+def parameters_of(target: Callable[..., Any]) -> list[Parameter]:
+    """Return the parameters of a function or a dataclass."""
+    return _parameters(target)
+
+
+@functools.cache
+def _parameters(target: Any) -> list[Parameter]:
+    kinds: Any = [kind for kind in getattr(target, "__mro__", (target,)) if kind is not object]
+    names = _Names()
+    for kind in reversed(kinds):
+        names |= vars(sys.modules[kind.__module__])
+    hints = typing.get_type_hints(target, localns=names, include_extras=True)
+    docs = dict[str, str]()
+    if dataclasses.is_dataclass(target):
+        defaults = {
+            field.name: field.default if field.default_factory is MISSING else field.default_factory()
+            for field in dataclasses.fields(target)
+            if field.init
+        }
+        for kind in reversed(kinds):
+            docs |= _field_docs(kind)
+    else:
+        defaults = {
+            name: MISSING if parameter.default is inspect.Parameter.empty else parameter.default
+            for name, parameter in inspect.signature(target).parameters.items()
+        }
+    found = []
+    for name, default in defaults.items():
+        hint, notes = _bare(hints[name])
+        found.append(Parameter(name, hint, notes, default, docs.get(name, "")))
+    return found
+
+
+class _Names(dict[str, Any]):
+    """The names that annotations use; one that is imported for type checkers alone stands for any object."""
+
+    def __missing__(self, name: str) -> Any:
+        builtins = self["__builtins__"]
+        found = builtins if isinstance(builtins, dict) else vars(builtins)
+        return found.get(name, object)
+
+
+def _field_docs(kind: type) -> dict[str, str]:
+    """Return the text beside each field of a dataclass: the docstring after it, or the comment on its lines or above it."""
+    try:
+        source = textwrap.dedent(inspect.getsource(kind))
+    except OSError:
+        return {}
+    lines = source.splitlines()
+    (tree,) = ast.parse(source).body
+    assert isinstance(tree, ast.ClassDef)
+    found = dict[str, str]()
+    for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
+        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
+            continue
+        match after:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                found[node.target.id] = text
+                continue
+        beside = [_comment(line) for line in lines[node.lineno - 1 : node.end_lineno]]
+        if not any(beside):
+            first = node.lineno - 1
+            while lines[first - 1].lstrip().startswith("#"):
+                first -= 1
+            beside = [_comment(line) for line in lines[first : node.lineno - 1]]
+        found[node.target.id] = " ".join(filter(None, beside))
+    return found
+
+
+def _comment(line: str) -> str:
+    return line.partition("# ")[2].strip()
+
+
+def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Return a type without ``Annotated``, and the annotations."""
+    if typing.get_origin(hint) is Annotated:
+        kind, *notes = typing.get_args(hint)
+        inner, more = _bare(kind)
+        return inner, (*notes, *more)
+    return hint, ()
+
+
+def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
+    """Return how many words a type takes (None: one), the function that reads one, and what it is called."""
+    hint, _ = _bare(hint)
+    members = [_bare(part)[0] for part in typing.get_args(hint)] if _is_union(hint) else [hint]
+    optional = type(None) in members
+    tuples = [part for part in members if typing.get_origin(part) is tuple]
+    words = [part for part in members if part in KINDS or typing.get_origin(part) is Literal]
+    if tuples and not words:
+        parts = typing.get_args(tuples[0])
+        several = parts[-1] is Ellipsis
+        _, convert, metavar = conversion(parts[0])
+        return ("+", convert, metavar) if several else (len(parts), convert, " ".join([metavar] * len(parts)))
+    kinds = sorted(words, key=lambda kind: 1 if kind is str else 2 if kind is Path else 0) or [str]
+    choices = {
+        str(c): c for kind in kinds if typing.get_origin(kind) is Literal for c in typing.get_args(kind)
+    }
+    plain = [kind for kind in kinds if kind in KINDS]
+    metavar = KINDS[plain[0]][0] if plain else f"{{{','.join(choices)}}}"
+    expected = " or ".join(
+        [*([f"one of {', '.join(choices)}"] if choices else []), *(KINDS[kind][1] for kind in plain)]
+    )
+
+    def convert_word(word: str) -> Any:
+        word = word[1:] if word.startswith(" ") and NEGATIVE.match(word[1:]) else word
+        if word in choices:
+            return choices[word]
+        if optional and word == "None":
+            return None
+        for kind in plain:
+            try:
+                value = kind(word)
+            except ValueError:
+                continue
+            if not isinstance(value, float) or math.isfinite(value):
+                return value
+        raise argparse.ArgumentTypeError(f"is {word!r}, expected {expected}")
+
+    return None, convert_word, metavar
+
+
+def _is_union(hint: Any) -> bool:
+    return typing.get_origin(hint) in (typing.Union, types.UnionType)
