@@ -33,7 +33,7 @@ from bidnerf_core.mapping import (
     posed_keypoints,
     tracked_views,
 )
-from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
@@ -65,8 +65,7 @@ class TrainingViews:
 
 def prepared(
     views: Sequence[View], refinement: RefinementChoice = "auto",
-    progress: ProgressCallback | None = None, cancel: Cancel | None = None, features: str = USUAL_FEATURES,
-    trust_poses: bool = False, depth_unit: float | None = None,
+    features: str = USUAL_FEATURES, trust_poses: bool = False, depth_unit: float | None = None,
 ) -> TrainingViews:  # fmt: skip
     """Refine the poses of the views if requested, and find the landmarks that they show.
 
@@ -75,15 +74,15 @@ def prepared(
     ``depth_unit`` (metres per step of depth images, if another can be given), with which it was read.
     """
     if refinement == "never":
-        tracked, seeing = located(views, progress, cancel, features, trust_poses, depth_unit)
+        tracked, seeing = located(views, features, trust_poses, depth_unit)
         if tracked is None and not trust_poses:
             _check_poses(posed_keypoints(_sample(views), SIFT))
         return TrainingViews(
             seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
         )
-    tracked = _tracked(views, progress, cancel, features, trust_poses, depth_unit)
+    tracked = _tracked(views, features, trust_poses, depth_unit)
     least = 0.0 if refinement == "always" else INCONSISTENT
-    report = counter("poses", "image pairs", progress, cancel)
+    report = counter("poses", "image pairs")
     found = training_poses(tracked, views, least, progress=report)
     poses, motion = found.tracked.T_world_camera, found.tracked.motion
     moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
@@ -111,8 +110,6 @@ def prepared(
 
 def located(
     views: Sequence[View],
-    progress: ProgressCallback | None = None,
-    cancel: Cancel | None = None,
     features: str = USUAL_FEATURES,
     trust_poses: bool = False,
     depth_unit: float | None = None,
@@ -124,7 +121,7 @@ def located(
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
-    tracked = _tracked(views, progress, cancel, features, trust_poses, depth_unit)
+    tracked = _tracked(views, features, trust_poses, depth_unit)
     return tracked, _with_landmarks(views, tracked)
 
 
@@ -135,8 +132,6 @@ def _lacks_distances(view: View) -> bool:
 
 def _tracked(
     views: Sequence[View],
-    progress: ProgressCallback | None,
-    cancel: Cancel | None,
     features: str,
     trust_poses: bool,
     depth_unit: float | None,
@@ -146,7 +141,7 @@ def _tracked(
 
     The unit is checked last: under wrong poses, triangulated distances say nothing about it.
     """
-    tracked = tracked_views(views, features, progress=counter("landmarks", "steps", progress, cancel))
+    tracked = tracked_views(views, features, progress=counter("landmarks", "steps"))
     if not trust_poses:
         _check_poses(tracked.observations.images)
     check_depth_unit(tracked, depth_unit)

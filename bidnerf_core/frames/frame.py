@@ -107,6 +107,15 @@ class Frame:
     def __post_init__(self) -> None:
         self._check(IMAGES)
 
+    def __repr__(self) -> str:
+        """A one-line description without images."""
+        camera = self.intrinsics
+        recorded = [name for name in ("depth", "alpha", "hidden") if self.__dict__[name] is not None]
+        kinds = ", ".join(["colour"] * self.has_colour + recorded)
+        return (
+            f"<Frame {self.name}: {camera.width}x{camera.height}, {kinds}, focal length {camera.fx:.4g} px>"
+        )
+
     def _check(self, new: Collection[str]) -> None:
         """Check that all images fit the camera, and the values of those that are ``new``."""
         where, camera = f"frame {self.name}", self.intrinsics

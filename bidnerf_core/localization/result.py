@@ -16,7 +16,14 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, unknown_name
 from bidnerf_core.frames import Frame
-from bidnerf_core.geometry import SE3, CovarianceConvention, LengthUnit, covariance_in, pose_from_matrix
+from bidnerf_core.geometry import (
+    SE3,
+    CovarianceConvention,
+    LengthUnit,
+    covariance_in,
+    pose_from_matrix,
+    symbol,
+)
 from bidnerf_core.io import from_plain, read_record, to_plain, write_file
 
 
@@ -82,6 +89,13 @@ class Localization:
     diagnostics: Diagnostics | None = None  # the measures by which the pose was accepted or rejected
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
+
+    def __repr__(self) -> str:
+        """A one-line description, without the steps and the covariance."""
+        x, y, z = self.T_world_camera.translation.tolist()
+        sure = "" if self.confidence is None else f", confidence {self.confidence:.3g}"
+        where = f"at ({x:.4g}, {y:.4g}, {z:.4g}) {symbol(self.unit)}"
+        return f"<Localization {self.outcome.value} {where}{sure}: {self.reason}>"
 
     def covariance_in(self, convention: CovarianceConvention) -> Float[Tensor, "6 6"] | None:
         """Return the covariance in another convention, see ``CovarianceConvention``; None if unknown.

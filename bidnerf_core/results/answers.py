@@ -274,7 +274,8 @@ class Answers:
         known = [(a.found.T_world_camera, a.truth) for a in self.accepted if a.truth is not None]
         if not known:
             return None
-        return TrajectoryErrors.of(SE3.stack([found for found, _ in known]), SE3.stack([t for _, t in known]))
+        found, true = (SE3.stack(list(poses)) for poses in zip(*known, strict=True))
+        return TrajectoryErrors.of(found, true, self.unit)
 
     def consistency(self) -> float | None:
         """Return the fraction of accepted poses whose error lies within the 95 % bound of their covariance,
@@ -340,11 +341,11 @@ class Answers:
         ]
         unit = symbol(self.unit)
         if (errors := self.errors()) is not None:
-            rows.append(("raw error", errors.raw.text(unit)))
+            rows.append(("raw error", str(errors.raw)))
             if errors.ate is not None:
                 rows.append(("ATE", f"{errors.ate:.4f} {unit} (root mean square, rigidly aligned)"))
             if errors.rpe is not None:
-                rows.append(("RPE per frame", errors.rpe.text(unit)))
+                rows.append(("RPE per frame", str(errors.rpe)))
         if (share := self.consistency()) is not None:
             rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
         if seen := self.trained_on():

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
@@ -26,13 +27,6 @@ CAPTION, GAP = 22, 6  # pixels
 INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
 OBSERVED_EDGES, RENDERED_EDGES = (0, 190, 110), (235, 0, 140)
 NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
-
-# Turbo colour map (Mikhailov 2019), its author's polynomial of degree 5; rows: red, green, blue; columns: 1, x, x^2 ...
-TURBO = (
-    (0.13572138, 4.61539260, -42.66032258, 132.13108234, -152.94239396, 59.28637943),
-    (0.09140261, 2.19418839, 4.84296658, -14.18503333, 4.27729857, 2.82956604),
-    (0.10667330, 12.64194608, -60.58204836, 110.36276771, -89.90310912, 27.34824973),
-)
 
 
 def overlay(
@@ -150,8 +144,11 @@ def depth_to_rgb(
     low, high = np.percentile(array[measured], (1, 99))
     low, high = low if near is None else near, high if far is None else far
     share = ((np.where(measured, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
-    powers = (0.96 - 0.9 * share)[..., None] ** np.arange(6)  # the ends of the colour map are nearly black
-    return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NO_DEPTH, np.uint8))
+    levels = (
+        (255 * (0.96 - 0.9 * share)).round().astype(np.uint8)
+    )  # the ends of the colour map are nearly black
+    turbo = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]  # to RGB
+    return np.where(measured[..., None], turbo, np.array(NO_DEPTH, np.uint8))
 
 
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:

@@ -7,14 +7,14 @@ need no alignment, so their raw error is what counts; the others make them compa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, Similarity, fit_similarity
+from bidnerf_core.geometry import SE3, LengthUnit, Similarity, fit_similarity, symbol
 from bidnerf_core.results.errors import PoseError, pose_error
 
 LEAST_POSES = 3
@@ -29,22 +29,23 @@ UNEXPLAINED = 0.1
 class ErrorSummary:
     """Median, 95th percentile and root mean square of translation and rotation errors."""
 
-    translation_median: float  # metres
+    translation_median: float  # in ``unit``
     translation_p95: float
     translation_rmse: float
     rotation_deg_median: float
     rotation_deg_p95: float
     rotation_deg_rmse: float
+    unit: LengthUnit = "units"  # of the translations
 
     @staticmethod
     def of(errors: PoseError) -> ErrorSummary:
         """Return the summary of a batch of errors. Raises ``InputError`` for an empty one."""
         if not errors.translation.numel():
             raise InputError("no errors to summarize", expected="those of at least one pose")
-        return ErrorSummary(*_three(errors.translation), *_three(errors.rotation_deg))
+        return ErrorSummary(*_three(errors.translation), *_three(errors.rotation_deg), errors.unit)
 
-    def text(self, unit: str) -> str:
-        """Return the summary in words; ``unit`` is the symbol of the translations' unit."""
+    def __str__(self) -> str:
+        unit = symbol(self.unit)
         return (
             f"median {self.translation_median:.4f} {unit}, {self.rotation_deg_median:.3f} deg;"
             f" 95 % within {self.translation_p95:.4f} {unit}, {self.rotation_deg_p95:.3f} deg"
@@ -57,19 +58,19 @@ class TrajectoryErrors:
 
     poses: int
     raw: ErrorSummary
-    ate: float | None  # metres: root mean square distance after a rigid alignment
+    ate: float | None  # in the unit of ``raw``: root mean square distance after a rigid alignment
     rpe: ErrorSummary | None  # of the motion between consecutive poses
 
     @staticmethod
-    def of(found: SE3, true: SE3) -> TrajectoryErrors:
-        """Compare poses ``T_world_camera`` (n), in chronological order. Raises ``InputError`` if there are none."""
+    def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
+        """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order. Raises ``InputError`` if there are none."""
         count = len(found.translation)
         distances = alignment_errors(found, true) if count >= LEAST_POSES else None
         return TrajectoryErrors(
             count,
-            ErrorSummary.of(pose_error(found, true)),
+            ErrorSummary.of(pose_error(found, true, unit)),
             None if distances is None else float(distances.square().mean().sqrt()),
-            ErrorSummary.of(relative_errors(found, true)) if count > 1 else None,
+            ErrorSummary.of(replace(relative_errors(found, true), unit=unit)) if count > 1 else None,
         )
 
 
