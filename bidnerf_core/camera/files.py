@@ -15,7 +15,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-import yaml
 
 from bidnerf_core.camera.intrinsics import Intrinsics, focal_length, question_focal
 from bidnerf_core.camera.lenses import (
@@ -29,7 +28,7 @@ from bidnerf_core.camera.lenses import (
     colmap_camera,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import Record, Row, parse_json, parse_record, parse_rows, read_file
+from bidnerf_core.io import Record, Row, parse_json, parse_record, parse_rows, parse_yaml, read_file
 
 LENSES = tuple(name for name, (_, kind, _) in MODELS.items() if kind != PERSPECTIVE)
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
@@ -167,7 +166,10 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     if start[:1] == b"[":
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
-        return calibrated_camera(str(path), _yaml(str(path), content), size)
+        values = parse_yaml(content, str(path), EXPECTED)
+        if not isinstance(values, Mapping):
+            raise InputError(where=path, expected=EXPECTED)
+        return calibrated_camera(str(path), values, size)
     return _chosen(path, _text_cameras(path, content), photo)
 
 
@@ -247,37 +249,6 @@ def _text_camera(row: Row, named: bool) -> tuple[str, Camera]:
     width, height = (row.integer(words[place]) for place in (2, 3))
     key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
     return key, colmap_camera(row.where, words[1], width, height, row.numbers(words[4:]))
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML loader for plain values, with OpenCV's matrices as mappings."""
-
-
-_Loader.add_multi_constructor("", lambda loader, suffix, node: _plain(loader, node))
-_Loader.add_multi_constructor("tag:yaml.org,2002:opencv", lambda loader, suffix, node: _plain(loader, node))
-
-
-def _plain(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    if isinstance(node, yaml.SequenceNode):
-        return loader.construct_sequence(node, deep=True)
-    return loader.construct_scalar(node)
-
-
-def _yaml(where: str, content: bytes) -> Mapping[str, Any]:
-    """Parse a YAML file whose tags are ignored, as OpenCV's of matrices. Raises ``InputError``, whose message begins with
-    ``where``.
-    """
-    try:
-        text = re.sub(r"\A\s*%YAML.*\n", "", content.decode("utf-8-sig"))
-        values = next(iter(yaml.load_all(text, Loader=_Loader)), None)
-    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"is not YAML ({reason})", where=where, expected=EXPECTED) from error
-    if not isinstance(values, Mapping):
-        raise InputError(where=where, expected=EXPECTED)
-    return values
 
 
 def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:

@@ -37,6 +37,7 @@ class StoredCamera:
     moved_pixels: float | None = None  # median shift (pixels) of the image's points due to the refinement
     # of the camera from the first row to the last, if refinement estimated it
     motion: RowMotion | None = None
+    file: str | None = None  # image file, relative to the folder of its dataset, if known
 
     @property
     def pose(self) -> SE3:

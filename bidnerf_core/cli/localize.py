@@ -139,7 +139,7 @@ class Localize:
             finder: Localizer | MapCollection = collection
             answers, source = (
                 Answers(collection),
-                self.queries.open(paths, images, "black", collection.cameras),
+                self.queries.open(paths, images, None, collection.cameras),
             )
         else:
             scene = load_map(maps[0])

@@ -65,7 +65,7 @@ class QueryOptions:
             )
 
     def open(
-        self, paths: Sequence[Path], images: DatasetOptions, background: Background, assumed: Sequence[Intrinsics],
+        self, paths: Sequence[Path], images: DatasetOptions, background: Background | None, assumed: Sequence[Intrinsics],
         points: DepthPoints | None = None,
     ) -> QuerySource:  # fmt: skip
         """Return the queries for the QUERY arguments: image files and folders of them, or one dataset.

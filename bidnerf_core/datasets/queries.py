@@ -94,7 +94,7 @@ class Photos:
         depth: Mapping[Path, Path] | None = None,
         depth_unit: float | None = None,
         sensor: DepthCamera | None = None,
-        background: Background = "black",
+        background: Background | None = None,
         points: DepthPoints | None = None,
         masks: MaskFolder | None = None,
     ) -> None:

@@ -104,6 +104,9 @@ class Frame:
     orientation: Orientation = UPRIGHT
     """How the image in its file was turned upright on reading."""
 
+    awaits_background: bool = False
+    """Whether ``rgb`` is black behind transparent pixels only until a map is known, whose background then lies there."""
+
     def __post_init__(self) -> None:
         self._check(IMAGES)
 
@@ -157,7 +160,7 @@ class Frame:
         hfov: float | None = None,
         assumed: Sequence[Intrinsics] = (),
         depth_unit: float | None = None,
-        background: Background = BLACK,
+        background: Background | None = None,
         largest: int | None = None,
         mask: str | Path | None = None,
         mask_hides: HiddenColour = "black",
@@ -176,7 +179,7 @@ class Frame:
         unit, 0.001 m is assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists
         values that mean "nothing measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become
         0. Depth at another resolution is resampled to the nearest measurement. ``background`` (rgb in [0, 1],
-        "white" or "black") lies behind transparent pixels. If the longer side exceeds ``largest`` pixels, the
+        "white" or "black") lies behind transparent pixels, by default that of the map in which the frame is localized. If the longer side exceeds ``largest`` pixels, the
         image is downscaled to that size. ``mask`` is an image whose black pixels (white ones with
         ``mask_hides="white"``) are ignored: they become ``hidden``.
 
@@ -197,13 +200,13 @@ class Frame:
         depth: str | Path | None = None,
         depth_unit: float | None = None,
         sensor: DepthCamera | None = None,
-        background: Background = BLACK,
+        background: Background | None = None,
         largest: int | None = None,
         mask: str | Path | None = None,
         mask_hides: HiddenColour = "black",
     ) -> Frame:
         """Read a photo as ``open`` does; depth is registered to it from ``sensor``, if given."""
-        path, behind = Path(path), background_colour(background)
+        path, behind = Path(path), BLACK if background is None else background_colour(background)
         header, exif = read_header(path), read_exif(path)
         raster = Raster(header.width, header.height, exif.orientation)
         found = camera.find(path, raster, exif)
@@ -233,6 +236,7 @@ class Frame:
             camera_source=found.description,
             focal_is_approximate=found.approximate,
             orientation=exif.orientation,
+            awaits_background=background is None and alpha is not None,
         )
 
     @staticmethod
@@ -265,6 +269,14 @@ class Frame:
         hidden = hidden if hidden is not None and bool(hidden.any()) else None
         return Frame(name, rgb, intrinsics, depth, alpha, hidden=hidden, **about)  # type: ignore[arg-type]
 
+    def over(self, background: tuple[float, float, float]) -> Frame:
+        """Return the frame with ``background`` (rgb in [0, 1]) behind transparent pixels, if it awaits one; else the frame itself."""
+        if not self.awaits_background or self.alpha is None:
+            return self
+        uncovered = (1 - self.alpha)[..., None]
+        rgb = self.rgb + uncovered * uncovered.new_tensor(background)
+        return self.replace(rgb=rgb.clamp(0, 1), awaits_background=False)
+
     def with_hidden(self, hidden: Bool[Tensor, "h w"] | None) -> Frame:
         """Return the frame with more pixels hidden; the frame itself if ``hidden`` is None or false
         everywhere.
@@ -285,13 +297,14 @@ class Frame:
         alpha: np.ndarray | Tensor | None = None,
         hidden: np.ndarray | Tensor | None = None,
         name: str = "image",
-        background: Background = BLACK,
+        background: Background | None = None,
     ) -> Frame:
         """Build a frame from NumPy arrays or torch tensors.
 
         ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a
         second or fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are
-        straight (not premultiplied) and composited over ``background``. ``depth`` (planar z), ``depth_unit``
+        straight (not premultiplied) and composited over ``background``, by default that of the map in which the
+        frame is localized. ``depth`` (planar z), ``depth_unit``
         and the scaling of ``camera`` are as in ``open``. ``hidden`` (h, w) holds booleans, true where a pixel
         is to be ignored.
 
@@ -335,11 +348,12 @@ class Frame:
             metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
             if remark := measured.remark(depth_unit is None):
                 warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
-        laid = over(colour, cover, background_colour(background))
+        laid = over(colour, cover, BLACK if background is None else background_colour(background))
         unused = None if hidden is None else torch.as_tensor(hidden)
         if unused is not None and unused.dtype == torch.bool and not bool(unused.any()):
             unused = None
-        return Frame(name, laid, intrinsics, metres, cover, hidden=unused)
+        awaits = background is None and cover is not None
+        return Frame(name, laid, intrinsics, metres, cover, hidden=unused, awaits_background=awaits)
 
     def replace(self, **changes: Any) -> Frame:
         """Return the frame with other attributes. Images that stay are neither converted nor checked again, as they
@@ -477,3 +491,8 @@ class View:
     def to(self, device: torch.device | str) -> View:
         """Return the view with its images and its pose on ``device``."""
         return moved(self, device)
+
+    def over(self, background: tuple[float, float, float]) -> View:
+        """Return the view with ``background`` behind the frame, see ``Frame.over``."""
+        frame = self.frame.over(background)
+        return self if frame is self.frame else replace(self, frame=frame)

@@ -60,3 +60,4 @@ from .tensors import read_tensors_and_metadata as read_tensors_and_metadata
 from .torch_files import check_sizes as check_sizes
 from .torch_files import outline_of as outline_of
 from .torch_files import read_saved as read_saved
+from .yaml import parse_yaml as parse_yaml

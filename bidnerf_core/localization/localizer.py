@@ -111,7 +111,8 @@ class Localizer:
         Unlike there, ``start`` is in the map's own coordinates, see ``Map.origin``, as is the answer of ``solved``.
         """
         T_world_camera = None if start is None else start_pose(start)
-        return rig(self.scene, _views(query), T_world_camera, depth_rays, self.matcher)
+        views = [view.over(self.scene.bounds.background) for view in _views(query)]
+        return rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
 
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer."""

@@ -37,6 +37,7 @@ from .landmarks.image_keypoints import measured_depth as measured_depth
 from .landmarks.keypoint_depth import depth_ratio as depth_ratio
 from .landmarks.landmark_map import HeldOutTrial as HeldOutTrial
 from .landmarks.landmark_map import LandmarkMap as LandmarkMap
+from .landmarks.landmark_map import Tracks as Tracks
 from .landmarks.landmark_map import concatenated as concatenated
 from .landmarks.tracks import LEAST_BASELINE as LEAST_BASELINE
 from .landmarks.tracks import TrackedKeypoints as TrackedKeypoints

@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.fields import LARGEST_LENGTH, VoxelGrid
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import COLOUR_ROUNDING
-from bidnerf_core.mapping.landmarks.landmark_map import PER_LANDMARK, HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.landmarks.landmark_map import PER_LANDMARK, HeldOutTrial, LandmarkMap, Tracks
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, Surfels
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
 
@@ -51,6 +51,12 @@ LANDMARK_KINDS: Kinds = {
     "trial": ((4,), torch.float64),  # the fields of ``HeldOutTrial`` in order
     "moving": ((), torch.float64),
 }
+TRACK_KINDS: Kinds = {
+    "track_landmark": ((-1,), torch.int32),
+    "track_image": ((-1,), torch.int32),
+    "track_pixel": ((-1, 2), torch.float32),
+}
+"""Optional: earlier versions stored no tracks."""
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
@@ -144,6 +150,8 @@ def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
     """Return copies of the tensors of ``landmarks``, by name and in the dtypes of ``LANDMARK_KINDS``."""
     values = {name: getattr(landmarks, name) for name in LANDMARK_KINDS} | {"trial": astuple(landmarks.trial)}
     found = {name: torch.as_tensor(values[name], dtype=kind) for name, (_, kind) in LANDMARK_KINDS.items()}
+    if (tracks := landmarks.tracks) is not None:
+        found |= dict(zip(TRACK_KINDS, (tracks.landmark, tracks.image, tracks.pixel), strict=True))
     return {name: value.contiguous().clone() for name, value in found.items()}
 
 
@@ -158,6 +166,14 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
     parts |= {name: float(tensors[name]) for name in ("noise", "correlation", "usual_matches", "moving")}
     images, found, translation, rotation_deg = tensors["trial"].tolist()
     parts["trial"] = HeldOutTrial(int(images), int(found), translation, rotation_deg)
+    if TRACK_KINDS.keys() <= tensors.keys():
+        check_kinds(tensors, TRACK_KINDS)
+        check_range(tensors, "track_landmark", 0, len(tensors["positions"]) - 1)
+        check_range(tensors, "track_image", 0, 2**31)
+        tracks = Tracks(*(tensors[name] for name in TRACK_KINDS))
+        if not len(tracks.landmark) == len(tracks.image) == len(tracks.pixel):
+            raise ValueError("the tensors of tracks have different lengths")
+        parts["tracks"] = tracks
     return LandmarkMap(**parts)
 
 

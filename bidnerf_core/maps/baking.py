@@ -7,6 +7,8 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
+
 from bidnerf_core.captures import (
     CaptureReport,
     UpDirection,
@@ -108,6 +110,10 @@ def bake_landmarks(
         # except for some wrong ones, their errors are negligible.
         by_source = update_scatter(pose_updates(info.cameras))
         landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
+        if views:
+            landmarks = with_tracks_in(info, landmarks, [view.frame.name for view in views])
+        else:
+            landmarks = replace(landmarks, tracks=None)  # in rendered images, which are not stored
         trial = landmarks.trial
         info = replace(info, colour_noise=noise, landmark_source=source, landmark_features=landmarks.features)
         log.info(
@@ -118,6 +124,15 @@ def bake_landmarks(
     for line in [] if capture is None else summary(capture):
         log.info(line)
     return info, landmarks, capture
+
+
+def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:
+    """Return landmarks that were built from images with these names, with tracks in the images of the map."""
+    if landmarks.tracks is None:
+        return landmarks
+    numbers = {camera.name: number for number, camera in enumerate(info.cameras)}
+    images = torch.tensor([numbers.get(name, -1) for name in names])
+    return replace(landmarks, tracks=landmarks.tracks.renumbered(images=images))
 
 
 def check_same_scene(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:

@@ -47,9 +47,9 @@ from bidnerf_core.mapping import (
     concatenated,
     tracked_views,
 )
-from bidnerf_core.maps.baking import bake_landmarks
+from bidnerf_core.maps.baking import bake_landmarks, with_tracks_in
 from bidnerf_core.maps.checkpoints import Checkpoints
-from bidnerf_core.maps.description import load_info, longest_side
+from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
@@ -198,6 +198,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
         raise InputError(f"none of {amount(len(unread), 'photo')} can be read: {unread[0][1]}")
     if not frames:
         raise InputError("no photos to add", expected="at least one")
+    frames = [frame.over(scene.bounds.background) for frame in frames]
     return [frame if side is None else frame.at_most(side) for frame in frames], unread
 
 
@@ -271,7 +272,7 @@ def _extended(
         info, landmarks, record = bake_landmarks(info, grown.field, seeing, where, tracked, grown.up)
         grown = replace(grown, info=info, record=record)
     else:
-        landmarks = _more_landmarks(scene.landmarks, tracked)
+        landmarks = _more_landmarks(info, scene.landmarks, tracked, [view.frame.name for view in new])
     grown = grown.with_parts(None, landmarks or scene.landmarks)
     before, after = (0 if m.landmarks is None else len(m.landmarks) for m in (scene, grown))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")
@@ -362,10 +363,12 @@ def _surface(scene: Map, views: Sequence[View], config: BakeConfig) -> SurfaceMa
         return None
 
 
-def _more_landmarks(landmarks: LandmarkMap | None, tracked: TrackedViews) -> LandmarkMap | None:
-    """Return the landmarks of a map plus those of new photos that it lacks."""
+def _more_landmarks(
+    info: MapInfo, landmarks: LandmarkMap | None, tracked: TrackedViews, names: Sequence[str]
+) -> LandmarkMap | None:
+    """Return the landmarks of a map plus those of new photos, called ``names``, that it lacks."""
     try:
-        more = tracked.landmarks(DEFAULT_LANDMARKS)
+        more = with_tracks_in(info, tracked.landmarks(DEFAULT_LANDMARKS), names)
     except InputError as error:  # one photo, or photos without overlap
         log.info(f"no new landmarks: {error}")
         return landmarks

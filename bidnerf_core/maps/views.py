@@ -134,6 +134,7 @@ def read_views(
         if not views:
             raise InputError("data holds no views", expected="at least one")
         colour = BLACK if background is None else background_colour(background)
+        views = [view.over(colour) for view in views]
         read = ReadViews(views, "", "views in memory", colour, unit=_unit_of(views))
     hidden = [view.frame.hidden for view in read.views]
     if (sentence := masks_sentence(hidden)) is not None:

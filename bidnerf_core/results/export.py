@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +21,13 @@ from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.localization import origin_of
+from bidnerf_core.mapping import LandmarkMap, Tracks
 from bidnerf_core.maps import Map
 from bidnerf_core.registry import Plugins, interface_defects
-from bidnerf_core.results.colmap_poses import write_colmap_poses
+from bidnerf_core.results.colmap_poses import write_colmap_model
 from bidnerf_core.results.pose_files import PosedImage, frame_of, transforms_json
+
+log = logging.getLogger("bidnerf")
 
 GREY = 0.5
 """Colour of landmarks in a map without a surface."""
@@ -50,13 +55,15 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
       each) and cameras.ply (a pyramid for each camera), and cameras.json (the cameras as 3D Gaussian splatting writes them, from which
       ``import`` looks at the surface);
-    - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks, without tracks;
+    - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks with the keypoints that they were
+      built from as tracks;
     - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
 
     These use the world and unit of the map, which their headers state, in double precision where it has an origin of its own;
-    installed exporters may write its own coordinates, see ``Map.origin``. Images are named as in the map, without file
-    extensions. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
+    installed exporters may write its own coordinates, see ``Map.origin``. Images are named by their files: relative to the folder
+    of the dataset or, for COLMAP, to the folder that contains all of them. Cameras are those of the images as the map uses
+    them, upright and perhaps downscaled. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
     export, and for a folder that is not empty unless ``overwrite`` is set.
     """
     if to not in EXPORTERS:
@@ -97,11 +104,46 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
 
 
 def export_colmap(scene: Map, out: Path) -> list[Path]:
-    """A text model of COLMAP: the cameras, with the landmarks as its points."""
-    write_colmap_poses(out / "images.txt", _needed_images(scene, "colmap"))
-    points = out / "points3D.txt"
-    write_file(points, points.read_bytes() + _colmap_points(scene))
-    return [out / "cameras.txt", out / "images.txt", points]
+    """A text model of COLMAP: the cameras, with the landmarks as its points, and the keypoints that they were built from."""
+    images, landmarks = _needed_images(scene, "colmap"), scene.landmarks
+    files = [image.name for image in images]
+    folder = os.path.commonpath([os.path.dirname(name) for name in files])
+    images = [replace(image, name=os.path.relpath(image.name, folder or ".")) for image in images]
+    points, keypoints = list[str](), list[list[str]]()
+    if landmarks is not None:
+        tracks = [list[str]() for _ in range(len(landmarks))]
+        keypoints = [list[str]() for _ in images]
+        errors, seen = np.full(len(landmarks), landmarks.noise), landmarks.tracks
+        if seen is not None:
+            errors = _reprojection_errors(scene, landmarks, seen)
+            rows = zip(seen.landmark.tolist(), seen.image.tolist(), seen.pixel.tolist(), strict=True)
+            for landmark, image, (u, v) in rows:
+                tracks[landmark].append(f" {image + 1} {len(keypoints[image])}")
+                keypoints[image].append(f"{u:.6g} {v:.6g} {landmark + 1}")
+        else:
+            log.info(f"{scene.name}: its landmarks have no tracks; 'bidnerf bake MAP --data DATA' finds them")
+        colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
+        places = _in_world(scene, landmarks.positions).tolist()
+        digits = 16 if any(scene.origin) else 9
+        points = [
+            f"{number + 1} {x:.{digits}g} {y:.{digits}g} {z:.{digits}g} {r} {g} {b} {errors[number]:.3f}{''.join(tracks[number])}"
+            for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, colours, strict=True))
+        ]
+    write_colmap_model(out / "images.txt", images, points, keypoints or None)
+    return [out / "cameras.txt", out / "images.txt", out / "points3D.txt"]
+
+
+def _reprojection_errors(scene: Map, landmarks: LandmarkMap, tracks: Tracks) -> np.ndarray:
+    """Return the mean distance (pixels) of the keypoints of each landmark from its projections."""
+    total, count = np.zeros(len(landmarks)), np.zeros(len(landmarks))
+    for number, camera in enumerate(scene.info.cameras):
+        own = tracks.image == number
+        seen = tracks.landmark[own].long()
+        local = camera.pose.inverse().apply(landmarks.positions[seen].double())
+        error = (camera.intrinsics.project(local) - tracks.pixel[own].double()).norm(dim=-1)
+        np.add.at(total, seen.numpy(), error.numpy())
+        np.add.at(count, seen.numpy(), 1)
+    return np.where(count > 0, total / np.maximum(count, 1), landmarks.noise)
 
 
 def export_transforms(scene: Map, out: Path) -> list[Path]:
@@ -118,7 +160,11 @@ def export_transforms(scene: Map, out: Path) -> list[Path]:
 def _images(scene: Map) -> list[PosedImage]:
     return [
         PosedImage(
-            camera.name, number, camera.intrinsics, camera.pose.translated(origin_of(scene)), unit=scene.unit
+            camera.file or camera.name,
+            number,
+            camera.intrinsics,
+            camera.pose.translated(origin_of(scene)),
+            unit=scene.unit,
         )
         for number, camera in enumerate(scene.info.cameras)
     ]
@@ -200,19 +246,6 @@ def _colours(scene: Map) -> Float[Tensor, "n 3"]:
     if scene.surface is None:
         return torch.full((len(landmarks), 3), GREY)
     return scene.surface.surfels.rgb[scene.surface.nearest(landmarks.positions)]
-
-
-def _colmap_points(scene: Map) -> bytes:
-    if scene.landmarks is None:
-        return b""
-    colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
-    places = _in_world(scene, scene.landmarks.positions).tolist()
-    digits = 16 if any(scene.origin) else 9
-    lines = [
-        f"{number} {x:.{digits}g} {y:.{digits}g} {z:.{digits}g} {r} {g} {b} {scene.landmarks.noise:.3f}\n"
-        for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, colours, strict=True), start=1)
-    ]
-    return "".join(lines).encode()
 
 
 def _pyramids(images: list[PosedImage], length: float) -> tuple[Float[Tensor, "v 3"], np.ndarray]:

@@ -44,6 +44,7 @@ def overlay(
         raise InputError(
             f"frame is a {type(frame).__name__}", where="overlay", expected="a Frame, such as that of a View"
         )
+    frame = frame.over(scene.bounds.background)
     if isinstance(found, Localization):
         frame, found = found.frame_as_taken(frame), found.T_world_camera
     begun = None if start is None else start_pose(start)

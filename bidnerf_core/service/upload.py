@@ -35,7 +35,7 @@ class Upload:
         return int(self.parameters.get("seed") or 0)
 
     def read(
-        self, usual: CameraSource, background: Background, folder: Path, max_pixels: float
+        self, usual: CameraSource, background: Background | None, folder: Path, max_pixels: float
     ) -> tuple[Photos, SE3 | None]:
         """Write the files into ``folder``, check the sizes in their headers, and return the photo and the start.
 

@@ -14,7 +14,6 @@ from typing import Any
 
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import BLACK
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
@@ -131,7 +130,7 @@ class Worker:
 
     def _placed(self, maps: MapCollection, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
         """Localize a photo in the map that it shows; return the answer and its JSON values, with that map."""
-        photos, start = upload.read(CameraSource(assumed=maps.cameras), BLACK, folder, self.max_pixels)
+        photos, start = upload.read(CameraSource(assumed=maps.cameras), None, folder, self.max_pixels)
         if start is not None:
             raise InputError("start was given without map", expected=f"map as one of {', '.join(self.maps)}")
         answers = localize_each(maps, photos, seed=upload.seed)

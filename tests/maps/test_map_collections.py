@@ -66,6 +66,27 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
         assert torch.equal(found.found.T_world_camera.matrix(), alone.T_world_camera.matrix())
 
 
+def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], tmp_path: Path) -> None:
+    """Of whichever map a photo is tried in, and unless the user names another."""
+    rgb, alpha = photo(SEEDS[0]).frame.rgb.numpy(), np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
+    alpha[: CAMERA.height // 2] = 1.0
+    rgba = (255 * np.concatenate([rgb, alpha], axis=-1)).round().astype(np.uint8)
+    iio.imwrite(tmp_path / "cut.png", rgba)
+    for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.25)):
+        info = replace(grounds[0].info, bounds=replace(BOUNDS, background=background))
+        localizer = bn.Localizer(replace(grounds[0], info=info), warm_up=False)
+        behind = (alpha * rgb + (1 - alpha) * np.float32(background))[-1, -1]
+        for frame in (
+            bn.Frame.open(tmp_path / "cut.png", camera=CAMERA),
+            bn.Frame.from_numpy(rgba, CAMERA),
+            bn.Frame.open(tmp_path / "cut.png", camera=CAMERA, background=background),
+        ):
+            (seen,) = localizer.problem(frame).views
+            np.testing.assert_allclose(seen.frame.rgb[-1, -1], behind, atol=1 / 255)
+    white = bn.Frame.open(tmp_path / "cut.png", camera=CAMERA, background="white")
+    assert float(bn.Localizer(grounds[0], warm_up=False).problem(white).views[0].frame.rgb[-1, -1].min()) == 1
+
+
 @pytest.mark.slow
 def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
     """Under the names by which the maps are served, and with the localizers that serve them."""

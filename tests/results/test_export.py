@@ -23,9 +23,10 @@ from refusals import refused
 @pytest.fixture(scope="module")
 def scene() -> Map:
     known = textured_map(surface=True)
-    info = MapInfo(
-        "ground", {}, BOUNDS, 1, True, "ground", weights="w", cameras=stored_cameras(training_views()), unit="metres"
-    )  # fmt: skip
+    cameras = tuple(
+        replace(camera, file=f"images/{camera.name}.JPG") for camera in stored_cameras(training_views())
+    )
+    info = MapInfo("ground", {}, BOUNDS, 1, True, "ground", weights="w", cameras=cameras, unit="metres")
     return Map(info, known.field, known.surface, known.landmarks)
 
 
@@ -69,13 +70,51 @@ def test_transforms_json_is_read_again(scene: Map, tmp_path: Path) -> None:
 
 
 def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
+    """With the keypoints that the landmarks were built from, which lie near their projections."""
     pycolmap = pytest.importorskip("pycolmap")
     bn.export_map(scene, tmp_path / "out", "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    landmarks = scene.landmarks
+    assert landmarks is not None
+    assert landmarks.tracks is not None
+    assert len(model.points3D) == len(landmarks)
+    np.testing.assert_allclose(model.points3D[1].xyz, landmarks.positions[0], atol=1e-6)
+    assert {image.name for image in model.images.values()} == {
+        f"{camera.name}.JPG" for camera in scene.info.cameras
+    }
+    assert [model.points3D[n + 1].track.length() for n in range(len(landmarks))] == landmarks.views.tolist()
+    assert model.compute_num_observations() == len(landmarks.tracks.landmark)
+    first = model.points3D[1]
+    seen = first.track.elements[0]
+    image = model.images[seen.image_id]
+    keypoint = image.points2D[seen.point2D_idx]
+    assert keypoint.point3D_id == 1
+    assert np.linalg.norm(image.project_point(first.xyz) - keypoint.xy) < 5 * landmarks.noise
+    stated = np.mean([point.error for point in model.points3D.values()])
+    model.update_point_3d_errors()
+    computed = np.mean([point.error for point in model.points3D.values()])
+    assert stated == pytest.approx(computed, rel=0.02)
+    assert computed < 3 * landmarks.noise
+
+
+def test_names_that_would_break_a_row_are_escaped(scene: Map, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    first, *others = scene.info.cameras
+    odd = replace(scene, info=replace(scene.info, cameras=(replace(first, file="a\nb\x1b.jpg"), *others)))
+    bn.export_map(odd, tmp_path / "out", "colmap")
+    assert b"\x1b" not in (tmp_path / "out" / "images.txt").read_bytes()
+    model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    assert len(model.images) == len(scene.info.cameras)
+    assert model.images[1].name.endswith("a\\nb\\x1b.jpg")
+
+
+def test_landmarks_without_tracks_are_points_alone(scene: Map, tmp_path: Path) -> None:
+    """As in maps that earlier versions stored, and in those whose landmarks come from rendered images."""
+    pycolmap = pytest.importorskip("pycolmap")
     assert scene.landmarks is not None
-    assert len(model.points3D) == len(scene.landmarks)
-    np.testing.assert_allclose(model.points3D[1].xyz, scene.landmarks.positions[0], atol=1e-6)
-    assert model.images[1].name == scene.info.cameras[0].name
+    bn.export_map(replace(scene, landmarks=replace(scene.landmarks, tracks=None)), tmp_path / "out", "colmap")
+    model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    assert (len(model.points3D), model.compute_num_observations()) == (len(scene.landmarks), 0)
 
 
 def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:

@@ -95,6 +95,7 @@ class Tracker:
         """
         began = clocks.perf_counter()
         clock, seconds = self._state.clock.step(time)
+        frame = frame.over(self.localizer.scene.bounds.background)
         image = grey_image(frame.rgb) if frame.has_colour else None
         state = replace(self._state, clock=clock, frames=self._state.frames + 1)
         stated, frame = frame, frame if state.camera is None else state.camera.corrected(frame)

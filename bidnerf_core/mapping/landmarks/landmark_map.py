@@ -36,6 +36,24 @@ class HeldOutTrial:
 
 
 @dataclass(frozen=True, eq=False)
+class Tracks:
+    """The keypoints of a map's images from which its landmarks were built."""
+
+    landmark: Int[Tensor, "m"]  # number of the landmark, int32
+    image: Int[Tensor, "m"]  # number of the image among the cameras of the map, int32
+    pixel: Float[Tensor, "m 2"]  # in the image
+
+    def renumbered(
+        self, landmarks: Int[Tensor, "n"] | None = None, images: Int[Tensor, "v"] | None = None
+    ) -> Tracks:
+        """Return the tracks with other numbers, given for each number so far; keypoints whose number is -1 are dropped."""
+        landmark = self.landmark if landmarks is None else landmarks.int()[self.landmark.long()]
+        image = self.image if images is None else images.int()[self.image.long()]
+        known = (landmark >= 0) & (image >= 0)
+        return Tracks(landmark[known], image[known], self.pixel[known])
+
+
+@dataclass(frozen=True, eq=False)
 class LandmarkMap:
     """Points in the world frame (metres) with descriptors."""
 
@@ -67,12 +85,19 @@ class LandmarkMap:
     )
     cameras: tuple[Intrinsics, ...] = ()  # of the images, where known
     features: str = USUAL_FEATURES  # name of the detector of the keypoints; "" if it has none
+    tracks: Tracks | None = None  # None in maps that earlier versions stored
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def __getitem__(self, index: Tensor) -> LandmarkMap:
-        return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
+        tracks = self.tracks
+        if tracks is not None:
+            chosen = torch.arange(len(self))[index.cpu()]
+            numbers = torch.full((len(self),), -1)
+            numbers[chosen] = torch.arange(len(chosen))
+            tracks = tracks.renumbered(numbers.to(tracks.landmark.device))
+        return replace(self, tracks=tracks, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
 
     def scaled(self, factor: float) -> LandmarkMap:
         """Return the landmarks with lengths multiplied by ``factor``."""
@@ -154,4 +179,14 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
     """Return the landmarks of all ``maps`` (descriptors of the same length), with the other fields of the first map."""
     joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
+    tracks, first = list[Tracks](), 0
+    for m in maps:
+        if m.tracks is not None:
+            tracks.append(m.tracks.renumbered(torch.arange(len(m)) + first))
+        first += len(m)
+    if tracks:
+        parts = (
+            torch.cat([getattr(part, name) for part in tracks]) for name in ("landmark", "image", "pixel")
+        )
+        joined["tracks"] = Tracks(*parts)
     return replace(maps[0], **joined)

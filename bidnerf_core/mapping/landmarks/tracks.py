@@ -17,7 +17,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.landmarks.features import MANY, byte_of_zero, squared_distances
 from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, Tracks
 
 EPIPOLAR_BAND = 2.0
 """Maximum distance (pixels) of a match from the epipolar line."""
@@ -226,6 +226,11 @@ class TrackedKeypoints:
         return torch.cat([p.keypoints.sizes for p in self.images])[self.number]
 
     @property
+    def pixels(self) -> Float[Tensor, "m 2"]:
+        """The places of the keypoints in their images."""
+        return torch.cat([p.keypoints.pixels for p in self.images])[self.number]
+
+    @property
     def depth(self) -> Float[Tensor, "m"]:
         """The depth measured at each keypoint, metres; 0 where none was measured."""
         return torch.cat([p.depth for p in self.images])[self.number]
@@ -263,6 +268,7 @@ def fused_landmarks(
         torch.bincount(sightings.point, minlength=count).int(),
         noise,
         torch.zeros((6, 6), dtype=torch.float64),
+        tracks=Tracks(sightings.point.int(), sightings.view.int(), observations.pixels.float()),
     )
 
 
@@ -275,8 +281,7 @@ def seen_landmarks(
     distance = torch.linalg.vector_norm(away, dim=-1)
     ray = away / distance[:, None].clamp(min=1e-300)
     variance = (ray[:, None] @ covariance[sightings.point] @ ray[..., None])[:, 0, 0]
-    pixels = torch.cat([p.keypoints.pixels for p in observations.images])[observations.number]
-    parts = pixels.float(), distance.float(), variance.clamp(min=0).sqrt().float()
+    parts = observations.pixels.float(), distance.float(), variance.clamp(min=0).sqrt().float()
     return [SeenLandmarks(*(part[image == i] for part in parts)) for i in range(len(observations.images))]
 
 

@@ -238,6 +238,34 @@ def glb(g: Gaussians, **node: object) -> bytes:
     return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
+def with_nodes(content: bytes, nodes: list[dict[str, object]]) -> bytes:
+    """Return a .glb with other nodes."""
+    (length,) = struct.unpack_from("<I", content, 12)
+    text = json.dumps(json.loads(content[20 : 20 + length]) | {"nodes": nodes}).encode()
+    text += b" " * (-len(text) % 4)
+    rest = struct.pack("<II", len(text), 0x4E4F534A) + text + content[20 + length :]
+    return b"glTF" + struct.pack("<II", 2, 12 + len(rest)) + rest
+
+
+def test_nodes_of_a_gltf_take_time_and_memory_in_proportion_to_the_file(tmp_path: Path, some: Some) -> None:
+    path, content = tmp_path / "a.glb", glb(some(3))
+    count = 20_000
+    chain: list[dict[str, object]] = [
+        {"children": [number + 1], "translation": [1, 0, 0]} for number in range(count)
+    ]
+    path.write_bytes(with_nodes(content, [*chain, {"mesh": 0}]))
+    shift = torch.tensor([float(count), 0, 0])
+    torch.testing.assert_close(read_gaussians(path).means, some(3).means + shift)
+    path.write_bytes(with_nodes(content, [*chain, {"mesh": 0, "children": [0]}]))
+    with pytest.raises(InputError, match="its nodes are children of themselves"):
+        read_gaussians(path)
+    path.write_bytes(with_nodes(content, [{"mesh": 0}] * 16))
+    assert len(read_gaussians(path)) == 48
+    path.write_bytes(with_nodes(content, [{"mesh": 0}] * 17))
+    with pytest.raises(InputError, match="its nodes show 51 Gaussians, 3 of them different"):
+        read_gaussians(path)
+
+
 def test_gltf(tmp_path: Path, some: Some) -> None:
     path = tmp_path / "a.glb"
     path.write_bytes(glb(some(10, 2)))

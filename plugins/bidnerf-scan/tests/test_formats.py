@@ -35,16 +35,35 @@ def test_meshes_with_colours(tmp_path: Path) -> None:
         assert np.allclose(scan.rgb[scan.faces], BYTES[FACES][..., :3] / 255, atol=2e-3)
 
 
-def test_a_mesh_that_countless_nodes_place_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("bidnerf_scan.formats.by_trimesh.MOST_POINTS", 100)
-    scene, box = trimesh.Scene(), trimesh.creation.box()
-    for number in range(20):
-        scene.add_geometry(box, node_name=f"{number}", geom_name="box")
+def test_a_mesh_that_countless_nodes_place_is_refused(tmp_path: Path) -> None:
+    scene = trimesh.Scene({"box": trimesh.creation.box()})
+    for number in range(19):
+        scene.graph.update(frame_to=f"{number}", geometry="box")
     scene.export(tmp_path / "many.glb")
-    with pytest.raises(InputError, match=r"many\.glb: its nodes place \d+ points, expected at most 100"):
+    with pytest.raises(InputError, match=r"many\.glb: its nodes place 160 points, expected at most 128"):
         read_scan(tmp_path / "many.glb")
+
+
+def test_a_chain_of_countless_nodes_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "chain.gltf").write_text(
+        json.dumps(
+            {"asset": {"version": "2.0"}, "nodes": [{"children": [n + 1]} for n in range(5000)] + [{}]}
+        )
+    )
+    with pytest.raises(InputError, match="nodes below each other"):
+        read_scan(tmp_path / "chain.gltf")
+
+
+def test_no_file_outside_of_the_folder_is_opened(tmp_path: Path) -> None:
+    inside = tmp_path / "scan"
+    inside.mkdir()
+    (tmp_path / "secret.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    (inside / "own.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n"
+    for name, is_red in (("own.mtl", True), ("../secret.mtl", False), (str(tmp_path / "secret.mtl"), False)):
+        (inside / "a.obj").write_text(f"mtllib {name}\n{corners}")
+        rgb = read_scan(inside / "a.obj").rgb
+        assert (rgb is not None and rgb[0].tolist() == [1, 0, 0]) == is_red
 
 
 def test_a_gltf_is_placed_by_its_nodes(tmp_path: Path) -> None:

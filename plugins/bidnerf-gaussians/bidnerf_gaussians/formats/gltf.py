@@ -4,6 +4,7 @@ accompanying files.
 
 from __future__ import annotations
 
+import functools
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 LARGEST_HEADER = 1 << 20
 """Number of bytes of a file that are searched for the name of the extension."""
+MOST_COPIES = 16
+"""Nodes that show each mesh, on average: a file of any size could place a mesh any number of times."""
 UNEVEN = 1e-3
 """Relative difference between a node's scales along its axes up to which they count as equal."""
 
@@ -38,7 +41,7 @@ def recognises(path: Path) -> bool:
         return EXTENSION.encode() in file.read(LARGEST_HEADER)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Scene:
     """The content of a file."""
 
@@ -46,6 +49,7 @@ class _Scene:
     gltf: dict[str, Any]
     binary: bytes | None  # of a .glb
 
+    @functools.lru_cache(maxsize=1)  # accessor by accessor, files beside would be read again  # noqa: B019
     def buffer(self, number: int) -> bytes:
         entry = self.gltf["buffers"][number]
         uri = entry.get("uri")
@@ -92,12 +96,26 @@ def read(path: Path) -> Gaussians:
     """
     scene = _opened(path)
     try:
-        found = [
-            _placed(_gaussians(scene, primitive), matrix, path)
-            for mesh, matrix in _meshes(scene)
-            for primitive in mesh["primitives"]
-            if EXTENSION in primitive.get("extensions", {})
-        ]
+        shown = _shown_meshes(scene)
+        meshes = {
+            number: [
+                _gaussians(scene, primitive)
+                for primitive in scene.gltf["meshes"][number]["primitives"]
+                if EXTENSION in primitive.get("extensions", {})
+            ]
+            for number in dict.fromkeys(number for number, _ in shown)
+        }
+        stored, placed = (
+            sum(len(part) for number in numbers for part in meshes[number])
+            for numbers in (meshes, [number for number, _ in shown])
+        )
+        if placed > MOST_COPIES * stored:
+            raise InputError(
+                f"its nodes show {placed:,} Gaussians, {stored:,} of them different",
+                where=path,
+                expected=f"at most {MOST_COPIES} times as many",
+            )
+        found = [_placed(part, matrix, path) for number, matrix in shown for part in meshes[number]]
     except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
@@ -130,20 +148,21 @@ def _opened(path: Path) -> _Scene:
     return _Scene(path, gltf, binary)
 
 
-def _meshes(scene: _Scene) -> list[tuple[dict[str, Any], np.ndarray]]:
-    """Return the meshes that nodes show, with their transforms to the world."""
+def _shown_meshes(scene: _Scene) -> list[tuple[int, np.ndarray]]:
+    """Return the numbers of the meshes that nodes show, with the nodes' transforms to the world."""
     nodes = scene.gltf.get("nodes", [])
     parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
-    found = []
-    for number, node in enumerate(nodes):
-        if "mesh" not in node:
-            continue
-        matrix, at, seen = _local(node), parents.get(number), {number}
-        while at is not None and at not in seen:
-            matrix, seen = _local(nodes[at]) @ matrix, seen | {at}
+    worlds: dict[int | None, np.ndarray] = {None: np.eye(4)}
+    for start in range(len(nodes)):
+        chain, at = dict[int, None](), start
+        while at not in worlds:
+            if at in chain:
+                raise InputError("its nodes are children of themselves", where=scene.path)
+            chain[at] = None
             at = parents.get(at)
-        found.append((scene.gltf["meshes"][node["mesh"]], matrix))
-    return found
+        for number in reversed(chain):
+            worlds[number] = worlds[parents.get(number)] @ _local(nodes[number])
+    return [(node["mesh"], worlds[number]) for number, node in enumerate(nodes) if "mesh" in node]
 
 
 def _local(node: dict[str, Any]) -> np.ndarray:

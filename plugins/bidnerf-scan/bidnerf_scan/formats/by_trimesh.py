@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from bidnerf_core.errors import InputError
 from bidnerf_scan.scan import Scan, joined
 
-MOST_POINTS = 2 * 10**8
-"""Largest number of points over all nodes: a small mesh may be placed by any number of them."""
+MOST_POINTS, MOST_COPIES = 2 * 10**8, 16
+"""Points over all nodes, and in proportion to those of the meshes: a small mesh may be placed by any number of nodes."""
 MOST_TEXELS = 2 * 10**9
 
 
@@ -29,15 +29,17 @@ def read(path: Path, expected: str) -> Scan:
             warnings.simplefilter("ignore")
             scene = trimesh.load_scene(str(path), process=False)
             nodes = [(node, scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
-            count = sum(len(getattr(geometry, "vertices", ())) for _, geometry in nodes)
-            parts = [] if count > MOST_POINTS else [_placed(scene, node) for node, _ in nodes]
+            sizes = {id(geometry): len(getattr(geometry, "vertices", ())) for _, geometry in nodes}
+            count = sum(sizes[id(geometry)] for _, geometry in nodes)
+            most = min(MOST_POINTS, MOST_COPIES * sum(sizes.values()))
+            parts = [] if count > most else [_placed(scene, node) for node, _ in nodes]
     except (Exception, RecursionError) as error:  # trimesh raises whatever its parsing steps raise
         said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise InputError(
             f"not readable ({said[:200]})", where=path, expected=f"{expected}; is it truncated?"
         ) from error
-    if count > MOST_POINTS:
-        raise InputError(f"its nodes place {count:,} points", where=path, expected=f"at most {MOST_POINTS:,}")
+    if count > most:
+        raise InputError(f"its nodes place {count:,} points", where=path, expected=f"at most {most:,}")
     meshes = [part for part in parts if part.faces is not None and len(part.faces)]
     chosen = meshes or [part for part in parts if len(part.points)]
     if not chosen:

@@ -16,6 +16,8 @@ EXPECTED = "a glTF file of a mesh or of points"
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 SPLATS = "KHR_gaussian_splatting"
 LARGEST_JSON = 256 * 2**20
+DEEPEST = 200
+"""Nodes below each other; skeletons and assemblies have some tens."""
 BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
@@ -41,6 +43,7 @@ def read(path: Path) -> Scan:
             expected="glTF without compression (`gltf-transform copy` or Blender write it)",
         )
     _check_counts(path, content)
+    _check_depth(path, content)
     return by_trimesh.read(path, EXPECTED)
 
 
@@ -97,3 +100,19 @@ def _check_counts(path: Path, content: dict[str, Any]) -> None:
             raise InputError(
                 f"accessor {number} is not readable ({error!r})", where=path, expected=EXPECTED
             ) from error
+
+
+def _check_depth(path: Path, content: dict[str, Any]) -> None:
+    """Raise ``InputError`` for long chains of nodes, which trimesh follows again for each node."""
+    nodes = content.get("nodes") or []
+    try:
+        parents = {child: number for number, node in enumerate(nodes) for child in node.get("children") or ()}
+        for start in range(len(nodes)):
+            depth, at = 0, start
+            while at in parents:
+                depth, at = depth + 1, parents[at]
+                if depth > DEEPEST:
+                    found = f"has more than {DEEPEST} nodes below each other"
+                    raise InputError(found, where=path, expected="fewer")
+    except (TypeError, AttributeError) as error:
+        raise InputError(f"its nodes are not readable ({error!r})", where=path, expected=EXPECTED) from error
