@@ -95,7 +95,7 @@ class QueryOptions:
         self,
         paths: Sequence[Path],
         images: DatasetOptions,
-        background: Background,
+        background: Background | None,
         points: DepthPoints | None,
     ) -> QuerySource:
         from bidnerf_core.datasets import DatasetFrames
