@@ -87,13 +87,15 @@ class HashGridField(nn.Module):
         """Rename a stored state's tensors to the present names.
 
         In earlier versions the occupancy grid was called ``sampler``, and it observed no densities: only
-        contracted scenes need them, which did not exist then.
+        contracted scenes need them, which did not exist then. Raises ``InputError`` for infinite densities.
         """
         old = "sampler."
         state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
         for name in ("occupancy", "coarse_sampler"):
             if (peak := state.get(f"{name}.peak")) is not None:
                 state.setdefault(f"{name}.density", torch.zeros_like(peak))
+                if not bool(state[f"{name}.density"].isfinite().all()):
+                    raise InputError(f"tensor '{name}.density' holds infinity", expected="densities")
         return state
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:

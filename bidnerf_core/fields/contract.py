@@ -183,6 +183,10 @@ class SceneBounds:
             )
         if not self.footprint >= 0:
             raise InputError(f"footprint is {self.footprint}", where="scene bounds", expected="0 or more")
+        if not all(0 <= channel <= 1 for channel in self.background):
+            raise InputError(
+                f"background is {self.background}", where="scene bounds", expected="three numbers in [0, 1]"
+            )
         largest = max(map(abs, (*self.lower, *self.upper, self.far, self.footprint)))
         if not largest <= LARGEST_LENGTH:
             raise InputError(

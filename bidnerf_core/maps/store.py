@@ -193,7 +193,10 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
     Their names, shapes and values are checked against the field here, since torch's own message would take many lines.
     """
     if isinstance(field, UpgradingField):
-        tensors = field.upgraded_state(tensors)
+        try:
+            tensors = field.upgraded_state(tensors)
+        except InputError as error:
+            raise InputError(error, where=path) from error
     module = cast(nn.Module, field)
     expected = module.state_dict()
     for name, value in expected.items():

@@ -381,3 +381,10 @@ def test_todays_state_is_taken_as_it_is(field: HashGridField) -> None:
     upgraded = field.upgraded_state(state)
     assert upgraded.keys() == state.keys()
     assert all(torch.equal(upgraded[name], value) for name, value in state.items())
+
+
+def test_a_state_with_infinite_densities_is_refused(field: HashGridField) -> None:
+    state = {name: value.clone() for name, value in field.state_dict().items()}
+    state["coarse_sampler.density"].view(-1)[3] = torch.inf
+    with refused(found="tensor 'coarse_sampler.density' holds infinity", expected="densities"):
+        field.upgraded_state(state)
