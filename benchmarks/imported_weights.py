@@ -43,9 +43,8 @@ from bidnerf_core.evaluation import (
 from bidnerf_core.fields import levels, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.io import to_plain
-from bidnerf_core.maps import Map, load_map
+from bidnerf_core.maps import Map, import_map
 from bidnerf_core.results import CRITERIA, depth_to_rgb, tile
-from bidnerf_nerf_pytorch.command import main as import_command
 
 LEVELS = {"coarse": 0, "fine": 1}
 Cell = tuple[str, str]
@@ -62,13 +61,12 @@ def quick_name(given: argparse.Namespace) -> str:
 
 def imported(given: argparse.Namespace, folder: Path) -> tuple[Map, Map]:
     """Return the map as imported in the README, and one limited to the object's box with few samples per ray."""
-    box = ["--box", *(str(edge) for edge in given.box)]
-    quick = [*box, "--coarse-samples", str(given.samples[0]), "--fine-samples", str(given.samples[1])]
-    names = "plain", quick_name(given)
-    for name, options in zip(names, ([], quick), strict=True):
-        if import_command([str(given.checkpoint), "--out", str(folder / name), *options]):
-            raise SystemExit(1)
-    return load_map(folder / names[0]), load_map(folder / names[1])
+    quick = {"box": tuple(given.box), "coarse_samples": given.samples[0], "fine_samples": given.samples[1]}
+    plain, limited = (
+        import_map(given.checkpoint, folder / name, config, bake=False)
+        for name, config in (("plain", {}), (quick_name(given), quick))
+    )
+    return plain, limited
 
 
 def shrunk(frame: Frame) -> Frame:
