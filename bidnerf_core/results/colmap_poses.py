@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
-from bidnerf_core.camera import Intrinsics, colmap_model, read_exif
+from bidnerf_core.camera import Intrinsics, colmap_model
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import write_file
-from bidnerf_core.results.pose_files import PosedImage, as_stored, frame_of, require_finite
+from bidnerf_core.results.pose_files import PosedImage, frame_of
 
 HEAD = "# written by bidnerf"
 
@@ -32,11 +30,10 @@ def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
     folder = os.path.commonpath([file.resolve().parent for file in files]) if files else ""
     stored = list[PosedImage]()
     for image in images:
+        name = image.name
         if image.file is not None:
-            intrinsics, pose = as_stored(image, read_exif(image.file).orientation)
             name = Path(os.path.relpath(image.file.resolve(), folder)).as_posix()
-            image = replace(image, name=name, intrinsics=intrinsics, T_world_camera=pose)
-        stored.append(image)
+        stored.append(replace(image.as_stored, name=name))
     write_colmap_model(path, stored)
 
 
@@ -51,11 +48,10 @@ def write_colmap_model(
     ``points`` are the rows of points3D.txt, and ``keypoints`` holds, for each image, those of POINTS2D[]: x, y, and the number
     of the point. Characters of names that would break a row are escaped.
     """
-    require_finite(images)
     cameras: dict[Intrinsics, int] = {}
     rows = list[str]()
     for number, image in enumerate(images, start=1):
-        T = image.T_world_camera.to("cpu", torch.float64).inverse()
+        T = image.pose.inverse()
         numbers = (*T.quaternion("wxyz").tolist(), *T.translation.tolist())
         camera = cameras.setdefault(image.intrinsics, len(cameras) + 1)
         pose = " ".join(f"{x:.15g}" for x in numbers)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +24,7 @@ from bidnerf_core.mapping import LandmarkMap, Tracks
 from bidnerf_core.maps import Map
 from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.results.colmap_poses import write_colmap_model
-from bidnerf_core.results.pose_files import PosedImage, frame_of, transforms_json
+from bidnerf_core.results.pose_files import PosedImage, frame_of, write_pose_transforms
 
 log = logging.getLogger("bidnerf")
 
@@ -149,11 +148,11 @@ def _reprojection_errors(scene: Map, landmarks: LandmarkMap, tracks: Tracks) -> 
 def export_transforms(scene: Map, out: Path) -> list[Path]:
     """A transforms.json: the cameras as nerfstudio reads them, with the landmarks as sparse points."""
     images, files = _needed_images(scene, "transforms.json"), [out / "transforms.json"]
-    content = json.loads(transforms_json(images, out))
+    more = {}
     if scene.landmarks is not None:
         files.append(_write_landmarks(scene, images, out))
-        content["ply_file_path"] = files[-1].name
-    write_file(files[0], (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+        more["ply_file_path"] = files[-1].name
+    write_pose_transforms(files[0], images, **more)
     return files
 
 

@@ -9,7 +9,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -45,6 +45,37 @@ class PosedImage:
     covariance: Float[Tensor, "6 6"] | None = None
     unit: LengthUnit = "units"  # of the position
 
+    @property
+    def pose(self) -> SE3:
+        """T_world_camera in float64, on the CPU. Raises ``InputError`` if it is not finite."""
+        found = self.T_world_camera.to("cpu", torch.float64)
+        if not bool(found.matrix().isfinite().all()):
+            raise InputError(
+                f"the pose of {self.name} is not finite", expected="to leave it out, or a .json file"
+            )
+        return found
+
+    @property
+    def as_stored(self) -> PosedImage:
+        """The image as its file stores it, which may not be upright; the image itself without a file.
+
+        Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
+        """
+        turned = UPRIGHT if self.file is None else read_exif(self.file).orientation
+        if turned == UPRIGHT:
+            return self
+        # The columns are the stored image's axes in the upright camera's frame.
+        x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
+        axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if turned.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
+        turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
+        if float(torch.linalg.det(turn)) < 0:
+            raise InputError("is stored mirrored, which this format cannot describe", where=self.file)
+        inverse = Orientation(turned.mirrors_columns, turned.mirrors_rows)
+        if turned.transposes:
+            inverse = Orientation(turned.mirrors_rows, turned.mirrors_columns, True)
+        pose = self.pose @ SE3(turn, torch.zeros(3, dtype=torch.float64))
+        return replace(self, intrinsics=self.intrinsics.upright(inverse), T_world_camera=pose)
+
 
 def common_unit(images: Sequence[PosedImage]) -> LengthUnit:
     """Return the unit of the positions: metres only if all are metric."""
@@ -59,123 +90,59 @@ def frame_of(images: Sequence[PosedImage], direction: str = "camera to world") -
     return f"{direction}, {OPENCV_AXES}, lengths in {lengths}"
 
 
-def tum_trajectory(images: Sequence[PosedImage]) -> str:
-    """Return rows ``timestamp tx ty tz qx qy qz qw`` (unit quaternions with the scalar last).
+def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write a TUM trajectory: rows ``timestamp tx ty tz qx qy qz qw`` (unit quaternions with the scalar last).
 
     The timestamp is the image's time if all have one, else its name if all names are numbers, as in the TUM
     RGB-D datasets, else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
     In the last case, a comment before the row names the image, since other programs skip comments.
     """
-    require_finite(images)
-    stamps, named = _timestamps(images)
-    rows = (
-        f"{'# ' + printable(_label(image)) + chr(10) if named else ''}{_tum_row(stamp, image.T_world_camera)}"
-        for stamp, image in zip(stamps, images, strict=True)
-    )
-    return f"# {TUM_COLUMNS} ({frame_of(images)})\n" + "".join(rows)
-
-
-def require_finite(images: Sequence[PosedImage]) -> None:
+    timed = all(image.time is not None for image in images)
+    named = not timed and all(NUMBER.fullmatch(image.name) for image in images)
+    rows = [f"# {TUM_COLUMNS} ({frame_of(images)})"]
     for image in images:
-        if not bool(image.T_world_camera.matrix().isfinite().all()):
-            raise InputError(
-                f"the pose of {image.name} is not finite", expected="to leave it out, or a .json file"
-            )
+        if not (timed or named):
+            rows.append(f"# {printable(image.name if image.file is None else image.file.name)}")
+        stamp = f"{image.time:.6f}" if timed else image.name if named else str(image.number)
+        numbers = (*image.pose.translation.tolist(), *image.pose.quaternion("xyzw").tolist())
+        rows.append(" ".join((stamp, *(f"{number:.12g}" for number in numbers))))
+    write_file(path, "\n".join([*rows, ""]).encode())
 
 
-def _timestamps(images: Sequence[PosedImage]) -> tuple[list[str], bool]:
-    """Return the time stamps of a TUM file, and whether images should be named next to them."""
-    times = [image.time for image in images if image.time is not None]
-    if len(times) == len(images):
-        return [f"{time:.6f}" for time in times], False
-    if all(NUMBER.fullmatch(image.name) for image in images):
-        return [image.name for image in images], False
-    return [str(image.number) for image in images], True
-
-
-def _label(image: PosedImage) -> str:
-    return image.name if image.file is None else image.file.name
-
-
-def _tum_row(timestamp: str, T_world_camera: SE3) -> str:
-    pose = T_world_camera.to("cpu", torch.float64)
-    numbers = (*pose.translation.tolist(), *pose.quaternion("xyzw").tolist())
-    return " ".join((timestamp, *(f"{number:.12g}" for number in numbers))) + "\n"
-
-
-def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
-    """Return a ``transforms.json`` for ``folder``: poses with OpenGL axes, one camera per image,
-    ``file_path`` relative to it.
-
-    It describes the image files as stored, so the poses and cameras of photos with an EXIF orientation are
-    rotated. Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
-    """
-    require_finite(images)
-    frames = [_transforms_entry(image, folder) for image in images]
-    content = {"camera_model": "OPENCV", "unit": common_unit(images), "frames": frames}
-    return json.dumps(content, indent=1, allow_nan=False) + "\n"
-
-
-def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
-    orientation = UPRIGHT if image.file is None else read_exif(image.file).orientation
-    intrinsics, pose = as_stored(image, orientation)
-    place = image.name if image.file is None else os.path.relpath(image.file.resolve(), folder.resolve())
-    return frame_entry(Path(place).as_posix(), image.name, intrinsics, pose, image.time)
-
-
-def poses_json(images: Sequence[PosedImage]) -> str:
-    """Return a JSON list of ``{"frame", "time", "T_world_camera", "covariance", "unit"}``, one per line; poses have OpenCV axes.
+def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write a JSON list of ``{"frame", "time", "T_world_camera", "covariance", "unit"}``, one per line; poses have OpenCV axes.
 
     ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in ``unit``, then rotation in rad, at
     the camera) are null if unknown, and every matrix is null if it is not finite.
     """
-    objects = [
-        {
-            "frame": image.name,
-            "time": image.time,
-            "T_world_camera": _rows(image.T_world_camera.matrix()),
-            "covariance": None if image.covariance is None else _rows(image.covariance),
-            "unit": image.unit,
+    entries = []
+    for image in images:
+        matrices = {"T_world_camera": image.T_world_camera.matrix(), "covariance": image.covariance}
+        rows = {
+            key: None if m is None or not bool(m.isfinite().all()) else m.double().cpu().tolist()
+            for key, m in matrices.items()
         }
-        for image in images
-    ]
-    return "[\n" + ",\n".join(json.dumps(entry, allow_nan=False) for entry in objects) + "\n]\n"
+        entry = {"frame": image.name, "time": image.time, **rows, "unit": image.unit}
+        entries.append(json.dumps(entry, allow_nan=False))
+    write_file(path, ("[\n" + ",\n".join(entries) + "\n]\n").encode())
 
 
-def _rows(matrix: Float[Tensor, "r c"]) -> list[list[float]] | None:
-    return matrix.double().cpu().tolist() if bool(matrix.isfinite().all()) else None
+def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any) -> None:
+    """Write a ``transforms.json`` in nerfstudio's format: poses with OpenGL axes, one camera per image, ``file_path`` relative
+    to it; ``more`` holds further entries.
 
-
-def as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, SE3]:
-    """Return the camera and pose (float64) of the image as its file stores it."""
-    pose = image.T_world_camera.to("cpu", torch.float64)
-    if orientation == UPRIGHT:
-        return image.intrinsics, pose
-    # The columns are the stored image's axes in the upright camera's frame.
-    x, y = (-1.0 if flips else 1.0 for flips in (orientation.mirrors_columns, orientation.mirrors_rows))
-    axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if orientation.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
-    turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
-    if float(torch.linalg.det(turn)) < 0:
-        raise InputError("is stored mirrored, which transforms.json cannot describe", where=image.file)
-    inverse = Orientation(orientation.mirrors_columns, orientation.mirrors_rows)
-    if orientation.transposes:
-        inverse = Orientation(orientation.mirrors_rows, orientation.mirrors_columns, True)
-    return image.intrinsics.upright(inverse), pose @ SE3(turn, torch.zeros(3, dtype=torch.float64))
-
-
-def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a TUM trajectory: rows of time, position and unit quaternion."""
-    write_file(path, tum_trajectory(images).encode())
-
-
-def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write JSON: a list of frames with poses and covariances."""
-    write_file(path, poses_json(images).encode())
-
-
-def write_pose_transforms(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a transforms.json in nerfstudio's format: poses with OpenGL axes, and cameras."""
-    write_file(path, transforms_json(images, path.parent).encode())
+    It describes the image files as stored, so the poses and cameras of photos with an EXIF orientation are
+    rotated. Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
+    """
+    frames = []
+    for image in images:
+        stored, place = image.as_stored, image.name
+        if image.file is not None:
+            place = os.path.relpath(image.file.resolve(), path.parent.resolve())
+        entry = frame_entry(Path(place).as_posix(), image.name, stored.intrinsics, stored.pose, image.time)
+        frames.append(entry)
+    content = {"camera_model": "OPENCV", "unit": common_unit(images), "frames": frames, **more}
+    write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def _defects(writer: Any) -> Iterator[str]:

@@ -6,10 +6,8 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
-from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.errors import InputWarning
+from bidnerf_core.geometry import symbol
 from bidnerf_core.io import write_file
 from bidnerf_core.results.pose_files import PosedImage, common_unit
 
@@ -30,7 +28,7 @@ def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
             InputWarning,
             stacklevel=2,
         )
-    rows = [_matrix(image)[:3].flatten().tolist() for image in images]
+    rows = [image.pose.matrix()[:3].flatten().tolist() for image in images]
     write_file(path, "".join(" ".join(f"{number:.12g}" for number in row) + "\n" for row in rows).encode())
 
 
@@ -43,19 +41,9 @@ def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
     """
     rows = [EUROC_HEAD.format(symbol(common_unit(images)))]
     for image in images:
-        pose = _matrix(image)
         time = image.number if image.time is None else image.time
-        numbers = [*pose[:3, 3].tolist(), *SE3.from_matrix(pose).quaternion("wxyz").tolist()]
+        numbers = [*image.pose.translation.tolist(), *image.pose.quaternion("wxyz").tolist()]
         rows.append(
             ",".join([str(round(time * NANOSECONDS)), *(f"{number:.12g}" for number in numbers)]) + "\n"
         )
     write_file(path, "".join(rows).encode())
-
-
-def _matrix(image: PosedImage) -> torch.Tensor:
-    matrix = image.T_world_camera.matrix().detach().to("cpu", torch.float64)
-    if not bool(matrix.isfinite().all()):
-        raise InputError(
-            f"the pose of {image.name} is not finite", expected="to leave it out, or a .json file"
-        )
-    return matrix

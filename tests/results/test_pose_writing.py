@@ -26,7 +26,7 @@ from bidnerf_core.io import read_record
 from bidnerf_core.results import PosedImage, read_poses, write_poses
 
 # Inside: writers of single formats, with poses and names that a path does not have
-from bidnerf_core.results.pose_files import tum_trajectory, write_pose_transforms, write_tum
+from bidnerf_core.results.pose_files import write_pose_transforms, write_tum
 from photo_files import noise, write_photo
 from refusals import refused
 
@@ -59,10 +59,14 @@ def test_a_tum_trajectory_is_what_scipy_reads(tmp_path: Path) -> None:
     assert np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1)
 
 
-def test_names_that_are_times_are_the_timestamps() -> None:
-    text = tum_trajectory(images(["1305031102.175304", "1305031102.211214"]))
-    assert [line.split()[0] for line in text.splitlines()[1:]] == ["1305031102.175304", "1305031102.211214"]
-    lines = tum_trajectory(images(["7", "x"])).splitlines()
+def test_names_that_are_times_are_the_timestamps(tmp_path: Path) -> None:
+    def lines_of(names: list[str]) -> list[str]:
+        write_tum(tmp_path / "poses.txt", images(names))
+        return (tmp_path / "poses.txt").read_text().splitlines()
+
+    times = ["1305031102.175304", "1305031102.211214"]
+    assert [line.split()[0] for line in lines_of(times)[1:]] == times
+    lines = lines_of(["7", "x"])
     assert lines[1] == "# 7"  # the name, where the time stamp is only a number
     assert lines[2].startswith("0 ")
 
