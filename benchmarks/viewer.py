@@ -25,7 +25,7 @@ from _lab import Row, Scene, one_thread, parser, record
 from playwright.sync_api import sync_playwright
 
 from bidnerf_core import Localizer
-from bidnerf_core.viewer import serve_view
+from bidnerf_core.viewer import LiveView, serve_view
 
 ARGUMENTS = [
     "--no-sandbox",
@@ -94,7 +94,7 @@ def main() -> None:
     before, began = resident(), time.perf_counter()
     ready, stop = SimpleQueue[str](), threading.Event()
     work = {"port": 0, "ready": ready.put, "stop": stop}
-    server = threading.Thread(target=serve_view, args=(Localizer(shown),), kwargs=work)
+    server = threading.Thread(target=serve_view, args=(LiveView(Localizer(shown)),), kwargs=work)
     server.start()
     address = ready.get()
     started = time.perf_counter() - began

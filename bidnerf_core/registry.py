@@ -1,5 +1,5 @@
-"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers, importers
-and exporters.
+"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers, importers,
+exporters and protocols of the service.
 
 A distribution provides an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones are
 provided in the same way. A script or a notebook adds one with ``register``. Listing reads only metadata, so a
@@ -30,6 +30,7 @@ GROUPS: Mapping[str, str] = {
     "writers": "writer",
     "importers": "importer",
     "exporters": "exporter",
+    "services": "protocol",
 }
 """The kinds of object that can be registered, and the noun for each. The entry-point group has the prefix
 ``bidnerf.``."""

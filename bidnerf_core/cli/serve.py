@@ -27,8 +27,8 @@ class Serve:
     A photo is sent as a form or as the body of a request, with its camera, depth image or start if known:
     curl -F photo=@photo.jpg -F hfov=68 http://127.0.0.1:8000/localize
 
-    /openapi.json describes all paths, /health and /metrics are for monitoring, and /geopose implements the GeoPose Protocol. Each
-    request is logged as a line of JSON on stderr.
+    /docs describes all paths, as does /openapi.json, and /health and /metrics are for monitoring. Each request is logged as a line of
+    JSON on stderr.
     """
 
     maps: Annotated[

@@ -84,7 +84,7 @@ class View:
         from bidnerf_core.datasets import DatasetFrames
         from bidnerf_core.localization import Localizer
         from bidnerf_core.maps import load_info, load_map
-        from bidnerf_core.viewer import page_of, serve_view, shown_trajectory
+        from bidnerf_core.viewer import LiveView, page_of, serve_view, shown_trajectory
 
         if self.save is not None:
             check_output(self.save, (*self.query, *self.queries.depth, self.results, self.trajectory))
@@ -109,7 +109,7 @@ class View:
             source = Chosen(source, places)
         if self.save is None:
             serve_view(
-                localizer, source, path, rows, camera=camera, host=self.host, port=self.port,
+                LiveView(localizer, source, path, rows, camera), host=self.host, port=self.port,
                 ready=lambda address: say(f"look at {address}; Ctrl-C ends"),
             )  # fmt: skip
             return
@@ -147,15 +147,9 @@ def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, 
 def rows_of(results: Path) -> tuple[ShownRow, ...]:
     """Return the trials in a results file as rows of the page's table."""
     from bidnerf_core.evaluation import read_results
-    from bidnerf_core.viewer import shown_row
+    from bidnerf_core.viewer import ShownRow
 
-    return tuple(
-        shown_row(
-            row.frame, row.method, row.outcome, row.converged, row.reason, row.confidence,
-            None if row.error is None else (row.error.translation, row.error.rotation_deg), row.covariance, row.T_world_camera,
-        )
-        for row in read_results([results])
-    )  # fmt: skip
+    return tuple(map(ShownRow.of, read_results([results])))
 
 
 class Chosen:

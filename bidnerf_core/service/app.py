@@ -1,4 +1,4 @@
-"""The service as an ASGI application: its paths, responses and log."""
+"""The service as an ASGI application: its paths and its log."""
 
 from __future__ import annotations
 
@@ -6,266 +6,240 @@ import asyncio
 import contextlib
 import json
 import logging
+import os
+import tempfile
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.metadata import version
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from starlette.applications import Starlette
-from starlette.exceptions import HTTPException
-from starlette.middleware import Middleware
-from starlette.requests import Request
-from starlette.responses import Response
-from starlette.routing import Route
+from fastapi import FastAPI, Request
+from pydantic import BaseModel
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.types import Scope
 
-from bidnerf_core.service.access import PROBLEM, SAFE, Access, describe_client
-from bidnerf_core.service.description import description
+from bidnerf_core.errors import InputError
+from bidnerf_core.io import parse_json
+from bidnerf_core.service.jobs import Full, Job
 from bidnerf_core.service.metrics import TEXT
-from bidnerf_core.service.pool import Full, Job, Lost, Pool, TimedOut
-from bidnerf_core.service.requests import JSON, Query, Refused, body_of, json_of, query_of
-from bidnerf_core.service.settings import ChosenMethod, ServiceLimits
+from bidnerf_core.service.models import Health, Localization, MapFacts, Refused, Service, checked
+from bidnerf_core.service.pool import Lost, Pool
+from bidnerf_core.service.protocols import PROTOCOLS, ServiceProtocol
+from bidnerf_core.service.settings import ServiceLimits
+from bidnerf_core.service.web import (
+    CLIENT_GONE,
+    UPLOAD_ERRORS,
+    body_of,
+    busy,
+    errors,
+    json_body,
+    left,
+    log,
+    new_app,
+    photo_body,
+    photo_of,
+    problem,
+)
 
-log = logging.getLogger("bidnerf.service")
-
-OSCP = "application/vnd.oscp+json"
-CLIENT_GONE = 499
-"""The status in the log and the metrics for a client that disconnected before the response; nobody receives it."""
-TITLES = {
-    400: "bad request", 401: "no valid token", 403: "not allowed", 404: "not found", 405: "method not allowed",
-    408: "upload too slow", 413: "too large", 422: "not localized", 429: "too many requests", 500: "internal error",
-    503: "not available", 504: "took too long",
-}  # fmt: skip
-
-Handler = Callable[[Request], Awaitable[Response]]
+DESCRIPTION = """Poses of photos in radiance fields. Poses are camera to world with OpenCV axes (x right, y down, z forward).
+A request has at most {0.max_megabytes:g} MiB, an image at most {0.max_megapixels:g} megapixels. Errors are
+application/problem+json; a method that a path lacks results in 405."""
+LOCALIZE = """The response is that of 'bidnerf localize --json', in several maps if none is named. Never use a pose whose
+'converged' is false. Each field is given once, in the query or in the form; at most one of focal, hfov and camera."""
+FAILURES = (*UPLOAD_ERRORS, 404, 422, 504)
 
 
-def application(
-    maps: Mapping[str, Path], limits: ServiceLimits, token: str | None, method: ChosenMethod
-) -> Starlette:
-    """Build the service for the maps in some folders, by name; it runs between ASGI startup and shutdown.
+class Running(BaseModel):
+    """Whether the endpoint is up."""
+
+    status: Literal["running"]
+
+
+def application(order: dict[str, Any], limits: ServiceLimits, token: str | None) -> FastAPI:
+    """Build the service for the maps, method and device of an ``order``, see ``worker.main``; it runs between ASGI startup and
+    shutdown.
 
     Its startup raises ``InputError`` if a map cannot be served.
     """
+    pool = Pool(order, limits)
 
     @contextlib.asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        pool = Pool(maps, limits, method)
-        await pool.start()
-        app.state.pool = pool
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         try:
+            await asyncio.to_thread(pool.start)
             yield
         finally:
-            await pool.close()
+            await asyncio.to_thread(pool.close)
 
-    routes = [
-        Route("/", _logged(_index), name="/"),
-        Route("/health", _logged(_health), name="/health"),
-        Route("/metrics", _logged(_metrics), name="/metrics"),
-        Route("/openapi.json", _logged(_description), name="/openapi.json"),
-        Route("/maps", _logged(_maps), name="/maps"),
-        Route("/maps/{map}", _logged(_map), name="/maps/{map}"),
-        Route("/localize", _logged(_localize), methods=["POST"], name="/localize"),
-        Route("/maps/{map}/localize", _logged(_localize), methods=["POST"], name="/maps/{map}/localize"),
-        Route("/geopose", _logged(_geopose), methods=["GET", "POST"], name="/geopose"),
-        Route("/maps/{map}/geopose", _logged(_geopose), methods=["GET", "POST"], name="/maps/{map}/geopose"),
-    ]
-    handlers: Any = {HTTPException: _unknown, 405: _unknown}
-    app = Starlette(
-        routes=routes,
-        lifespan=lifespan,
-        exception_handlers=handlers,
-        middleware=[Middleware(Access, token=token, refused=_refused)],
+    def report(scope: Scope, status: int, seconds: float) -> None:
+        """Count a request, and write one line of JSON about it to the log."""
+        facts = scope.get("state", {}).get("facts", {})
+        path = getattr(scope.get("route"), "path", "unknown" if status not in (401, 403) else "refused")
+        pool.metrics.requests.labels(path=path, status=status).inc()
+        if scope["method"] == "POST":
+            pool.metrics.seconds.observe(seconds)
+        if scope["method"] == "POST" or status >= 400:
+            client = scope.get("client")
+            line = {
+                "time": round(time.time(), 3), "client": client and f"{client[0]}:{client[1]}", "method": scope["method"],
+                "path": scope["path"][:200], "status": status, "seconds": round(seconds, 4), **facts,
+            }  # fmt: skip
+            log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))
+
+    names = list(order["maps"])
+    app = new_app("bidnerf", DESCRIPTION.format(limits), token, report=report, lifespan=lifespan)
+    app.state.pool, app.state.limits, app.state.names = pool, limits, names
+
+    @app.get("/", response_model=Service, summary="The version, the maps and where this description is.")
+    async def index() -> Response:
+        return _json({"bidnerf": version("bidnerf"), "maps": names, "description": "/openapi.json"})
+
+    @app.get(
+        "/health",
+        response_model=Health,
+        responses=errors(503),
+        summary="Whether the service can answer; needs no token.",
     )
-    app.state.protected = token is not None
-    app.router.redirect_slashes = False  # a path with a slash too many is unknown, as every other
+    async def health() -> Response:
+        alive = len(pool.alive)
+        if not alive:
+            return problem(503, "no worker is currently alive", {"Retry-After": "1"})
+        folder = tempfile.gettempdir()
+        if os.path.isdir(folder) and not os.access(folder, os.W_OK):
+            return problem(503, "the folder for temporary files cannot be written", {"Retry-After": "60"})
+        return _json({"status": "ok", "workers": alive, "waiting": pool.queue.waiting})
+
+    @app.get("/metrics", response_class=PlainTextResponse, summary="Counters and times for Prometheus.")
+    async def metrics() -> Response:
+        return Response(pool.metrics.text(), headers={"Content-Type": TEXT})
+
+    @app.get("/maps", response_model=dict[str, MapFacts], summary="The maps by name, with facts about each.")
+    async def maps() -> Response:
+        return _json(pool.described)
+
+    @app.get("/maps/{map}", response_model=MapFacts, responses=errors(404), summary="Facts about a map.")
+    async def facts(request: Request, map: str) -> Response:
+        return _json(pool.described[_chosen(request, map)])
+
+    async def localize(request: Request, job: Job, map: str | None) -> Response:
+        upload = await photo_of(request, limits)
+        name = dict(upload.parameters).pop("map", None) if map is None else map
+        chosen = (
+            None if name is None and len(names) > 1 else _chosen(request, name)
+        )  # without one, the map is found
+        return _json(await _answer(request, job, {"map": chosen, "upload": upload}))
+
+    _post(
+        app, "/localize", localize, photo_body(), photo_body("map"), response_model=Localization, responses=errors(*FAILURES),
+        summary="Find the pose of a photo.", description=LOCALIZE,
+    )  # fmt: skip
+    for name, protocol in PROTOCOLS.items():
+        _add_protocol(app, name, protocol)
     return app
 
 
-def _logged(handler: Handler) -> Handler:
-    """Convert errors to responses, count the request, and write one line of JSON about it to the log."""
+def _post(
+    app: FastAPI, path: str, handle: Callable[[Request, Job, str | None], Awaitable[Response]], body: dict[str, Any],
+    in_map_body: dict[str, Any], **more: Any,
+) -> None:  # fmt: skip
+    """Add a path for requests, and the one of each map; ``handle`` is called with a job that has a place.
 
-    async def handle(request: Request) -> Response:
-        began = time.perf_counter()
-        request.state.facts = {}
-        try:
-            response = await handler(request)
-        except Refused as error:
-            response = problem(error.status, error.detail, error.headers)
-        except Exception as error:  # an internal error: the operator has to see where it happened
-            log.exception("%s", json.dumps({"fault": f"{type(error).__name__}: {error}"}))
-            response = problem(500, "internal error")
-        seconds = time.perf_counter() - began
-        path = request.scope["route"].name
-        pool: Pool = request.app.state.pool
-        pool.metrics.requests[path, response.status_code] += 1
-        facts = request.state.facts
-        if request.method == "POST":
-            pool.metrics.seconds.add(seconds)
-            _log(request.scope, response.status_code, seconds, facts)
-        return response
-
-    return handle
-
-
-def _refused(scope: Scope, status: int) -> None:
-    """Count and log an unauthorized request. Its path may be anything, not only a documented one."""
-    scope["app"].state.pool.metrics.requests["refused", status] += 1
-    _log(scope, status, 0.0, {})
-
-
-def _log(scope: Scope, status: int, seconds: float, facts: Mapping[str, Any]) -> None:
-    line = {
-        "time": round(time.time(), 3), "client": describe_client(scope), "method": scope["method"],
-        "path": scope["path"][:200], "status": status, "seconds": round(seconds, 4), **facts,
-    }  # fmt: skip
-    log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))
-
-
-def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any) -> Response:
-    """Return an error response in the format of RFC 9457."""
-    body = {"title": TITLES.get(status, "error"), "status": status, "detail": detail, **more}
-    return Response(json.dumps(body), status, {**SAFE, **(headers or {})}, PROBLEM)
-
-
-def _json(value: Any, kind: str = JSON) -> Response:
-    return Response(json.dumps(value, allow_nan=False) + "\n", 200, SAFE, kind)
-
-
-async def _unknown(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    request.app.state.pool.metrics.requests["unknown", error.status_code] += 1
-    _log(request.scope, error.status_code, 0.0, {})
-    return problem(error.status_code, error.detail, error.headers)
-
-
-async def _index(request: Request) -> Response:
-    pool: Pool = request.app.state.pool
-    return _json(
-        {"bidnerf": version("bidnerf"), "maps": list(pool.described), "description": "/openapi.json"}
-    )
-
-
-async def _health(request: Request) -> Response:
-    pool: Pool = request.app.state.pool
-    alive = len(pool.alive)
-    if not alive:
-        return problem(503, "no worker is currently alive", {"Retry-After": "1"})
-    return _json({"status": "ok", "workers": alive, "waiting": int(pool.metrics.gauges["queue_length"][1]())})
-
-
-async def _metrics(request: Request) -> Response:
-    pool: Pool = request.app.state.pool
-    return Response(pool.metrics.text(), 200, {**SAFE, "Content-Type": TEXT})
-
-
-async def _description(request: Request) -> Response:
-    pool: Pool = request.app.state.pool
-    return _json(description(list(pool.described), pool.limits, request.app.state.protected))
-
-
-async def _maps(request: Request) -> Response:
-    pool: Pool = request.app.state.pool
-    return _json(pool.described)
-
-
-async def _map(request: Request) -> Response:
-    pool: Pool = request.app.state.pool
-    return _json(pool.described[str(_chosen(request, None))])
-
-
-async def _localize(request: Request) -> Response:
-    """Respond with the JSON of ``bidnerf localize``."""
-    pool: Pool = request.app.state.pool
-    with _place(pool):
-        content = await body_of(request, pool.limits)
-        query = await query_of(request, content)
-        del content
-        name = _chosen(request, query.parameters.pop("map", None))  # without one, the map is found
-        answer = await _answer(request, pool, "localize", name, query, None)
-    return _json(answer["body"]) if "body" in answer else _failed(answer)
-
-
-async def _geopose(request: Request) -> Response:
-    """Respond to a request of the GeoPose Protocol; a GET checks that the service runs."""
-    pool: Pool = request.app.state.pool
-    if request.method != "POST":
-        _chosen(request, None)
-        return _json({"status": "running"})
-    with _place(pool):
-        body = json_of(await body_of(request, pool.limits))
-        name = _chosen(request, request.query_params.get("map"))
-        if name is None:  # the answer refers to one anchor, and prior poses to one world
-            names = ", ".join(pool.described)
-            raise Refused(400, f"several maps are served, expected map as one of {names}")
-        answer = await _answer(request, pool, "geopose", name, Query(), body)
-    if "body" not in answer:
-        return _failed(answer)
-    kind = f"{OSCP};version=2.0" if OSCP in request.headers.get("accept", "") else JSON
-    return _json(answer["body"], kind)
-
-
-@contextlib.contextmanager
-def _place(pool: Pool) -> Any:
-    try:
-        with pool.place():
-            yield
-    except Full as error:
-        headers = {"Retry-After": str(pool.retry_after), "Connection": "close"}
-        raise Refused(429, f"all {pool.limits.places} places are taken, try again later", headers) from error
-
-
-def _chosen(request: Request, asked: str | None) -> str | None:
-    """Return the name of the map that a request is for; None if it is for any of several. Raises ``Refused``
-    for an unknown one.
+    ``body`` and ``in_map_body`` are what OpenAPI says of their parameters and bodies.
     """
-    names = list(request.app.state.pool.described)
-    asked = request.path_params.get("map", asked)
-    if asked is None:
-        return str(names[0]) if len(names) == 1 else None
-    if asked not in names:
+    pool: Pool = app.state.pool
+
+    async def queued(request: Request, map: str | None) -> Response:
+        try:
+            job = pool.queue.enter()
+        except Full as error:
+            raise busy(f"all {pool.queue.places} places are taken", pool.retry_after) from error
+        try:
+            return await handle(request, job, map)
+        finally:
+            job.stop("cancelled")
+
+    async def anywhere(request: Request) -> Response:
+        return await queued(request, None)
+
+    async def in_map(request: Request, map: str) -> Response:
+        return await queued(request, _chosen(request, map))
+
+    app.post(path, openapi_extra=body, **more)(anywhere)
+    app.post(f"/maps/{{map}}{path}", openapi_extra=in_map_body, **more)(in_map)
+
+
+def _add_protocol(app: FastAPI, name: str, protocol: ServiceProtocol) -> None:
+    """Add the paths of another protocol."""
+    several = len(app.state.names) > 1
+    parameter = {"name": "map", "in": "query", "required": several, "schema": {"type": "string"}}
+
+    async def handle(request: Request, job: Job, map: str | None) -> Response:
+        body = parse_json(await body_of(request, app.state.limits), "", "a JSON object")
+        checked(protocol.request, body)
+        chosen = _chosen(request, request.query_params.get("map") if map is None else map)
+        answer = await _answer(request, job, {"map": chosen, "protocol": name, "body": body})
+        accepts = protocol.media_type.partition(";")[0] in request.headers.get("accept", "")
+        return _json(answer, protocol.media_type if accepts else "application/json")
+
+    async def running() -> Response:
+        return _json({"status": "running"})
+
+    async def running_in(request: Request, map: str) -> Response:
+        _chosen(request, map)
+        return _json({"status": "running"})
+
+    summary = f"Whether the endpoint is up: {protocol.summary}"
+    app.get(f"/{name}", response_model=Running, summary=summary)(running)
+    app.get(f"/maps/{{map}}/{name}", response_model=Running, responses=errors(404), summary=summary)(
+        running_in
+    )
+    body, answered = json_body(protocol.request), {200: {"content": {protocol.media_type: {}}}}
+    _post(
+        app, f"/{name}", handle, body | {"parameters": [parameter]}, body, response_model=protocol.response,
+        responses=errors(*FAILURES) | answered, summary=protocol.summary,
+    )  # fmt: skip
+
+
+def _chosen(request: Request, name: str | None) -> str:
+    """Return the name of the map that a request is for. Raises ``Refused`` for an unknown one, and ``InputError`` if one has to be named."""
+    names: list[str] = request.app.state.names
+    if name is None:
+        if len(names) > 1:
+            raise InputError("several maps are served", expected=f"map as one of {', '.join(names)}")
+        return names[0]
+    if name not in names:
         raise Refused(404, f"no map with that name, expected one of {', '.join(names)}")
-    return str(asked)
+    return name
 
 
-async def _answer(
-    request: Request, pool: Pool, kind: str, name: str | None, query: Query, body: Mapping[str, Any] | None
-) -> dict[str, Any]:
-    """Return a worker's answer; stop the work if the client disconnects. Raises ``Refused``."""
-    loop = asyncio.get_running_loop()
-    deadline = loop.time() + pool.limits.timeout
-    job = Job(kind, name, query.parameters, query.blocks, deadline, loop.create_future(), body)
-    facts = request.state.facts
-    facts |= {"id": job.id, "map": name, "bytes": sum(map(len, query.blocks.values()))}
-    answering, leaving = asyncio.ensure_future(pool.answer(job)), asyncio.ensure_future(_left(request))
+async def _answer(request: Request, job: Job, task: dict[str, Any]) -> Any:
+    """Return the JSON of a worker's answer; stop the work if it takes too long or the client disconnects. Raises ``Refused``."""
+    pool: Pool = request.app.state.pool
+    seconds = request.app.state.limits.timeout
+    upload = task.get("upload")
+    sizes = [] if upload is None else map(len, upload.files.values())
+    request.state.facts = facts = {"id": job.id, "map": task["map"], "bytes": sum(sizes)}
+    pool.queue.put(job, task)
+    answering, leaving = asyncio.wrap_future(job.result), asyncio.ensure_future(left(request))
     try:
-        await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({answering, leaving}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         if not answering.done():
-            raise Refused(CLIENT_GONE, "the client has left")
-        answer = answering.result()
-    except TimedOut as error:
-        raise Refused(504, f"no answer within {pool.limits.timeout:g} s") from error
+            job.stop("cancelled" if leaving.done() else "timeout")
+            if leaving.done():
+                raise Refused(CLIENT_GONE, "the client has left")
+            raise Refused(504, f"no answer within {seconds:g} s")
+        answer: dict[str, Any] = answering.result()
     except Lost as error:
         raise Refused(422, "the request crashed every worker that took it") from error
     finally:
-        for task in (answering, leaving):
-            task.cancel()
-        await asyncio.gather(answering, leaving, return_exceptions=True)
+        leaving.cancel()
         facts |= {"attempts": job.attempts, "waited": None if job.waited is None else round(job.waited, 4)}
-    outcome = answer.get("outcome", "bad input" if answer["status"] < 500 else "fault")
-    pool.metrics.outcomes[name or "", outcome] += 1
-    facts |= {"outcome": outcome, "worker": answer["worker"]}
-    if "fault" in answer:
-        facts["fault"] = answer["fault"]
-    return answer
+    pool.metrics.outcomes.labels(map=task["map"] or "", outcome=answer["outcome"]).inc()
+    facts |= {key: answer[key] for key in ("outcome", "worker", "fault") if key in answer}
+    if answer["status"] != 200:
+        raise Refused(answer["status"], answer["detail"], None, **answer.get("more", {}))
+    return answer["body"]
 
 
-async def _left(request: Request) -> None:
-    """Return once the client has closed the connection."""
-    while (await request.receive())["type"] != "http.disconnect":
-        pass
-
-
-def _failed(answer: Mapping[str, Any]) -> Response:
-    return problem(answer["status"], answer["detail"], None, **answer.get("extra", {}))
+def _json(value: Any, media_type: str = "application/json") -> Response:
+    return JSONResponse(value, media_type=media_type)

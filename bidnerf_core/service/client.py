@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
+import struct
 import time
 import urllib.error
 import urllib.request
 import uuid
+import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+
+File: TypeAlias = str | Path | bytes
+"""A file, or its content as bytes."""
 
 
 class ServiceError(Exception):
@@ -21,7 +27,7 @@ class ServiceError(Exception):
 
 class ServiceClient:
     """Requests poses from a ``bidnerf serve`` service at ``url``. A busy service is retried for up to
-    ``timeout`` seconds.
+    ``timeout`` seconds. All methods raise ``ServiceError``.
     """
 
     def __init__(
@@ -29,28 +35,57 @@ class ServiceClient:
     ) -> None:
         self.url, self.token, self.timeout = url.rstrip("/"), token, timeout
 
-    def localize(self, photo: str | Path | bytes, **given: Any) -> dict[str, Any]:
-        """Return the JSON of ``bidnerf localize`` for a photo, given as a file or its bytes.
+    def localize(
+        self,
+        photo: File | Any,
+        map: str | None = None,
+        *,
+        depth: File | Any = None,
+        camera: File | None = None,
+        start: Any = None,
+        **numbers: str | float | None,
+    ) -> dict[str, Any]:
+        """Return the JSON of ``bidnerf localize`` for a photo: a file, its bytes, or an array of bytes (h, w) or (h, w, 3).
 
-        ``given``: ``map`` (by default the one that the photo shows) and ``name``; ``depth``, a file or its bytes, with ``depth_unit``; ``focal``,
-        ``hfov``, or ``camera``, a path or such a file's content as bytes; ``start``, 4x4 rows of
-        T_world_camera; ``seed``. Raises ``ServiceError``.
+        ``map`` is by default the one that the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z,
+        ``camera`` a file with the camera, or its content, and ``start`` the 4x4 rows of T_world_camera. ``numbers`` are ``focal``
+        (pixels) or ``hfov`` (degrees), ``depth_unit`` (metres per step), ``seed`` and the ``name`` of the frame.
         """
-        edge, start = uuid.uuid4().hex, given.pop("start", None)
-        fields = given | {"photo": photo} | ({} if start is None else {"start": json.dumps(start).encode()})
-        files = ("photo", "depth", "camera", "start")
-        parts = [_part(edge, n, v, n in files) for n, v in fields.items() if v is not None]
+        fields = {**numbers, "map": map}
+        edge = uuid.uuid4().hex
+        rows = getattr(start, "tolist", lambda: start)()
+        files = {
+            "photo": _png(photo) if hasattr(photo, "shape") else photo,
+            "depth": _npy(depth) if hasattr(depth, "shape") else depth,
+            "camera": camera,
+            "start": None if start is None else json.dumps(rows).encode(),
+        }
+        parts = [
+            _part(edge, name, str(value).encode()) for name, value in fields.items() if value is not None
+        ]
+        for name, file in files.items():
+            if file is not None:
+                content = file if isinstance(file, bytes) else Path(file).read_bytes()
+                parts.append(_part(edge, name, content, name if isinstance(file, bytes) else Path(file).name))
         body = b"".join(parts) + f"--{edge}--\r\n".encode()
         found: dict[str, Any] = self.ask("/localize", body, f"multipart/form-data; boundary={edge}")
         return found
 
+    def maps(self) -> dict[str, Any]:
+        """Return the facts about each map by its name."""
+        found: dict[str, Any] = self.ask("/maps")
+        return found
+
+    def health(self) -> dict[str, Any]:
+        """Return whether the service can answer, and how many requests wait."""
+        found: dict[str, Any] = self.ask("/health")
+        return found
+
     def ask(self, path: str, body: bytes | None = None, kind: str = "application/json") -> Any:
-        """Return the JSON at a path such as /maps, or the response to ``body``. Raises ``ServiceError``."""
+        """Return the JSON at a path such as /maps, or the response to ``body``."""
         headers = {"Content-Type": kind} | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
-        request, until = (
-            urllib.request.Request(self.url + path, body, headers),
-            time.monotonic() + self.timeout,
-        )
+        request = urllib.request.Request(self.url + path, body, headers)
+        until = time.monotonic() + self.timeout
         while True:
             try:
                 with urllib.request.urlopen(request, timeout=self.timeout) as answer:
@@ -59,27 +94,45 @@ class ServiceClient:
                 wait = float(error.headers.get("Retry-After") or 0)
                 if error.code not in (429, 503) or time.monotonic() + wait > until:
                     text = error.read().decode(errors="replace")
-                    told = (
-                        json.loads(text)["detail"]
-                        if "problem+json" in error.headers.get("Content-Type", "")
-                        else text
-                    )
-                    raise ServiceError(error.code, told) from error
+                    is_problem = "problem+json" in error.headers.get("Content-Type", "")
+                    raise ServiceError(
+                        error.code, json.loads(text)["detail"] if is_problem else text
+                    ) from error
                 time.sleep(wait)
             except OSError as error:
                 raise ServiceError(0, f"{self.url}: {getattr(error, 'reason', error)}") from error
 
 
-def _part(edge: str, name: str, value: Any, is_file: bool) -> bytes:
+def _part(edge: str, name: str, content: bytes, file: str | None = None) -> bytes:
     """Return a form field; the stem of a photo's file name becomes its name in the answer."""
-    content = (
-        value if isinstance(value, bytes) else Path(value).read_bytes() if is_file else str(value).encode()
-    )
-    told = Path(value).name if is_file and not isinstance(value, bytes) else name
-    quoted = told.replace("\\", "\\\\").replace('"', "%22").replace("\r", "").replace("\n", "")
-    file = f'; filename="{quoted}"' if is_file else ""
-    return (
-        f'--{edge}\r\nContent-Disposition: form-data; name="{name}"{file}\r\n\r\n'.encode()
-        + content
-        + b"\r\n"
-    )
+    quoted = (file or "").replace("\\", "\\\\").replace('"', "%22").replace("\r", "").replace("\n", "")
+    head = f'--{edge}\r\nContent-Disposition: form-data; name="{name}"'
+    return (head + (f'; filename="{quoted}"' if file else "") + "\r\n\r\n").encode() + content + b"\r\n"
+
+
+def _npy(array: Any) -> bytes:
+    import numpy as np
+
+    file = io.BytesIO()
+    np.save(file, np.asarray(array))
+    return file.getvalue()
+
+
+def _png(array: Any) -> bytes:
+    import numpy as np
+
+    pixels = np.ascontiguousarray(array)
+    kinds = {(): 0, (3,): 2, (4,): 6}  # of PNG: grey, RGB, RGBA
+    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.shape[2:] not in kinds:
+        raise ServiceError(0, f"photo is {pixels.dtype} {pixels.shape}, expected bytes (h, w) or (h, w, 3)")
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    height, width = pixels.shape[:2]
+    head = struct.pack(">IIBBBBB", width, height, 8, kinds[pixels.shape[2:]], 0, 0, 0)
+    rows = [b"\0" + row.tobytes() for row in pixels]
+    data = chunk(b"IDAT", zlib.compress(b"".join(rows), 1))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + data + chunk(b"IEND", b"")

@@ -11,14 +11,16 @@ import signal
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.service.settings import ChosenMethod, ServiceLimits, checked_token
+from bidnerf_core.service.settings import ServiceLimits, checked_token
+from bidnerf_core.settings import to_flat
 
 if TYPE_CHECKING:
-    from starlette.applications import Starlette
+    from fastapi import FastAPI
 
 PORT = 8000
 LOOPBACK = "127.0.0.1"
@@ -27,12 +29,22 @@ HEAD_SECONDS = 10.0
 IDLE_SECONDS = 15
 """Time for which a connection may be idle between two requests."""
 CONNECTIONS = 256
-"""Open connections; a further one is closed at once."""
+"""Open connections; a further one ends that which has been without a request for the longest."""
 GRACE = 10
 """Seconds for running requests when the service shuts down."""
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 NAME = re.compile(r"[\w.-]{1,100}")
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
+
+
+class AppOptions(TypedDict, total=False):
+    """How ``service_app`` finds poses, and its limits."""
+
+    method: str
+    config: Any
+    device: str
+    limits: ServiceLimits | None
+
 
 Scenes: TypeAlias = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
 """The folders of maps, named by themselves or explicitly."""
@@ -46,7 +58,7 @@ def service_app(
     device: str = "cpu",
     limits: ServiceLimits | None = None,
     token: str | None = None,
-) -> Starlette:
+) -> FastAPI:
     """Return the service for the maps in some folders as an ASGI application, for your own server.
 
     ``method`` finds the poses on ``device``; ``config`` holds its settings, as an instance of their type or a dictionary of those
@@ -60,8 +72,16 @@ def service_app(
         from bidnerf_core.service.app import application
     except ImportError as error:
         raise InputError(NEEDS) from error
-    chosen = ChosenMethod.of(method, config, device)
-    return application(named(scenes), limits or ServiceLimits(), checked_token(token), chosen)
+    if config is not None and not isinstance(config, Mapping) and not is_dataclass(config):
+        raise InputError(
+            f"config is a {type(config).__name__}", expected=f"settings of {method}, or a dictionary"
+        )
+    limits = limits or ServiceLimits()
+    order = {
+        "maps": named(scenes), "method": method, "device": device, "max_pixels": limits.max_pixels,
+        "config": dict(to_flat(config) if is_dataclass(config) else config or {}),
+    }  # fmt: skip
+    return application(order, limits, checked_token(token))
 
 
 def serve(
@@ -69,39 +89,45 @@ def serve(
     *,
     host: str | None = None,
     port: int = PORT,
-    method: str = "auto",
-    config: Any = None,
-    device: str = "cpu",
-    limits: ServiceLimits | None = None,
     token: str | None = None,
     ready: Callable[[str, str | None], None] | None = None,
     stop: threading.Event | None = None,
+    **options: Unpack[AppOptions],
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
     ``scenes``: the folder of a map, a list of them, or folders by the names under which clients ask for them. Only
     programs on this machine are answered, unless a ``host``, such as 0.0.0.0, is given: clients then need the
-    ``token``, which is generated if none is given. ``port`` 0 picks a free one. ``method``, ``config`` and ``device`` are those of
-    ``service_app``. ``ready`` is called with the address and the token once requests are answered. Raises ``InputError`` for maps and settings that cannot
-    be served, and for a port that is taken.
+    ``token``, which is generated if none is given. ``port`` 0 picks a free one. ``options`` are ``method``, ``config``, ``device``
+    and ``limits`` of ``service_app``. ``ready`` is called with the address and the token once requests are answered. Raises
+    ``InputError`` for maps and settings that cannot be served, and for a port that is taken.
     """
-    try:
-        import uvicorn  # noqa: F401 (tried before the maps are read)
-    except ImportError as error:
-        raise InputError(NEEDS) from error
     if not hasattr(os, "fork"):
         raise InputError(
             "this system has no fork, but workers share the maps' memory by forking; use Linux or macOS"
         )
-    from bidnerf_core.service.access import is_loopback
-
-    token = token or (None if host is None or is_loopback(host) else secrets.token_urlsafe(24))
-    app = service_app(scenes, method=method, config=config, device=device, limits=limits, token=token)
+    token = token_for(host, token, NEEDS)
+    app = service_app(scenes, token=token, **options)
     run_app(app, host, port, lambda address: ready and ready(address, token), stop)
 
 
+def token_for(host: str | None, token: str | None, needs: str) -> str | None:
+    """Return the token that clients need: the given one, or one that is made up unless ``host`` is this machine only.
+
+    Raises ``InputError`` with the text ``needs`` if the web server is not installed, and for a token that is too short.
+    """
+    try:
+        import uvicorn  # noqa: F401 (tried before the maps are read)
+
+        from bidnerf_core.service.access import is_loopback
+    except ImportError as error:
+        raise InputError(needs) from error
+    is_local = host is None or is_loopback(host)
+    return checked_token(token or (None if is_local else secrets.token_urlsafe(24)))
+
+
 def run_app(
-    app: Starlette,
+    app: FastAPI,
     host: str | None,
     port: int,
     ready: Callable[[str], Any],
@@ -116,7 +142,7 @@ def run_app(
 
     with _bound(host or LOOPBACK, port) as bound:
         options = uvicorn.Config(
-            app, http=_patient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
+            app, http=_impatient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
             server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=grace, backlog=CONNECTIONS,
         )  # fmt: skip
         asyncio.run(_run(app, uvicorn.Server(options), bound, ready, stop))
@@ -164,7 +190,7 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 async def _run(
-    app: Starlette,
+    app: FastAPI,
     server: Any,
     bound: socket.socket,
     ready: Callable[[str], Any],
@@ -209,39 +235,34 @@ async def _signals_end(server: Any) -> AsyncIterator[None]:
             signal.signal(number, before[number])
 
 
-def _patient() -> type[Any]:
-    """Return uvicorn's protocol with additional limits: on the time of a request's head, and on connections."""
-    import h11
+def _impatient() -> type[Any]:
+    """Return uvicorn's protocol with limits on the time of a request's head, and on the number of connections."""
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-    from bidnerf_core.service.access import closing_problem
+    class Impatient(H11Protocol):
+        idle_since: float | None = None  # None while a request is answered
 
-    class Limited(H11Protocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
-            if len(self.connections) > CONNECTIONS:
-                transport.close()
-                return
-            self.loop.call_later(HEAD_SECONDS, self._close_if_silent, None)
+            self._idle(HEAD_SECONDS)
+            others: list[Any] = [each for each in self.connections if not each.transport.is_closing()]
+            if len(others) > CONNECTIONS:
+                idle = [each for each in others if each.idle_since is not None]
+                min(idle, key=lambda each: each.idle_since).transport.close()
+
+        def handle_events(self) -> None:
+            last: Any = self.cycle
+            super().handle_events()
+            if self.cycle is not last and not self.cycle.response_complete:
+                self.idle_since = None
 
         def on_response_complete(self) -> None:
-            answered = self.cycle  # before the next request, which may have arrived already
+            self._idle(IDLE_SECONDS + HEAD_SECONDS)  # before the next request, which may have arrived already
             super().on_response_complete()
-            self.loop.call_later(IDLE_SECONDS + HEAD_SECONDS, self._close_if_silent, answered)
 
-        def send_400_response(self, msg: str) -> None:
-            """Answer bytes that are not HTTP as other bad requests are answered, and close the connection."""
-            headers, body = closing_problem(400, "bad request", "not a valid HTTP request")
-            response = h11.Response(status_code=400, headers=headers, reason=b"Bad Request")
-            with contextlib.suppress(h11.LocalProtocolError):  # an answer has begun already
-                for event in (response, h11.Data(data=body), h11.EndOfMessage()):
-                    self.transport.write(self.conn.send(event) or b"")
-            self.transport.close()
+        def _idle(self, seconds: float) -> None:
+            """Close the connection if no request arrives within some seconds, even if bytes do."""
+            self.idle_since = began = self.loop.time()
+            self.loop.call_later(seconds, lambda: self.idle_since == began and self.transport.close())
 
-        def _close_if_silent(self, last: Any) -> None:
-            """Close the connection if no request has arrived since ``last``, even if bytes have."""
-            asked: Any = self.cycle  # None until the first request
-            if asked is last:
-                self.transport.close()
-
-    return Limited
+    return Impatient

@@ -1,148 +1,201 @@
-"""A worker: reads a photo from the bytes of a request, localizes it in a map, and returns the JSON of
-``bidnerf localize``.
+"""The process that loads the maps once, and the workers that it forks, which share its memory and localize photos.
+
+The loading process has a single thread, so that forks are safe, and it never handles a request: a worker that fails or
+is killed is replaced by a fork within milliseconds, and no memory is shared for writing.
 """
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import json
 import os
-import shutil
+import signal
 import socket
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
 from bidnerf_core.results import Answer, localize_each
-from bidnerf_core.service import geopose, wire
-from bidnerf_core.service.settings import ChosenMethod
-from bidnerf_core.service.upload import Upload
+from bidnerf_core.service.models import Refused, Upload
+from bidnerf_core.service.protocols import PROTOCOLS
+from bidnerf_core.service.upload import public_message, read_upload
 
-OK, UNUSABLE, FAULT = 200, 422, 500
-TOLD = ("backend", "cameras", "landmarks", "surfels", "unit", "distances", "bounds", "complete", "bidnerf")
+FACTS = ("backend", "cameras", "landmarks", "surfels", "unit", "distances", "bounds", "complete", "bidnerf")
 """The facts about a map that clients may see. The others name photos and folders."""
-
-
-@dataclass(frozen=True)
-class Served:
-    """A map that is served, ready to localize."""
-
-    scene: Map
-    localizer: Localizer
-
-    @property
-    def described(self) -> dict[str, Any]:
-        """Facts about the map that clients may see."""
-        facts = self.scene.describe().plain()
-        return {key: facts[key] for key in TOLD} | {
-            "anchor": None if self.scene.anchor is None else to_plain(self.scene.anchor)
-        }
 
 
 @dataclass(frozen=True)
 class Worker:
     """Everything needed to answer requests, loaded before workers are forked."""
 
-    maps: Mapping[str, Served]
+    maps: Mapping[str, Localizer]
     together: MapCollection | None  # several maps, for photos whose map is not known
     max_pixels: float
-    folder: Path  # where request files are stored, each request in its own folder
-    device: str
 
     @staticmethod
-    def load(maps: Mapping[str, Path], method: ChosenMethod, max_pixels: float, folder: Path) -> Worker:
-        """Load maps by name. Raises ``InputError`` if one cannot be served.
-
-        On devices other than the CPU, each worker creates its own localizer: no accelerator survives a fork.
-        """
-        config = settings_of(method.name, dict(method.config))
-        served = dict[str, Served]()
-        for name, place in maps.items():
-            scene = load_map(place)
-            localizer = Localizer(scene, method.name, config, warm_up=method.device == "cpu")
-            served[name] = Served(scene, localizer)
-        return Worker(served, _together(served), max_pixels, folder, method.device)
+    def of(maps: Mapping[str, Localizer], max_pixels: float) -> Worker:
+        """Return a worker for maps by name; several form a collection that uses their localizers."""
+        together, first = None, next(iter(maps.values()))
+        if len(maps) > 1:
+            scenes = {name: _scene(localizer) for name, localizer in maps.items()}
+            together = MapCollection(scenes, first.method, first.config, localizers=dict(maps))
+        return Worker(maps, together, max_pixels)
 
     @property
     def described(self) -> dict[str, Any]:
-        """The description of each map by its name."""
-        return {name: served.described for name, served in self.maps.items()}
+        """The facts about each map that clients may see, by its name."""
+        found = {}
+        for name, localizer in self.maps.items():
+            scene = _scene(localizer)
+            facts, anchor = scene.describe().plain(), scene.anchor
+            found[name] = {key: facts[key] for key in FACTS}
+            found[name]["anchor"] = to_plain(anchor)
+        return found
 
-    def serve(self, connection: socket.socket) -> None:
-        """Answer requests until the connection ends."""
+    def answer(self, task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+        """Return the status and the body of the response to a request, whose files may be written to ``folder``.
+
+        ``task`` has the name of the ``map``, None for the one that the photo shows, and an ``upload``, or the JSON ``body``
+        of a request of ``protocol``.
+        """
+        outcomes = list[str]()
+
+        def localize(upload: Upload) -> tuple[Answer, dict[str, Any]]:
+            answer, body = self.localize(task["map"], upload, folder)
+            outcomes.append(str(answer.found.outcome))
+            return answer, body
+
         try:
-            ready = self._on_device()
-        except (InputError, RuntimeError) as error:
-            wire.send(connection, {"error": str(error)})
-            return
-        wire.send(connection, {"pid": os.getpid()})
-        while (message := wire.receive(connection)) is not None:
-            wire.send(connection, ready.answer(*message))
-
-    def _on_device(self) -> Worker:
-        if self.device == "cpu":
-            return self
-        moved = {
-            name: Served(s.scene, Localizer(s.scene, s.localizer.method, s.localizer.config, self.device))
-            for name, s in self.maps.items()
-        }
-        return Worker(moved, _together(moved), self.max_pixels, self.folder, self.device)
-
-    def answer(self, request: dict[str, Any], blocks: Mapping[str, bytes]) -> dict[str, Any]:
-        """Return the status and body of the response to a request."""
-        folder = self.folder / request["id"]
-        try:
-            folder.mkdir(mode=0o700)
-            upload = Upload(request["parameters"], blocks)
-            if request["map"] is None and self.together is not None:
-                answer, plain = self._placed(self.together, upload, folder)
-                return {"status": OK, "body": plain, "outcome": str(answer.found.outcome)}
-            served = self.maps[request["map"]]
-            if request["kind"] == "geopose":
-                return geopose.answer(
-                    served.scene.anchor, request["body"], lambda query: self._localize(served, query, folder)
-                )
-            answer, plain = self._localize(served, upload, folder)
-            return {"status": OK, "body": plain, "outcome": str(answer.found.outcome)}
+            if (protocol := task.get("protocol")) is None:
+                _, body = localize(task["upload"])
+            else:
+                body = PROTOCOLS[protocol].answer(task["body"], _scene(self.maps[task["map"]]), localize)
+            found = {"status": 200, "body": body}
+        except Refused as error:
+            found = {"status": error.status, "detail": error.detail, "more": error.more}
         except InputError as error:
-            return {"status": UNUSABLE, "detail": str(error).replace(f"{folder}{os.sep}", "")}
+            found = {"status": 422, "detail": public_message(error, folder)}
         except (
             Exception
         ) as error:  # an internal error: the worker continues, and the log states what happened
-            return {"status": FAULT, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            found = {"status": 500, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
+        return found | {
+            "outcome": outcomes[-1] if outcomes else "bad input" if found["status"] < 500 else "fault"
+        }
 
-    def _localize(self, served: Served, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
-        """Localize a photo; return the answer, and its JSON values as printed by ``bidnerf localize --json``."""
-        usual, background = (
-            CameraSource(assumed=served.localizer.assumed_cameras),
-            served.scene.bounds.background,
-        )
-        photos, start = upload.read(usual, background, folder, self.max_pixels)
-        answers = localize_each(served.localizer, photos, start=lambda _: start, seed=upload.seed)
-        (answer,) = answers.answers
-        return answer, {**answers.plain(answer), "frame": upload.name}
-
-    def _placed(self, maps: MapCollection, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
-        """Localize a photo in the map that it shows; return the answer and its JSON values, with that map."""
-        photos, start = upload.read(CameraSource(assumed=maps.cameras), None, folder, self.max_pixels)
-        if start is not None:
+    def localize(self, name: str | None, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
+        """Localize a photo in a map, or in the one of several that it shows; return the answer, and its JSON values as printed
+        by ``bidnerf localize --json``.
+        """
+        several = self.together if name is None else None
+        localizer = next(iter(self.maps.values())) if name is None else self.maps[name]
+        usual = CameraSource(assumed=localizer.assumed_cameras if several is None else several.cameras)
+        photos, start = read_upload(upload, usual, folder, self.max_pixels)
+        if several is not None and start is not None:
             raise InputError("start was given without map", expected=f"map as one of {', '.join(self.maps)}")
-        answers = localize_each(maps, photos, seed=upload.seed)
+        if several is not None:
+            answers: Any = localize_each(several, photos, seed=upload.seed)
+        else:
+            answers = localize_each(localizer, photos, start=lambda _: start, seed=upload.seed)
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}
 
 
-def _together(maps: Mapping[str, Served]) -> MapCollection | None:
-    """Return several maps as a collection that uses their localizers; None for a single one."""
-    if len(maps) == 1:
-        return None
-    first = next(iter(maps.values())).localizer
-    localizers = {name: served.localizer for name, served in maps.items()}
-    scenes = {name: served.scene for name, served in maps.items()}
-    return MapCollection(scenes, first.method, first.config, localizers=localizers)
+def _scene(localizer: Localizer) -> Map:
+    assert isinstance(localizer.scene, Map)
+    return localizer.scene
+
+
+def main() -> None:
+    """Load the maps that the parent names over the socket whose descriptor is the program's argument, and fork workers on demand.
+
+    Each byte that arrives then comes with the socket that a new worker will serve.
+    """
+    assert os.getpgrp() == os.getpid(), "this process ends its group"
+    control = socket.socket(fileno=int(sys.argv[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system then reaps workers that end
+    connection = Connection(os.dup(control.fileno()))
+    order = connection.recv()
+    try:
+        worker = _loaded(order)
+    except (InputError, OSError, RuntimeError, MemoryError) as error:
+        _send(connection, {"error": str(error) or type(error).__name__})
+        return
+    gc.collect()
+    gc.freeze()  # otherwise a collection in a worker would write to, and so copy, every page with an object
+    _send(connection, {"maps": worker.described})
+    connection.close()
+    while True:
+        asked, descriptors, _, _ = socket.recv_fds(control, 1, 1)
+        if not asked:
+            with contextlib.suppress(OSError):
+                os.killpg(0, signal.SIGKILL)  # including those that are busy
+            return
+        if os.fork() == 0:
+            control.close()
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            try:
+                _serve(worker, order["device"], Connection(descriptors[0]))
+            finally:
+                os._exit(0)
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _loaded(order: Mapping[str, Any]) -> Worker:
+    """Load maps by name. Raises ``InputError`` if one cannot be served."""
+    import logging
+    import warnings
+
+    import cv2
+    import torch
+
+    logging.getLogger("bidnerf").addHandler(logging.NullHandler())
+    warnings.simplefilter("ignore", InputWarning)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    config = settings_of(order["method"], order["config"])
+    warm_up = order["device"] == "cpu"
+    maps = {
+        name: Localizer(load_map(folder), order["method"], config, warm_up=warm_up)
+        for name, folder in order["maps"].items()
+    }
+    return Worker.of(maps, order["max_pixels"])
+
+
+def _serve(worker: Worker, device: str, connection: Connection) -> None:
+    """Answer requests until the connection ends. On an accelerator, which does not survive a fork, the localizers are made anew."""
+    try:
+        if device != "cpu":
+            moved = {
+                name: Localizer(_scene(each), each.method, each.config, device)
+                for name, each in worker.maps.items()
+            }
+            worker = Worker.of(moved, worker.max_pixels)
+    except (InputError, RuntimeError) as error:
+        _send(connection, {"error": str(error)})
+        return
+    _send(connection, {"pid": os.getpid()})
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            task, folder = connection.recv()
+            _send(connection, worker.answer(task, Path(folder)))
+
+
+def _send(connection: Connection, message: Mapping[str, Any]) -> None:
+    """Send JSON, so that nothing is unpickled in the process that listens, whatever a photo does to a worker."""
+    connection.send_bytes(json.dumps(message).encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,8 +19,15 @@ PIXELS_AT_A_TIME = 4096
 
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Render the colours of the field, in [0, 1], from a camera."""
-    return render_image(scene.field, camera, T_world_camera, scene.bounds, PIXELS_AT_A_TIME).rgb
+    """Render the colours of the field, in [0, 1], from a camera, which may be farther away than those of the map's images."""
+    bounds = scene.bounds
+    place = T_world_camera.translation.detach().cpu().double()
+    distance = float((place - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
+    beyond = (
+        bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
+    )  # of the centre, there is no more matter
+    bounds = replace(bounds, far=max(bounds.far, distance + beyond))
+    return render_image(scene.field, camera, T_world_camera, bounds, PIXELS_AT_A_TIME).rgb
 
 
 @torch.no_grad()

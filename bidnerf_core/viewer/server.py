@@ -1,22 +1,15 @@
-"""The viewer on a port: ``serve_view``, which runs until it is stopped."""
+"""The live viewer: ``serve_view``, which runs until it is stopped."""
 
 from __future__ import annotations
 
-import secrets
 import threading
 from collections.abc import Callable
-from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets import QuerySource
-from bidnerf_core.errors import InputError
-from bidnerf_core.localization import Localizer
-from bidnerf_core.maps import Map
-from bidnerf_core.service import ServiceLimits, checked_token, run_app
-from bidnerf_core.viewer.page_state import PageState
-from bidnerf_core.viewer.scene import shown_map
-from bidnerf_core.viewer.table import ShownRow
-from bidnerf_core.viewer.trajectories import ShownTrajectory
+from bidnerf_core.service import ServiceLimits, run_app, token_for
+
+if TYPE_CHECKING:
+    from bidnerf_core.viewer.app import LiveView
 
 PORT = 8010
 GRACE = 1
@@ -25,12 +18,8 @@ NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'
 
 
 def serve_view(
-    localizer: Localizer,
-    source: QuerySource | None = None,
-    trajectory: ShownTrajectory | None = None,
-    results: tuple[ShownRow, ...] = (),
+    shown: LiveView,
     *,
-    camera: CameraSource | None = None,
     host: str | None = None,
     port: int = PORT,
     token: str | None = None,
@@ -40,40 +29,15 @@ def serve_view(
 ) -> None:
     """Show a map in browsers, which may localize photos in it, until the process is interrupted or ``stop`` is set.
 
-    ``source`` holds images that may be localized by choosing them. ``camera`` is that of other photos, by default that of EXIF or
-    the map; the page shows its field of view, which can be changed there. Only browsers on this
-    machine are answered, unless a ``host``, such as 0.0.0.0, is named: the address that ``ready`` is called with then holds a
-    ``token``, which is made up where none is given. Raises ``InputError`` without the extra, and for a port that is taken.
+    Only browsers on this machine are answered, unless a ``host``, such as 0.0.0.0, is named: the address that ``ready`` is
+    called with then holds a ``token``, which is made up where none is given. Raises ``InputError`` without the extra, and for
+    a port that is taken.
     """
-    try:
-        import uvicorn  # noqa: F401
-
-        from bidnerf_core.service import is_loopback
-        from bidnerf_core.viewer.app import Shown, viewer_app
-    except ImportError as error:
-        raise InputError(NEEDS) from error
-    scene = localizer.scene
-    if not isinstance(scene, Map):
-        raise InputError(f"the viewer shows a Map, got a {type(scene).__name__}")
-    is_local = host is None or is_loopback(host)
-    token = checked_token(token or (None if is_local else secrets.token_urlsafe(24)))
-    names = () if source is None else tuple(source.names)
-    usual = replace(camera or CameraSource(), assumed=localizer.assumed_cameras)
-    others = replace(usual, hfov=None)  # the page sends the field of view
-    state = PageState(
-        shown_map(scene, thumbnails=0), live=True, queries=names, trajectory=trajectory, results=results,
-        hfov=usual.hfov, camera_given=others.is_given,
-    )  # fmt: skip
+    token = token_for(host, token, NEEDS)
+    from bidnerf_core.viewer.app import viewer_app
 
     def announce(address: str) -> None:
         if ready is not None:
             ready(address if token is None else f"{address}/?token={token}")
 
-    run_app(
-        viewer_app(Shown(localizer, source, state, others), token, limits),
-        host,
-        port,
-        announce,
-        stop,
-        grace=GRACE,
-    )
+    run_app(viewer_app(shown, token, limits), host, port, announce, stop, grace=GRACE)

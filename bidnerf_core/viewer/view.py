@@ -14,7 +14,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Localizer, SearchRecord, recorded
 from bidnerf_core.maps import Map
 from bidnerf_core.results import BAD_INPUT
-from bidnerf_core.viewer.answer import PICTURE_SIDE, ShownAnswer, shown_answer
+from bidnerf_core.viewer.answer import ShownAnswer, shown_answer
 from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.saving import page_html, save_page
 from bidnerf_core.viewer.scene import shown_map
@@ -84,7 +84,8 @@ def view(
 def localized(
     localizer: Localizer,
     query: Query,
-    side: int = PICTURE_SIDE,
+    start: SE3 | None = None,
+    seed: int = 0,
     begun: Callable[[SearchRecord], None] | None = None,
     found_pose: Callable[[ShownAnswer], None] | None = None,
 ) -> ShownAnswer:
@@ -97,16 +98,13 @@ def localized(
         with recorded() as record:
             if begun is not None:
                 begun(record)
-            found = localizer(query.views, depth_rays=query.depth_rays)
+            found = localizer(query.views, start, query.depth_rays, seed)
     except InputError as error:
         return ShownAnswer(query.name, BAD_INPUT, False, str(error))
+    known = (localizer.scene, query.name, found, query.frame, record, query.truth)
     if found_pose is not None:
-        found_pose(
-            shown_answer(
-                localizer.scene, query.name, found, query.frame, record, query.truth, side, quick=True
-            )
-        )
-    return shown_answer(localizer.scene, query.name, found, query.frame, record, query.truth, side)
+        found_pose(shown_answer(*known, quick=True))
+    return shown_answer(*known)
 
 
 def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> ShownAnswer:

@@ -49,13 +49,13 @@ MEASURED = """
 import os, sys
 from pathlib import Path
 from bidnerf_core.io.torch_files import outline_of, read_saved
-from bidnerf_core.service.metrics import resident_bytes
+import psutil
 
 kept = []
 for read in (outline_of, read_saved):
-    before = resident_bytes(os.getpid())
+    before = psutil.Process().memory_info().rss
     kept.append(read(Path(sys.argv[1]), "a checkpoint"))
-    print(resident_bytes(os.getpid()) - before)
+    print(psutil.Process().memory_info().rss - before)
 """
 
 

@@ -19,8 +19,8 @@ from bidnerf_core.captures import stored_cameras
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in
-from bidnerf_core.service.worker import Served, Worker
-from bidnerf_core.service.worker import _together as together_of
+from bidnerf_core.service import Upload
+from bidnerf_core.service.worker import Worker
 from bidnerf_core.testing import BOUNDS, CAMERA, POSES, ground, training_views, view
 from commands import Run
 from refusals import refused
@@ -90,20 +90,19 @@ def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], t
 @pytest.mark.slow
 def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
     """Under the names by which the maps are served, and with the localizers that serve them."""
-    served = {name: Served(scene, bn.Localizer(scene)) for name, scene in zip("ab", grounds, strict=False)}
-    together = together_of(served)
-    assert together is not None
-    assert together.localizer("b") is served["b"].localizer
-    assert together_of({"a": served["a"]}) is None
-    worker = Worker(served, together, 1e6, tmp_path, "cpu")
+    localizers = {name: bn.Localizer(scene) for name, scene in zip("ab", grounds, strict=False)}
+    worker = Worker.of(localizers, 1e6)
+    assert worker.together is not None
+    assert worker.together.localizer("b") is localizers["b"]
+    assert Worker.of({"a": localizers["a"]}, 1e6).together is None
     png = iio.imwrite("<bytes>", (255 * photo(SEEDS[1]).frame.rgb).byte().numpy(), extension=".png")
-    request = {"id": "1", "kind": "localize", "map": None, "parameters": {"name": "<i>", "focal": CAMERA.fx}}
-    reply = worker.answer(request, {"photo": png})
+    task = {"map": None, "upload": Upload({"name": "<i>", "focal": CAMERA.fx}, {"photo": png})}
+    reply = worker.answer(task, tmp_path)
     assert reply["status"] == 200, reply
     body = reply["body"]
     assert (body["frame"], body["map"], body["converged"]) == ("<i>", "b", True)
     assert body["runner_up"]["map"] == "a"
-    alone = worker.answer(request | {"map": "b"}, {"photo": png})["body"]
+    alone = worker.answer(task | {"map": "b"}, tmp_path)["body"]
     assert alone["T_world_camera"] == body["T_world_camera"]
 
 

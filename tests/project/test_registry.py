@@ -196,7 +196,7 @@ def test_every_group_is_listed_loaded_and_refused_alike(site: Site, group: str) 
         load_plugin(group, "broken")
 
 
-@pytest.mark.parametrize("group", [group for group in GROUPS if group != "importers"])
+@pytest.mark.parametrize("group", [group for group in GROUPS if group not in ("importers", "services")])
 def test_bundled_plugins_are_registered_as_a_strangers_are_and_their_names_are_taken(
     site: Site, group: str
 ) -> None:

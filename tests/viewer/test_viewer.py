@@ -33,6 +33,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.mapping import States
 from bidnerf_core.progress import job_context
 from bidnerf_core.results import PosedImage, write_poses
+from bidnerf_core.scenes import closed_form_map, orbit
 from bidnerf_core.viewer import ShownAnswer, shown_trajectory
 
 # Inside: what a page states of one answer is read from its parts, without a browser
@@ -386,6 +387,18 @@ def test_view_saves_a_page_of_photos(bidnerf: Run, room: Map, tmp_path: Path) ->
     assert (good["name"], good["accepted"]) == ("photo", True), good["reason"]
     assert not bad["accepted"]
     assert "none.png" in bad["reason"]  # the page says what is wrong, too
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_the_field_is_seen_from_beyond_the_reach_of_the_images_rays(contracted: bool) -> None:
+    """The first view of a page shows the map from outside."""
+    blobs = closed_form_map("blobs")
+    scene = replace(blobs, info=replace(blobs.info, bounds=replace(blobs.bounds, contracted=contracted)))
+    near, distance = orbit(3.5, 1)[0], 5 * scene.bounds.far
+    away = replace(near, translation=near.translation * distance / near.translation.norm())
+    camera = Intrinsics.from_hfov(2 * math.degrees(math.atan(max(scene.bounds.size) / distance)), 32, 32)
+    background = torch.tensor(scene.bounds.background)
+    assert float(((field_image(scene, camera, away) - background).abs() > 0.05).float().mean()) > 0.02
 
 
 def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted(room: Map) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from http.client import HTTPConnection
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from urllib.parse import quote
 
 import pytest
@@ -24,7 +25,7 @@ from bidnerf_core import Localizer, Map, settings_of
 from bidnerf_core.camera import CameraSource
 
 # Inside: the queue of localizations, of which requests show only the results
-from bidnerf_core.viewer.jobs import Jobs
+from bidnerf_core.viewer.jobs import PLACES, Jobs
 from bombs import png_of
 from photo_room import CAMERA
 from viewer_client import Client, serving
@@ -100,7 +101,7 @@ def test_bad_uploads_are_refused_with_the_reason(client: Client) -> None:
     [
         "/map.json", "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/api/thumbnail/..%2f..%2fetc%2fpasswd",
         "/api/thumbnail/-1", "/api/thumbnail/8", "/api/thumbnail/../../map.json", "/api/job/..%2f..%2fetc%2fpasswd",
-        "/api/query/0/..%2f..", "//etc/passwd", "/api/thumbnail/1e1",
+        "/api/query/0/..%2f..", "//etc/passwd", "/api/thumbnail/1e1", f"/api/thumbnail/{'9' * 5000}", f"/api/query/{'9' * 5000}",
     ],
 )  # fmt: skip
 def test_no_file_can_be_asked_for(client: Client, path: str) -> None:
@@ -115,12 +116,52 @@ def test_images_are_chosen_by_number_among_those_given(client: Client) -> None:
     assert answer["accepted"]
 
 
+def test_the_start_and_the_seed_of_a_photo_are_used(room: Map, tmp_path: Path) -> None:
+    content = viewed.photo_file(tmp_path).read_bytes()
+    start = json.dumps(viewed.walk(15)[5].matrix().tolist())
+    with serving(room, method="bid") as client:
+        assert "needs a start" in answer_of(client, client.post("/api/photo?hfov=58.19", content))["reason"]
+        path = f"/api/photo?hfov=58.19&seed=3&start={quote(start)}"
+        assert answer_of(client, client.post(path, content))["method"] == "bid"
+        assert "bad input" in answer_of(client, client.post(f"{path[:-5]}", content))["outcome"]
+        assert client.post("/api/photo?map=other", content).status_code == 400
+
+
+def test_internal_errors_are_for_the_log_alone(
+    room: Map, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*given: Any, **more: Any) -> Any:
+        raise RuntimeError("/home/user/secret")
+
+    monkeypatch.setattr("bidnerf_core.viewer.jobs.localized", fail)
+    with serving(room) as client:
+        answer = answer_of(client, client.post("/api/query/0"))
+    assert answer["outcome"] == "fault"
+    assert "secret" not in json.dumps(answer)
+    assert "secret" in caplog.text
+
+
+def test_photos_beyond_the_bound_are_refused_before_they_are_read(room: Map) -> None:
+    with serving(room) as client, contextlib.ExitStack() as uploads:
+        for _ in range(PLACES):
+            connection = HTTPConnection("127.0.0.1", client.port)
+            uploads.callback(connection.close)
+            connection.putrequest("POST", "/api/photo")
+            connection.putheader("Content-Length", "1000")
+            connection.endheaders(b"x")
+        until(lambda: client.post("/api/photo", b"x").status_code == 429)
+        assert client.get("/health").status_code == 200
+
+
 @pytest.mark.parametrize("method", LONG)
 def test_closing_ends_the_localization_at_work(room: Map, method: str) -> None:
     localizer = Localizer(room, method, settings_of(method, LONG[method]), warm_up=False)
     start = viewed.walk(15)[6]
-    jobs = Jobs(cast(Localizer, lambda views, depth_rays: localizer(views, start)))
-    running, waiting = (jobs.begin(name, partial(viewed.query, name)) for name in ("a", "b"))
+    jobs = Jobs(localizer)
+    running, waiting = (
+        jobs.put(jobs.queue.enter(name), lambda name=name: (viewed.query(name), start, 0))
+        for name in ("a", "b")
+    )
     until(lambda: running.state == "searching")
     time.sleep(0.3)
     began = time.monotonic()
@@ -143,16 +184,29 @@ def test_thumbnails_and_renderings_are_images_of_the_size_asked_for(client: Clie
     "wrong",
     [
         {"width": 100_000}, {"height": 0}, {"fov": 1e9}, {"pose": [1, 2]}, {"pose": ["x"] * 16}, {"quick": None, "pose": None},
-        {"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"width": "1e400"},
+        {"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"width": "1e400"}, {"pose": [float("nan")] * 16},
     ],
 )  # fmt: skip
 def test_cameras_that_are_none_are_refused(client: Client, wrong: dict[str, Any]) -> None:
     assert client.post("/api/view", json.dumps(VIEW | {"quick": True} | wrong).encode()).status_code == 400
 
 
+def test_a_number_of_thousands_of_digits_is_refused(client: Client) -> None:
+    body = json.dumps(VIEW | {"quick": True}).replace("32", "9" * 5000).encode()
+    assert client.post("/api/view", body).status_code == 400
+    assert client.post(f"/api/photo?hfov={'9' * 5000}", b"x").status_code == 400
+
+
+def test_the_viewer_describes_itself(client: Client) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    assert {"/", "/api/photo", "/api/view", "/docs"} <= set(paths)
+    assert b"degrees from top to bottom" in client.get("/docs").content
+
+
 def test_without_a_token_only_pages_of_this_machine_are_answered(client: Client) -> None:
     assert client.get("/", Host="evil.example").status_code == 403
-    assert client.post("/api/query/0", headers={"Origin": "https://evil.example"}).status_code == 403
+    for origin in ("https://evil.example", f"http://127.0.0.1:{client.port + 1}"):
+        assert client.post("/api/query/0", headers={"Origin": origin}).status_code == 403
     assert client.get("/").status_code == 200
 
 
@@ -166,5 +220,9 @@ def test_a_token_in_the_address_becomes_a_cookie_that_scripts_cannot_read(room: 
         cookie = reply.headers["set-cookie"]
         assert "httponly" in cookie.lower()
         assert "samesite=strict" in cookie.lower()
+        assert "secure" not in cookie.lower()
+        assert cookie.startswith(f"bidnerf_token_{client.port}=")
+        behind_tls = client.get(f"/?token={TOKEN}", **{"X-Forwarded-Proto": "https"})
+        assert "secure" in behind_tls.headers["set-cookie"].lower()
         assert client.get("/", Cookie=cookie.partition(";")[0]).status_code == 200
-        assert client.get("/", Cookie="bidnerf_token=other").status_code == 401
+        assert client.get("/", Cookie=f"bidnerf_token_{client.port}=other").status_code == 401

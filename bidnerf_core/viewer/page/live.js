@@ -56,7 +56,7 @@ export class Live {
     if (file.size > LARGEST) { this.page.note(`${file.name} has ${Math.round(file.size / 2 ** 20)} MiB, at most 32 are accepted.`); return null; }
     const name = file.name.slice(0, LONGEST) || "photo";
     const hfov = find("hfov");
-    if (!hfov.checkValidity()) { this.page.note("The field of view is a number of degrees from 1 to 179."); return null; }
+    if (!hfov.checkValidity()) { this.page.note("The field of view is a number of degrees from 1 to 170."); return null; }
     const camera = hfov.value ? `&hfov=${encodeURIComponent(hfov.value)}` : "";
     return this.ask(`/api/photo?name=${encodeURIComponent(name)}${camera}`, name, file);
   }

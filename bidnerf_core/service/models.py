@@ -1,0 +1,223 @@
+"""What clients send and receive: each model checks requests and describes itself in OpenAPI."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from bidnerf_core.errors import InputError, spelling_hint
+from bidnerf_core.settings import LARGEST_SEED
+
+LONGEST_NAME = 200
+"""Characters of a name in an answer."""
+WIDEST = 170.0
+"""Largest horizontal field of view (degrees): beyond it, the inner half of the angles has less than a twelfth of a pinhole image."""
+CAMERAS = ("focal", "hfov", "camera")
+"""The ways to state the camera of a photo."""
+DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+"""A number as a program writes it; Python's ``float`` takes digits of every script and underscores too."""
+
+
+class Refused(Exception):
+    """A request that is answered with an error: its status, a ``detail``, headers, and further JSON values."""
+
+    def __init__(
+        self, status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any
+    ) -> None:
+        super().__init__(detail)
+        self.status, self.detail, self.headers, self.more = status, detail, dict(headers or {}), more
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A photo and what is known about it, as sent with a request: no value is ever used as a file name."""
+
+    parameters: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # those of ``PhotoParameters`` that were given
+    files: Mapping[str, bytes] = field(default_factory=dict)  # "photo" and perhaps "depth"
+
+    @property
+    def name(self) -> str:
+        """The name of the frame in the answer."""
+        return str(self.parameters.get("name") or "photo")
+
+    @property
+    def seed(self) -> int:
+        """The seed of the search."""
+        return int(self.parameters.get("seed") or 0)
+
+
+def _decimal(value: Any) -> Any:
+    if isinstance(value, str) and not DECIMAL.fullmatch(value):
+        raise PydanticCustomError("number", "expected a number")
+    return value
+
+
+def _without_aliases(text: str) -> str:
+    """Refuse YAML, whose aliases and merge keys expand without a limit."""
+    if text.lstrip("\ufeff \t\r\n").startswith(("%YAML", "---")):
+        raise PydanticCustomError("camera", "expected JSON, or a row of COLMAP's cameras.txt")
+    return text
+
+
+Number = Annotated[float, BeforeValidator(_decimal)]
+
+
+def _only_given_defaults(schema: dict[str, Any]) -> None:
+    for each in schema["properties"].values():
+        if each.get("default", 0) is None:
+            del each["default"]
+
+
+class PhotoParameters(BaseModel):
+    """What may be known about a photo, in the query of a request or as fields of a form."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra=_only_given_defaults)
+
+    map: str = Field(None, description="by default the one that the photo shows")
+    name: str = Field(
+        None, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer"
+    )
+    focal: Number = Field(None, ge=1e-3, le=1e9, description="focal length in pixels of the stored image")
+    hfov: Number = Field(None, ge=1e-3, le=WIDEST, description="horizontal field of view in degrees")
+    depth_unit: Number = Field(None, ge=1e-9, le=1e9, description="metres per step of the depth image")
+    seed: Annotated[int, BeforeValidator(_decimal)] = Field(
+        None, ge=0, le=LARGEST_SEED, description="seed of every random choice"
+    )
+    camera: Annotated[str, BeforeValidator(_without_aliases)] = Field(
+        None, description="the content of a camera file: transforms.json, cameras.json or cameras.txt"
+    )
+    start: str = Field(None, description="JSON with a 4x4 T_world_camera to start from")
+
+    @model_validator(mode="after")
+    def _has_one_camera(self) -> PhotoParameters:
+        given = [name for name in CAMERAS if name in self.model_fields_set]
+        if len(given) > 1:
+            raise PydanticCustomError(
+                "cameras", f"{' and '.join(given)} are given, expected one of {', '.join(CAMERAS)}"
+            )
+        return self
+
+
+class PhotoForm(PhotoParameters):
+    """The form in which a photo is sent with what is known about it."""
+
+    photo: bytes = Field(description="an image file")
+    depth: bytes = Field(None, description="a depth image, or the .npy of an array: planar z")
+
+
+def checked(model: type[BaseModel], values: Any) -> Any:
+    """Return values, or JSON as bytes, as an instance of a model. Raises ``InputError`` that names the first that is wrong."""
+    try:
+        return (
+            model.model_validate_json(values) if isinstance(values, bytes) else model.model_validate(values)
+        )
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+    except RecursionError as error:
+        raise InputError("the body is nested too deeply", expected="JSON of this request") from error
+    name = ".".join(map(str, first["loc"]))
+    expected = re.sub(
+        r"^(Input|String|List|Value) should (be (?=(less|greater))|be )?", "expected ", first["msg"]
+    )
+    expected = re.sub(r"^expected (less|greater)", r"expected a number \1", expected)
+    if first["type"] == "extra_forbidden":
+        known = list(model.model_fields)
+        hint = spelling_hint(name, known, f", expected any of {', '.join(known)}")
+        raise InputError(f"unknown parameter {short(name)}{hint}")
+    if not name:
+        raise InputError(expected if first["type"] in ("cameras",) else f"the body: {expected}")
+    if first["type"] == "missing":
+        raise InputError(f"no {name!r}", expected="all that the description requires")
+    raise InputError(f"{name} is {short(first['input'])}, {expected}")
+
+
+def short(value: Any) -> str:
+    """Return a value as JSON on one line, truncated if it is long."""
+    shown = json.dumps(value, default=str)
+    return shown if len(shown) <= 60 else shown[:57] + "..."
+
+
+# Responses. They describe what is sent, and are not used to make it.
+
+
+class Problem(BaseModel):
+    """An error (RFC 9457)."""
+
+    title: str
+    status: int
+    detail: str
+    localization: Localization = Field(None)
+
+
+class Service(BaseModel):
+    """The version, the maps, and where the description of the service is."""
+
+    bidnerf: str
+    maps: list[str]
+    description: str
+
+
+class Health(BaseModel):
+    """Whether the service can answer."""
+
+    status: Literal["ok"]
+    workers: int = Field(ge=0)
+    waiting: int = Field(ge=0)
+
+
+class MapFacts(BaseModel):
+    """Facts about a map."""
+
+    backend: str
+    cameras: int = Field(ge=0)
+    landmarks: int = Field(ge=0)
+    surfels: int = Field(ge=0)
+    unit: Literal["metres", "units"]
+    distances: bool = Field(description="whether its photos determine distances")
+    bounds: dict[str, Any]
+    complete: bool = Field(description="whether its training was finished")
+    bidnerf: str = Field(description="the version that wrote it")
+    anchor: dict[str, Any] | None
+
+
+Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+Row6 = Annotated[list[float], Field(min_length=6, max_length=6)]
+
+
+class Localization(BaseModel):
+    """The pose of a photo, and whether it can be trusted: the JSON of 'bidnerf localize'."""
+
+    model_config = ConfigDict(json_schema_extra=_only_given_defaults)
+
+    frame: str
+    T_world_camera: Annotated[list[Row4], Field(min_length=4, max_length=4, description="camera to world")]
+    converged: bool = Field(description="whether the pose can be trusted")
+    outcome: str
+    reason: str
+    steps: int = Field(ge=0)
+    seconds: float
+    covariance: Annotated[list[Row6], Field(min_length=6, max_length=6)] | None = Field(
+        description="of a right update at the camera: translation before rotation"
+    )
+    loss: float | None
+    method: str
+    focal_factor: float | None
+    intrinsics: dict[str, Any] | None
+    confidence: float | None
+    unit: Literal["metres", "units"]
+    backend: str
+    error: None
+    map: str = Field(None, description="of several maps, the one that the photo shows")
+    similarity: float = Field(None, description="of the photo and that map")
+    runner_up: dict[str, Any] | None = Field(None, description="the second best of several maps")
+
+
+Problem.model_rebuild()
