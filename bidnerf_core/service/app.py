@@ -14,6 +14,7 @@ from importlib.metadata import version
 from typing import Any, Literal
 
 from fastapi import FastAPI, Request
+from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.types import Scope
@@ -21,7 +22,6 @@ from starlette.types import Scope
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import parse_json
 from bidnerf_core.service.jobs import Full, Job
-from bidnerf_core.service.metrics import TEXT
 from bidnerf_core.service.models import Health, Localization, MapFacts, Refused, Service, checked
 from bidnerf_core.service.pool import Lost, Pool
 from bidnerf_core.service.protocols import PROTOCOLS, ServiceProtocol
@@ -111,7 +111,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
 
     @app.get("/metrics", response_class=PlainTextResponse, summary="Counters and times for Prometheus.")
     async def metrics() -> Response:
-        return Response(pool.metrics.text(), headers={"Content-Type": TEXT})
+        return Response(pool.metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})
 
     @app.get("/maps", response_model=dict[str, MapFacts], summary="The maps by name, with facts about each.")
     async def maps() -> Response:
@@ -193,7 +193,8 @@ def _add_protocol(app: FastAPI, name: str, protocol: ServiceProtocol) -> None:
     app.get(f"/maps/{{map}}/{name}", response_model=Running, responses=errors(404), summary=summary)(
         running_in
     )
-    body, answered = json_body(protocol.request), {200: {"content": {protocol.media_type: {}}}}
+    body = json_body(protocol.request)
+    answered: dict[int | str, Any] = {200: {"content": {protocol.media_type: {}}}}
     _post(
         app, f"/{name}", handle, body | {"parameters": [parameter]}, body, response_model=protocol.response,
         responses=errors(*FAILURES) | answered, summary=protocol.summary,

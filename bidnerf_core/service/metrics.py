@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import psutil
-from prometheus_client import CONTENT_TYPE_LATEST as TEXT
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 """Upper bounds of the buckets of times."""
-__all__ = ["TEXT", "Metrics"]
 
 
 class Metrics:
@@ -42,9 +42,7 @@ class Metrics:
         text = "Resident memory; pages shared by processes count for each."
         memory = Gauge("bidnerf_resident_bytes", text, ["process"], registry=registry)
         for kind, numbers in processes.items():
-            memory.labels(process=kind).set_function(
-                lambda numbers=numbers: sum(map(_resident_bytes, numbers()))
-            )
+            memory.labels(process=kind).set_function(partial(_resident_bytes, numbers))
 
     def text(self) -> bytes:
         """Return the metrics in Prometheus' format."""
@@ -61,8 +59,9 @@ class Metrics:
         return self.value("request_seconds_sum") / count if count else 1.0
 
 
-def _resident_bytes(process: int) -> int:
-    try:
-        return int(psutil.Process(process).memory_info().rss)
-    except psutil.Error:
-        return 0
+def _resident_bytes(processes: Callable[[], Sequence[int]]) -> float:
+    total = 0
+    for process in processes():
+        with contextlib.suppress(psutil.Error):
+            total += psutil.Process(process).memory_info().rss
+    return total

@@ -20,6 +20,8 @@ WIDEST = 170.0
 """Largest horizontal field of view (degrees): beyond it, the inner half of the angles has less than a twelfth of a pinhole image."""
 CAMERAS = ("focal", "hfov", "camera")
 """The ways to state the camera of a photo."""
+ABSENT: Any = None
+"""The default of values that may be left out, but not be null."""
 DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 """A number as a program writes it; Python's ``float`` takes digits of every script and underscores too."""
 
@@ -81,20 +83,20 @@ class PhotoParameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra=_only_given_defaults)
 
-    map: str = Field(None, description="by default the one that the photo shows")
+    map: str = Field(ABSENT, description="by default the one that the photo shows")
     name: str = Field(
-        None, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer"
+        ABSENT, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer"
     )
-    focal: Number = Field(None, ge=1e-3, le=1e9, description="focal length in pixels of the stored image")
-    hfov: Number = Field(None, ge=1e-3, le=WIDEST, description="horizontal field of view in degrees")
-    depth_unit: Number = Field(None, ge=1e-9, le=1e9, description="metres per step of the depth image")
+    focal: Number = Field(ABSENT, ge=1e-3, le=1e9, description="focal length in pixels of the stored image")
+    hfov: Number = Field(ABSENT, ge=1e-3, le=WIDEST, description="horizontal field of view in degrees")
+    depth_unit: Number = Field(ABSENT, ge=1e-9, le=1e9, description="metres per step of the depth image")
     seed: Annotated[int, BeforeValidator(_decimal)] = Field(
-        None, ge=0, le=LARGEST_SEED, description="seed of every random choice"
+        ABSENT, ge=0, le=LARGEST_SEED, description="seed of every random choice"
     )
     camera: Annotated[str, BeforeValidator(_without_aliases)] = Field(
-        None, description="the content of a camera file: transforms.json, cameras.json or cameras.txt"
+        ABSENT, description="the content of a camera file: transforms.json, cameras.json or cameras.txt"
     )
-    start: str = Field(None, description="JSON with a 4x4 T_world_camera to start from")
+    start: str = Field(ABSENT, description="JSON with a 4x4 T_world_camera to start from")
 
     @model_validator(mode="after")
     def _has_one_camera(self) -> PhotoParameters:
@@ -110,7 +112,7 @@ class PhotoForm(PhotoParameters):
     """The form in which a photo is sent with what is known about it."""
 
     photo: bytes = Field(description="an image file")
-    depth: bytes = Field(None, description="a depth image, or the .npy of an array: planar z")
+    depth: bytes = Field(ABSENT, description="a depth image, or the .npy of an array: planar z")
 
 
 def checked(model: type[BaseModel], values: Any) -> Any:
@@ -154,7 +156,7 @@ class Problem(BaseModel):
     title: str
     status: int
     detail: str
-    localization: Localization = Field(None)
+    localization: Localization = Field(ABSENT)
 
 
 class Service(BaseModel):
@@ -215,9 +217,9 @@ class Localization(BaseModel):
     unit: Literal["metres", "units"]
     backend: str
     error: None
-    map: str = Field(None, description="of several maps, the one that the photo shows")
-    similarity: float = Field(None, description="of the photo and that map")
-    runner_up: dict[str, Any] | None = Field(None, description="the second best of several maps")
+    map: str = Field(ABSENT, description="of several maps, the one that the photo shows")
+    similarity: float = Field(ABSENT, description="of the photo and that map")
+    runner_up: dict[str, Any] | None = Field(ABSENT, description="the second best of several maps")
 
 
 Problem.model_rebuild()

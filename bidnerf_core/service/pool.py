@@ -198,7 +198,7 @@ class Pool:
 
     def _renew(self, number: int) -> None:
         """Fork a worker. If the process that holds the maps has ended or does not answer, they are reloaded first."""
-        while not self.queue.closed:
+        while True:
             with self._loading:
                 if self.queue.closed:
                     return

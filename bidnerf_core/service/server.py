@@ -263,6 +263,11 @@ def _impatient() -> type[Any]:
         def _idle(self, seconds: float) -> None:
             """Close the connection if no request arrives within some seconds, even if bytes do."""
             self.idle_since = began = self.loop.time()
-            self.loop.call_later(seconds, lambda: self.idle_since == began and self.transport.close())
+
+            def close() -> None:
+                if self.idle_since == began:
+                    self.transport.close()
+
+            self.loop.call_later(seconds, close)
 
     return Impatient

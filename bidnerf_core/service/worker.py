@@ -79,7 +79,7 @@ class Worker:
                 _, body = localize(task["upload"])
             else:
                 body = PROTOCOLS[protocol].answer(task["body"], _scene(self.maps[task["map"]]), localize)
-            found = {"status": 200, "body": body}
+            found: dict[str, Any] = {"status": 200, "body": body}
         except Refused as error:
             found = {"status": error.status, "detail": error.detail, "more": error.more}
         except InputError as error:

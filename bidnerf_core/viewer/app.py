@@ -251,8 +251,9 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
 
         drawing = asyncio.ensure_future(asyncio.get_running_loop().run_in_executor(painter, render))
         leaving = asyncio.ensure_future(left(request))
+        waited: set[asyncio.Future[Any]] = {drawing, leaving}
         try:
-            await asyncio.wait({drawing, leaving}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
         finally:
             cancelled.set()
             leaving.cancel()

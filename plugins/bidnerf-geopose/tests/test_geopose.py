@@ -96,7 +96,7 @@ def test_without_an_anchor_the_pose_is_local() -> None:
 
 
 def test_a_rejected_pose_is_never_a_geopose() -> None:
-    with pytest.raises(Refused, match="^not localized: ambiguous: because$") as refused:
+    with pytest.raises(Refused, match=r"^not localized: ambiguous: because$") as refused:
         asked(BUDAPEST, localization(Outcome.AMBIGUOUS))
     assert refused.value.status == 422
     assert refused.value.more == {"localization": {"outcome": "ambiguous"}}
@@ -111,7 +111,7 @@ def test_the_last_prior_pose_is_the_start() -> None:
     assert "start" not in asked(None, localization(), priorPoses=[prior])[1].parameters
     for anchor in (BUDAPEST, None):  # with which it would be of no use either
         for wrong in ([{"geopose": {}}], [{"geopose": {}}, prior]):
-            with pytest.raises(InputError, match="no 'priorPoses.0.geopose.position'"):
+            with pytest.raises(InputError, match=r"no 'priorPoses\.0\.geopose\.position'"):
                 asked(anchor, localization(), priorPoses=wrong)
 
 
