@@ -173,20 +173,13 @@ def named(scenes: Scenes) -> dict[str, Path]:
 
 def _bound(host: str, port: int) -> socket.socket:
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        bound = socket.socket(family, kind, protocol)
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family, backlog=CONNECTIONS)
     except (OSError, OverflowError) as error:
-        raise InputError(f"no such address ({error})", where=f"{host}:{port}") from error
-    try:
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(address)
-    except (OSError, OverflowError) as error:
-        bound.close()
         reason = getattr(error, "strerror", None) or error
         raise InputError(
             f"cannot listen there ({reason}); choose another port", where=f"{host}:{port}"
         ) from error
-    return bound
 
 
 async def _run(

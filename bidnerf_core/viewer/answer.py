@@ -143,9 +143,9 @@ class ShownAnswer:
 
 def shown_answer(
     scene: SceneMap, name: str, found: Localization, frame: Frame | None = None, record: SearchRecord | None = None,
-    truth: SE3 | None = None, side: int = PICTURE_SIDE, quick: bool = False,
+    truth: SE3 | None = None, quick: bool = False,
 ) -> ShownAnswer:  # fmt: skip
-    """Return a localization as JSON values, with renderings of at most ``side`` pixels if its ``frame`` is known.
+    """Return a localization as JSON values, with renderings if its ``frame`` is known.
 
     ``record`` is that of its search, ``truth`` the true T_world_camera. A ``quick`` answer has renderings of the surface.
     Poses are shown in the map's own coordinates, see ``Map.origin``.
@@ -157,14 +157,17 @@ def shown_answer(
     given, frame = frame, None if frame is None else found.frame_as_taken(frame)
     observed = rendered = depth = None
     if frame is not None:
-        camera = frame.intrinsics.at_most(side)
+        camera = frame.intrinsics.at_most(PICTURE_SIDE)
         observed = photograph(reduced(frame.rgb, camera.width, camera.height))
         if finite:
             rendered, depth = _compared(scene, camera, T, frame, quick)
     error = None if truth is None or not finite else pose_error(T, truth, found.unit)
     advice = ADVICE.get(found.outcome)
     other = None if record is None or not finite else _runner_up(scene, found, record, frame, quick)
-    answer = last_answer(record)
+    answer, summary = last_answer(record), ""
+    with contextlib.suppress(PluginError):  # it is not installed here
+        summary = METHODS.load(found.method).summary
+    places = found.poses.translation.detach().cpu().double()
     return ShownAnswer(
         name=name,
         outcome=str(found.outcome),
@@ -173,7 +176,7 @@ def shown_answer(
         meaning="" if advice is None else advice.meaning,
         advice="" if advice is None else advice.first,
         method=found.method,
-        method_summary=_summary(found.method),
+        method_summary=summary,
         seconds=found.seconds,
         loss=_finite(found.loss),
         unit=symbol(found.unit),
@@ -188,7 +191,7 @@ def shown_answer(
         rendered=rendered,
         depth=depth,
         steps=_steps(found, record),
-        path=_path(found.poses),
+        path=tuple((x, y, z) for x, y, z in places[places.isfinite().all(-1)].tolist()),
         matches=None if frame is None or answer is None or not finite else _matches(scene, found, answer),
         figures=acceptance_figures(found, record),
         contests=contests(found, record),
@@ -250,13 +253,6 @@ def _camera(frame: Frame | None, found: Localization) -> str:
     return frame.camera_source or "intrinsics as given"
 
 
-def _summary(method: str) -> str:
-    """Return the one-line summary of a method; empty if it is not installed here."""
-    with contextlib.suppress(PluginError):
-        return METHODS.load(method).summary
-    return ""
-
-
 def _steps(found: Localization, record: SearchRecord | None) -> tuple[ShownStep, ...]:
     """Return the steps of the search, or else of the descent, then the pose with each of its rivals, and the pose found."""
     shown, last = list[ShownStep](), found.T_world_camera.to("cpu", torch.float64)
@@ -300,12 +296,6 @@ def _numbers(values: Float[Tensor, "h"]) -> tuple[float | None, ...]:
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
-
-
-def _path(poses: SE3) -> tuple[tuple[float, float, float], ...]:
-    places = poses.translation.detach().cpu().double()
-    places = places[places.isfinite().all(-1)]
-    return tuple((x, y, z) for x, y, z in places.tolist())
 
 
 def _matches(scene: SceneMap, found: Localization, answer: Answer) -> ShownMatches | None:

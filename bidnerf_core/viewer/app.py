@@ -51,9 +51,8 @@ from bidnerf_core.service import (
 )
 from bidnerf_core.viewer.jobs import Jobs, Read
 from bidnerf_core.viewer.packing import jpeg
-from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.rendering import field_image, quick_image
-from bidnerf_core.viewer.saving import page_html
+from bidnerf_core.viewer.saving import PageState, page_html
 from bidnerf_core.viewer.scene import shown_map, thumbnail_jpeg
 from bidnerf_core.viewer.table import ShownRow
 from bidnerf_core.viewer.trajectories import ShownTrajectory

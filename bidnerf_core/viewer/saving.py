@@ -4,18 +4,43 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import re
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import write_file
-from bidnerf_core.viewer.page_state import PageState
+from bidnerf_core.io import to_plain, write_file
+from bidnerf_core.viewer.answer import ShownAnswer
+from bidnerf_core.viewer.scene import ShownMap
+from bidnerf_core.viewer.table import ShownRow
+from bidnerf_core.viewer.trajectories import ShownTrajectory
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
 """The modules of the page, each after those that it imports. They share one scope, so their names must differ."""
 IMPORT = re.compile(r'^import \{[^}]*\} from "\./\w+\.js";\n', re.MULTILINE)
+
+ESCAPED = str.maketrans({c: f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"})
+"""JSON escapes of the characters that could end a script in a page or begin markup."""
+
+
+@dataclass(frozen=True)
+class PageState:
+    """A map, and the localizations in it."""
+
+    map: ShownMap
+    answers: tuple[ShownAnswer, ...] = ()
+    title: str = ""
+    live: bool = False  # whether a server answers
+    queries: tuple[str, ...] = ()  # names of images that the server can localize
+    trajectory: ShownTrajectory | None = None
+    results: tuple[ShownRow, ...] = ()
+    hfov: float | None = None  # horizontal field of view (degrees) with which the page's field is filled in
+    camera_given: bool = (
+        False  # whether photos without a field of view have a given camera, not that of EXIF or the map
+    )
 
 
 def page_html(state: PageState) -> str:
@@ -29,7 +54,7 @@ def page_html(state: PageState) -> str:
     parts = {
         "policy": f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
         "style": f"<style>{style}</style>",
-        "state": state.json(),
+        "state": json.dumps(to_plain(state), allow_nan=False, separators=(",", ":")).translate(ESCAPED),
         "scripts": f'<script>{library}</script>\n<script type="module">{scripts}</script>',
     }
     return re.sub(r"<!-- (\w+) -->", lambda found: parts[found[1]], _part("index.html"))

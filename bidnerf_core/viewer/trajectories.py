@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 
@@ -37,16 +37,6 @@ class ShownTrajectory:
     outcomes: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class _Posed:
-    T: SE3
-    frame: str = ""
-    time: float | None = None
-    sigma: float | None = None
-    outcome: str = ""
-    unit: str | None = None  # None if the file does not state it
-
-
 def shown_trajectory(
     path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> ShownTrajectory:
@@ -54,67 +44,55 @@ def shown_trajectory(
 
     Its poses are shown relative to ``origin``, that of the map. A remark is logged if the file states another unit than the map's ``unit``. Raises ``InputError`` for a file without poses.
     """
-    found = _from_json(path) if path.suffix.lower() in (".json", ".jsonl") else _from_rows(path)
+    content = read_file(path, "a trajectory")
+    if path.suffix.lower() in (".json", ".jsonl"):
+        found = [_posed(entry, path) for entry in pose_entries(path, content) if isinstance(entry, dict)]
+        found = [each for each in found if each[0] is not None]
+    else:
+        rows = read_trajectory(path)
+        stated = re.search(rb"^#.*lengths in (metres|units)", content.partition(b"\n")[0])  # by bidnerf
+        of = None if stated is None else stated[1].decode()
+        poses = zip(rows.times.tolist(), rows.rotations, rows.translations, strict=True)
+        found = [
+            (SE3(rotation, translation), "", time, None, "", of) for time, rotation, translation in poses
+        ]
     if not found:
         raise InputError("holds no pose", where=path, expected="those of a trajectory")
-    other = {each.unit for each in found} - {unit, None}
+    some = found[:: max(1, math.ceil(len(found) / MOST_POSES))]
+    T, frames, times, sigmas, outcomes, _ = zip(*some, strict=True)
+    other = {each[-1] for each in found} - {unit, None}
     if unit is not None and other:
         log.info(
             "%s: is in %s, but the map is in %s; its poses are shown as they are", path, other.pop(), unit
         )
-    some = found[:: max(1, math.ceil(len(found) / MOST_POSES))]
-    return ShownTrajectory(
-        path.name,
-        packed(
-            SE3.stack([each.T for each in some])
-            .translated(-torch.tensor(origin).double())
-            .matrix()[:, :3]
-            .flatten(1)
-            .numpy()
-        ),
-        tuple(each.frame for each in some),
-        tuple(each.time for each in some),
-        tuple(each.sigma for each in some),
-        tuple(each.outcome for each in some),
-    )
+    shown = SE3.stack(list(T)).translated(-torch.tensor(origin).double()).matrix()[:, :3]
+    return ShownTrajectory(path.name, packed(shown.flatten(1).numpy()), frames, times, sigmas, outcomes)
 
 
-def _from_rows(path: Path) -> list[_Posed]:
-    found, unit = read_trajectory(path), _stated_unit(path)
-    rows = zip(found.times.tolist(), found.rotations, found.translations, strict=True)
-    return [_Posed(SE3(rotation, translation), time=time, unit=unit) for time, rotation, translation in rows]
-
-
-def _stated_unit(path: Path) -> str | None:
-    """Return the unit of lengths in the first line of a file that bidnerf wrote."""
-    head = read_file(path, "a trajectory").partition(b"\n")[0]
-    found = re.search(rb"^#.*lengths in (metres|units)", head)
-    return None if found is None else found[1].decode()
-
-
-def _from_json(path: Path) -> list[_Posed]:
-    entries = pose_entries(path, read_file(path, "a trajectory"))
-    return [
-        _posed(entry, path) for entry in entries if isinstance(entry, dict) and entry.get("T_world_camera")
-    ]
+_Posed: TypeAlias = tuple[SE3 | None, str, float | None, float | None, str, str | None]
+"""A pose, the frame's name, its time, the standard deviation of the position, the outcome, and the unit of lengths."""
 
 
 def _posed(entry: dict[str, Any], path: Path) -> _Posed:
     try:
-        rows = torch.tensor(entry["T_world_camera"], dtype=torch.float64)
-        covariance = entry.get("covariance")
-        sigma = None
+        rows, covariance = entry.get("T_world_camera"), entry.get("covariance")
+        T = (
+            pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_world_camera", path)
+            if rows
+            else None
+        )
+        sigma = math.nan
         if covariance is not None:
             sigma = standard_deviations(torch.tensor(covariance, dtype=torch.float64).reshape(6, 6))[0]
-        time = entry.get("time")
-        time = None if time is None else float(time)
+        time = None if entry.get("time") is None else float(entry["time"])
+    except InputError:
+        raise
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(
             f"{entry.get('frame')!r} has no matrices of numbers", where=path, expected="poses"
         ) from error
     unit = entry.get("unit")
-    finite = sigma is not None and math.isfinite(sigma)
-    return _Posed(
-        pose_from_matrix(rows, "T_world_camera", path), str(entry.get("frame", "")), time,
-        sigma if finite else None, str(entry.get("outcome", "")), unit if isinstance(unit, str) else None,
+    return (
+        T, str(entry.get("frame", "")), time, sigma if math.isfinite(sigma) else None, str(entry.get("outcome", "")),
+        unit if isinstance(unit, str) else None,
     )  # fmt: skip

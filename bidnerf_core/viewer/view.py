@@ -15,8 +15,7 @@ from bidnerf_core.localization import Localization, Localizer, SearchRecord, rec
 from bidnerf_core.maps import Map
 from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.viewer.answer import ShownAnswer, shown_answer
-from bidnerf_core.viewer.page_state import PageState
-from bidnerf_core.viewer.saving import page_html, save_page
+from bidnerf_core.viewer.saving import PageState, page_html, save_page
 from bidnerf_core.viewer.scene import shown_map
 from bidnerf_core.viewer.table import ShownRow
 from bidnerf_core.viewer.trajectories import ShownTrajectory, shown_trajectory

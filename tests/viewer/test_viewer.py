@@ -41,9 +41,8 @@ from bidnerf_core.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, 
 from bidnerf_core.viewer.explanations import EARLIER, HERE, contests
 from bidnerf_core.viewer.figures import MEASURES, Bar, acceptance_figures
 from bidnerf_core.viewer.packing import packed_points
-from bidnerf_core.viewer.page_state import PageState
 from bidnerf_core.viewer.rendering import field_image, quick_image
-from bidnerf_core.viewer.saving import MODULES, page_html
+from bidnerf_core.viewer.saving import MODULES, PageState, page_html
 from bidnerf_core.viewer.scene import shown_map, towards
 from bidnerf_core.viewer.view import localized
 from commands import Run, assert_refused
