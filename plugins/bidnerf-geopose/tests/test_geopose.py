@@ -17,8 +17,9 @@ from PIL import Image
 from bidnerf_core import SE3, InputError, Intrinsics, Localization, Outcome
 from bidnerf_core.geometry import Geodetic
 from bidnerf_core.maps import Anchor, GeographicPose
+from bidnerf_core.registry import registered
 from bidnerf_core.results import Answer
-from bidnerf_core.service import Refused, checked
+from bidnerf_core.service import Refused, checked, service_app
 from bidnerf_geopose import answers
 from bidnerf_geopose.protocol import GEOPOSE, GeoPoseRequest
 
@@ -159,3 +160,14 @@ def test_requests_that_contradict_the_protocol_are_refused_with_the_part_that_is
 def test_answers_are_those_of_the_description() -> None:
     for anchor in (BUDAPEST, None):
         GEOPOSE.response.model_validate(asked(anchor, localization())[0])
+
+
+def test_a_service_with_the_plugin_describes_its_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fastapi", reason="the extra 'serve' is not installed")
+    monkeypatch.setitem(registered, ("services", "geopose"), GEOPOSE)
+    paths = service_app(["a", "b"]).openapi()["paths"]
+    (name,) = paths["/geopose"]["post"]["parameters"]
+    assert (name["name"], name["required"], name["schema"]["enum"]) == ("map", True, ["a", "b"])
+    answered = paths["/maps/{map}/geopose"]["post"]["responses"]["200"]["content"]
+    assert set(answered) == {"application/json", GEOPOSE.media_type}
+    assert set(paths["/geopose"]) == {"get", "post"}
