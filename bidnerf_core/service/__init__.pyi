@@ -1,6 +1,5 @@
 from .client import ServiceClient as ServiceClient
 from .client import ServiceError as ServiceError
-from .jobs import Full as Full
 from .jobs import Job as Job
 from .jobs import Queue as Queue
 from .models import LONGEST_NAME as LONGEST_NAME
@@ -20,7 +19,6 @@ from .upload import public_message as public_message
 from .upload import read_upload as read_upload
 from .web import CLIENT_GONE as CLIENT_GONE
 from .web import body_of as body_of
-from .web import busy as busy
 from .web import errors as errors
 from .web import json_body as json_body
 from .web import left as left

@@ -21,7 +21,7 @@ from starlette.types import Scope
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import parse_json
-from bidnerf_core.service.jobs import Full, Job
+from bidnerf_core.service.jobs import Job
 from bidnerf_core.service.models import Health, Localization, MapFacts, Refused, Service, checked
 from bidnerf_core.service.pool import Lost, Pool
 from bidnerf_core.service.protocols import PROTOCOLS, ServiceProtocol
@@ -30,7 +30,6 @@ from bidnerf_core.service.web import (
     CLIENT_GONE,
     UPLOAD_ERRORS,
     body_of,
-    busy,
     errors,
     json_body,
     left,
@@ -117,93 +116,95 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     async def maps() -> Response:
         return _json(pool.described)
 
-    @app.get("/maps/{map}", response_model=MapFacts, responses=errors(404), summary="Facts about a map.")
-    async def facts(request: Request, map: str) -> Response:
-        return _json(pool.described[_chosen(request, map)])
+    async def facts(request: Request) -> Response:
+        return _json(pool.described[_chosen(request)])
 
-    async def localize(request: Request, job: Job, map: str | None) -> Response:
-        upload = await photo_of(request, limits)
-        name = dict(upload.parameters).pop("map", None) if map is None else map
-        chosen = (
-            None if name is None and len(names) > 1 else _chosen(request, name)
-        )  # without one, the map is found
-        return _json(await _answer(request, job, {"map": chosen, "upload": upload}))
+    async def localize(request: Request) -> Response:
+        with pool.queue.place() as job:
+            upload = await photo_of(request, limits)
+            name = dict(upload.parameters).get("map")
+            nowhere = name is None and "map" not in request.path_params and len(names) > 1
+            task = {"map": None if nowhere else _chosen(request, name), "upload": upload}
+            return _json(await _answer(request, job, task))
 
-    _post(
-        app, "/localize", localize, photo_body(), photo_body("map"), response_model=Localization, responses=errors(*FAILURES),
-        summary="Find the pose of a photo.", description=LOCALIZE,
+    app.get(
+        "/maps/{map}",
+        **_in_map({}),
+        response_model=MapFacts,
+        responses=errors(404),
+        summary="Facts about a map.",
+    )(facts)
+    _add(
+        app, "POST", "/localize", localize, photo_body(), photo_body("map"), response_model=Localization,
+        responses=errors(*FAILURES), summary="Find the pose of a photo.", description=LOCALIZE,
     )  # fmt: skip
     for name, protocol in PROTOCOLS.items():
         _add_protocol(app, name, protocol)
     return app
 
 
-def _post(
-    app: FastAPI, path: str, handle: Callable[[Request, Job, str | None], Awaitable[Response]], body: dict[str, Any],
+def _add(
+    app: FastAPI, method: str, path: str, handle: Callable[[Request], Awaitable[Response]], body: dict[str, Any],
     in_map_body: dict[str, Any], **more: Any,
 ) -> None:  # fmt: skip
-    """Add a path for requests, and the one of each map; ``handle`` is called with a job that has a place.
+    """Add a path, and the one of each map; ``body`` and ``in_map_body`` are what OpenAPI says of their requests."""
+    app.api_route(path, methods=[method], openapi_extra=body, **more)(handle)
+    app.api_route(f"/maps/{{map}}{path}", methods=[method], **_in_map(in_map_body), **more)(handle)
 
-    ``body`` and ``in_map_body`` are what OpenAPI says of their parameters and bodies.
-    """
-    pool: Pool = app.state.pool
 
-    async def queued(request: Request, map: str | None) -> Response:
-        try:
-            job = pool.queue.enter()
-        except Full as error:
-            raise busy(f"all {pool.queue.places} places are taken", pool.retry_after) from error
-        try:
-            return await handle(request, job, map)
-        finally:
-            job.stop("cancelled")
+def _in_map(body: dict[str, Any]) -> dict[str, Any]:
+    parameters = [_map_in("path", True), *body.get("parameters", ())]
+    return {"openapi_extra": body | {"parameters": parameters}}
 
-    async def anywhere(request: Request) -> Response:
-        return await queued(request, None)
 
-    async def in_map(request: Request, map: str) -> Response:
-        return await queued(request, _chosen(request, map))
-
-    app.post(path, openapi_extra=body, **more)(anywhere)
-    app.post(f"/maps/{{map}}{path}", openapi_extra=in_map_body, **more)(in_map)
+def _map_in(place: str, required: bool) -> dict[str, Any]:
+    return {"name": "map", "in": place, "required": required, "schema": {"type": "string"}}
 
 
 def _add_protocol(app: FastAPI, name: str, protocol: ServiceProtocol) -> None:
     """Add the paths of another protocol."""
-    several = len(app.state.names) > 1
-    parameter = {"name": "map", "in": "query", "required": several, "schema": {"type": "string"}}
+    pool: Pool = app.state.pool
 
-    async def handle(request: Request, job: Job, map: str | None) -> Response:
-        body = parse_json(await body_of(request, app.state.limits), "", "a JSON object")
-        checked(protocol.request, body)
-        chosen = _chosen(request, request.query_params.get("map") if map is None else map)
-        answer = await _answer(request, job, {"map": chosen, "protocol": name, "body": body})
+    async def ask(request: Request) -> Response:
+        with pool.queue.place() as job:
+            body = parse_json(await body_of(request, app.state.limits), "", "a JSON object")
+            checked(protocol.request, body)
+            chosen = _chosen(request, request.query_params.get("map"))
+            answer = await _answer(request, job, {"map": chosen, "protocol": name, "body": body})
         accepts = protocol.media_type.partition(";")[0] in request.headers.get("accept", "")
         return _json(answer, protocol.media_type if accepts else "application/json")
 
-    async def running() -> Response:
-        return _json({"status": "running"})
-
-    async def running_in(request: Request, map: str) -> Response:
-        _chosen(request, map)
+    async def running(request: Request) -> Response:
+        if "map" in request.path_params:
+            _chosen(request)
         return _json({"status": "running"})
 
     summary = f"Whether the endpoint is up: {protocol.summary}"
-    app.get(f"/{name}", response_model=Running, summary=summary)(running)
-    app.get(f"/maps/{{map}}/{name}", response_model=Running, responses=errors(404), summary=summary)(
-        running_in
+    _add(
+        app,
+        "GET",
+        f"/{name}",
+        running,
+        {},
+        {},
+        response_model=Running,
+        responses=errors(404),
+        summary=summary,
     )
-    body = json_body(protocol.request)
-    answered: dict[int | str, Any] = {200: {"content": {protocol.media_type: {}}}}
-    _post(
-        app, f"/{name}", handle, body | {"parameters": [parameter]}, body, response_model=protocol.response,
-        responses=errors(*FAILURES) | answered, summary=protocol.summary,
+    body, answered = json_body(protocol.request), {200: {"content": {protocol.media_type: {}}}}
+    _add(
+        app, "POST", f"/{name}", ask, body | {"parameters": [_map_in("query", len(app.state.names) > 1)]}, body,
+        response_model=protocol.response, responses=errors(*FAILURES) | answered, summary=protocol.summary,
     )  # fmt: skip
 
 
-def _chosen(request: Request, name: str | None) -> str:
-    """Return the name of the map that a request is for. Raises ``Refused`` for an unknown one, and ``InputError`` if one has to be named."""
+def _chosen(request: Request, name: str | None = None) -> str:
+    """Return the name of the map that a request is for: in its path, else the given one, else the only one.
+
+    Raises ``Refused`` for an unknown one, and ``InputError`` if one has to be named.
+    """
     names: list[str] = request.app.state.names
+    name = request.path_params.get("map", name)
     if name is None:
         if len(names) > 1:
             raise InputError("several maps are served", expected=f"map as one of {', '.join(names)}")

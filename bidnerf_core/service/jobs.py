@@ -11,9 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Any
 
-
-class Full(Exception):
-    """There are already as many jobs as the queue has places."""
+from bidnerf_core.service.models import Refused
 
 
 class Job:
@@ -53,10 +51,14 @@ class Job:
 
 
 class Queue:
-    """Jobs in the order of their arrival, at most ``places`` of them: uploading, waiting and at work."""
+    """Jobs in the order of their arrival, at most ``places`` of them: uploading, waiting and at work.
 
-    def __init__(self, places: int) -> None:
+    ``retry_after`` returns the whole seconds after which a place is likely to be free.
+    """
+
+    def __init__(self, places: int, retry_after: Callable[[], int] = lambda: 5) -> None:
         self.places, self.taken, self.closed = places, 0, False
+        self._retry_after = retry_after
         self._waiting = deque[Job]()
         self._changed = threading.Condition()
 
@@ -66,14 +68,25 @@ class Queue:
         return len(self._waiting)
 
     def enter(self, name: str = "") -> Job:
-        """Return a new job, which has a place until it is done or stopped. Raises ``Full`` if no place is left."""
+        """Return a new job, which has a place until it is done or stopped. Raises ``Refused`` if no place is left."""
         with self._changed:
             if self.taken >= self.places:
-                raise Full
+                headers = {"Retry-After": str(self._retry_after()), "Connection": "close"}
+                raise Refused(429, f"all {self.places} places are taken, try again later", headers)
             self.taken += 1
         job = Job(name)
         job.result.add_done_callback(lambda _: self._leave(job))
         return job
+
+    @contextlib.contextmanager
+    def place(self, name: str = "") -> Iterator[Job]:
+        """Enter a job, which is stopped if the block raises an error, also ``Refused`` if no place is left."""
+        job = self.enter(name)
+        try:
+            yield job
+        except BaseException:
+            job.stop("refused")
+            raise
 
     def put(self, job: Job, task: Any) -> None:
         """Let a job wait for a thread that does ``task``."""

@@ -88,7 +88,7 @@ class Pool:
 
     def __init__(self, order: dict[str, Any], limits: ServiceLimits) -> None:
         """``order`` is what the process that loads the maps gets, see ``worker.main``."""
-        self.queue = Queue(limits.processes + limits.queue)
+        self.queue = Queue(limits.processes + limits.queue, self._retry_after)
         self.described: dict[str, Any] = {}
         self._order, self._limits = order, limits
         self._workers: dict[int, WorkerProcess] = {}
@@ -116,9 +116,7 @@ class Pool:
         workers = list(self._workers.items())
         return [worker.pid for number, worker in workers if number in self._busy or not worker.ended]
 
-    @property
-    def retry_after(self) -> int:
-        """Whole seconds after which a place is likely to be free."""
+    def _retry_after(self) -> int:
         mean = self.metrics.mean_seconds
         return max(1, min(60, round(mean * self._limits.queue / self._limits.processes)))
 

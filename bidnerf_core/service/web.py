@@ -263,11 +263,6 @@ async def left(request: Request) -> None:
         pass
 
 
-def busy(what: str, seconds: int) -> Refused:
-    """Return the refusal of a request beyond the bound of the queue, to be tried again after ``seconds``."""
-    return Refused(429, f"{what}, try again later", {"Retry-After": str(seconds), "Connection": "close"})
-
-
 # The description.
 
 

@@ -33,12 +33,10 @@ from bidnerf_core.maps import Map
 from bidnerf_core.progress import job_context
 from bidnerf_core.service import (
     CLIENT_GONE,
-    Full,
     Job,
     Refused,
     ServiceLimits,
     body_of,
-    busy,
     checked,
     errors,
     json_body,
@@ -159,19 +157,6 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
     if token is not None:
         app.add_middleware(Login, token=token)
 
-    @contextlib.contextmanager
-    def place(name: str) -> Any:
-        """Give a job with a place in the queue, which is given up if no localization is queued."""
-        try:
-            job = jobs.queue.enter(name)
-        except Full as error:
-            raise busy("several photos are waiting already", 5) from error
-        try:
-            yield job
-        except BaseException:
-            job.stop("refused")
-            raise
-
     def queued(job: Job, read: Read) -> Response:
         return JSONResponse({"job": jobs.put(job, read).id}, 202)
 
@@ -197,7 +182,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
         summary="Queue the localization of a photo.",
     )  # fmt: skip
     async def photo(request: Request) -> Response:
-        with place("photo") as job:
+        with jobs.queue.place("photo") as job:
             upload = await photo_of(request, limits)
             if "map" in upload.parameters:
                 raise InputError("map is given", expected="none, since the viewer shows one map")
@@ -221,7 +206,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
     )  # fmt: skip
     async def query(number: str) -> Response:
         index = _index(number, len(names), "image with which the viewer was started")
-        with place(names[index]) as job:
+        with jobs.queue.place(names[index]) as job:
             assert shown.source is not None
             source = shown.source
             return queued(job, lambda: (source.read(index), None, 0))
