@@ -191,7 +191,8 @@ def _add_protocol(app: FastAPI, name: str, protocol: ServiceProtocol) -> None:
         responses=errors(404),
         summary=summary,
     )
-    body, answered = json_body(protocol.request), {200: {"content": {protocol.media_type: {}}}}
+    body = json_body(protocol.request)
+    answered: dict[int | str, Any] = {200: {"content": {protocol.media_type: {}}}}
     _add(
         app, "POST", f"/{name}", ask, body | {"parameters": [_map_in("query", len(app.state.names) > 1)]}, body,
         response_model=protocol.response, responses=errors(*FAILURES) | answered, summary=protocol.summary,
