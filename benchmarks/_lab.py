@@ -15,7 +15,7 @@ import torch
 from scipy.stats import chi2
 
 from bidnerf_core import Localization, Map, View, load_map
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.evaluation import write_record
 from bidnerf_core.results import normalized_error_squared, pose_error, success_rate
 
@@ -74,7 +74,7 @@ class Scene:
     folder: Path
     data: Path
     map: Map
-    dataset: Dataset
+    dataset: Capture
 
     @classmethod
     def open(cls, pair: str) -> Scene:

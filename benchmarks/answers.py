@@ -62,7 +62,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from bidnerf_core import Localizer
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import VERSIONS, RowStore, faulty, provenance, random_units, warped
 from bidnerf_core.frames import Frame, View
@@ -295,7 +295,7 @@ class Subject:
         return kept if len(kept) >= FEWEST else list(names)
 
     @cached_property
-    def foreign(self) -> dict[str, tuple[Dataset, str]]:
+    def foreign(self) -> dict[str, tuple[Capture, str]]:
         """Frames of other scenes by name, alternately of each."""
         sets = {other: self.dataset(other) for other in self.others}
         names = {other: spread(data.frame_names("test"), FRAMES) for other, data in sets.items()}
@@ -310,7 +310,7 @@ class Subject:
     def localizer_of_two(self) -> Localizer:
         return Localizer(doubled(self.scene.map, copies(self.scene.map.bounds)[0]))
 
-    def dataset(self, name: str) -> Dataset:
+    def dataset(self, name: str) -> Capture:
         return open_dataset(folder_of("BIDNERF_DATA") / name, self.scene.map.bounds.background)
 
     @lru_cache(maxsize=64)  # noqa: B019

@@ -41,7 +41,7 @@ from query_conditions import resized
 
 from bidnerf_core import SE3, Frame, View
 from bidnerf_core.captures import build_tried_landmarks
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.evaluation import RowStore
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import Features, find_features
@@ -105,7 +105,7 @@ def localized(landmarks: LandmarkMatcher, features: Features, query: View) -> Ro
 class Maps:
     """The landmarks of one choice of photos, by detector, which are built when they are first needed."""
 
-    def __init__(self, data: Dataset, names: Sequence[str]) -> None:
+    def __init__(self, data: Capture, names: Sequence[str]) -> None:
         self._data, self._names = data, names
         self._built: dict[str, LandmarkMatcher] = {}
 

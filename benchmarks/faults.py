@@ -44,7 +44,7 @@ from _lab import (
 from _lab import answer as timed_answer
 
 from bidnerf_core import Localization, Localizer, Map, load_map
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
     FAULTS,
@@ -104,7 +104,7 @@ def map_of(folder: str) -> Map:
 
 
 @lru_cache(maxsize=8)
-def dataset_of(folder: str, background: tuple[float, float, float]) -> Dataset:
+def dataset_of(folder: str, background: tuple[float, float, float]) -> Capture:
     """Return a dataset, cached."""
     return open_dataset(Path(folder), background)
 

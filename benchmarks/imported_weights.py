@@ -28,7 +28,7 @@ import torch
 from kornia.metrics import psnr
 from scipy.stats import binomtest
 
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.evaluation import (
     NEVER,
     ResultsFile,
@@ -93,7 +93,7 @@ def seen(stored: Map, view: View, picture: Path | None) -> dict[str, float]:
     return found
 
 
-def image_quality(stored: Map, dataset: Dataset, given: argparse.Namespace, kept: RowStore) -> dict[str, Any]:
+def image_quality(stored: Map, dataset: Capture, given: argparse.Namespace, kept: RowStore) -> dict[str, Any]:
     """Return the PSNR of frames spread evenly over the test split; the first one is drawn."""
     names = dataset.frame_names("test")
     rows = []
@@ -119,7 +119,7 @@ def cell_trial(folder: Path, given: argparse.Namespace, cell: Cell, frame: str, 
     )  # fmt: skip
 
 
-def all_trials(folder: Path, dataset: Dataset, given: argparse.Namespace) -> dict[Cell, list[TrialResult]]:
+def all_trials(folder: Path, dataset: Capture, given: argparse.Namespace) -> dict[Cell, list[TrialResult]]:
     """Return the results of each cell.
 
     Trials run start by start, so that an interrupted run has the same starts in every cell. Fine levels, which cost five

@@ -28,7 +28,7 @@ from _lab import Row
 
 import bidnerf_core as bn
 from bidnerf_core import SE3, Frame, Map, View
-from bidnerf_core.datasets import TimedFrame, all_views
+from bidnerf_core.datasets import TimedFrame
 from bidnerf_core.geometry import Similarity, fit_similarity
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import pose_error
@@ -60,7 +60,7 @@ def main() -> None:
     result = without_files(to_plain(found)) | (
         {"seconds": time.monotonic() - began} if not known.exists() else {}
     )
-    placed = {v.frame.name: v for v in all_views(bn.open_dataset(given.out / "poses"))}
+    placed = {v.frame.name: v for v in bn.open_dataset(given.out / "poses").views("all")}
     if given.video:  # frames are named by their numbers
         placed = {order[int(name)]: renamed(view, order[int(name)]) for name, view in placed.items()}
     names = [name for name in order if name in placed]

@@ -27,7 +27,7 @@ from clouds import Gicp, KissMatcher, Open3d, Points, Ransac, Refine, SmallGicp,
 from landmark_peers import Answer, Peer, answer, auto, kiss_gicp, open3d
 
 from bidnerf_core import ImportOptions, Localizer, View, import_map, load_map
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import RowStore
 
@@ -137,7 +137,7 @@ def once(make: Callable[[], Localizer]) -> Peer:
 
 def scene_rows(data: Path, given: argparse.Namespace, store: RowStore) -> dict[str, list[Row]]:
     """Return the rows of all peers on the frames of a dataset."""
-    dataset: Dataset = open_dataset(data)
+    dataset: Capture = open_dataset(data)
     folder = given.folder / data.name
     folder.mkdir(parents=True, exist_ok=True)
     fused(dataset.views("train"), folder)

@@ -1,9 +1,8 @@
 from .backend import RecipeBackend as RecipeBackend
 from .backend import load_backend as load_backend
 from .camera import Intrinsics as Intrinsics
-from .datasets import Dataset as Dataset
+from .datasets import Capture as Capture
 from .datasets import DatasetOptions as DatasetOptions
-from .datasets import FrameSequence as FrameSequence
 from .datasets import open_dataset as open_dataset
 from .datasets import open_sequence as open_sequence
 from .datasets import write_transforms as write_transforms

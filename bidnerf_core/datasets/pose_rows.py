@@ -5,6 +5,7 @@ NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices w
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +50,18 @@ def _from_opengl(record: Record, key: str, rows: list[list[float]]) -> SE3:
     return rigid_pose(matrix, record.where, f"the rotation of {key}")
 
 
-def read_pose_matrix(path: Path) -> SE3:
-    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
+def read_pose_matrix(path: Path) -> SE3 | None:
+    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix; None if tracking failed,
+    as numbers that are not finite record.
 
     Raises ``InputError``, which names the offending line.
     """
     expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
-    rows = [row.numbers(count=4) for row in read_rows(path, "a file of a pose", expected, LARGEST_POSE)]
+    lines = read_rows(path, "a file of a pose", expected, LARGEST_POSE)
+    rows = [row.plain_numbers(row.words) for row in lines]
+    if not all(map(math.isfinite, (number for row in rows for number in row))):
+        return None
+    rows = [row.numbers(count=4) for row in lines]
     if len(rows) != 4:
         raise InputError(f"has {len(rows)} rows", where=path, expected=expected)
     if max(abs(x - y) for x, y in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:

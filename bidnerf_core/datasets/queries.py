@@ -10,19 +10,17 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets.capture import Capture
 from bidnerf_core.datasets.colmap import SparsePoints
-from bidnerf_core.datasets.dataset import Dataset, unique_names
-from bidnerf_core.datasets.masked import MaskedDataset
+from bidnerf_core.datasets.formats.photos import PhotoShot
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.reader import file_of_dataset, no_dataset
-from bidnerf_core.datasets.transforms import TransformsDataset
-from bidnerf_core.datasets.whole import WholeDataset, with_all
 from bidnerf_core.depth import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import DEPTH_STEM, Frame, MaskFolder, View, photos_in
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Background, looks_like_image
+from bidnerf_core.io import Background, background_colour, looks_like_image
 from bidnerf_core.localization import window as windowed
 
 log = logging.getLogger("bidnerf")
@@ -79,7 +77,52 @@ class DepthPoints:
         return rays
 
 
-class Photos:
+class Queries:
+    """Frames of a capture as queries, each of them the last of a rig: names of frames with known relative poses.
+
+    Frames of a ``split`` are named as in it; without one, frames have no pose, and each is a rig of its own.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        rigs: Sequence[tuple[str, ...]],
+        split: str | None,
+        points: DepthPoints | None = None,
+    ) -> None:
+        self.capture, self._rigs, self._split, self._points = capture, rigs, split, points
+        self._remarks: set[str] = set()
+
+    @property
+    def names(self) -> Sequence[str]:
+        return [rig[-1] for rig in self._rigs]
+
+    def read(self, place: int) -> Query:
+        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
+        if self._split is None:
+            shot = self.capture.shots[place]
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", InputWarning)
+                frame = self.capture[place].frame
+            for warning in caught:
+                self._remark(shot.name, str(warning.message).partition(": ")[2] or str(warning.message))
+            self._remark(shot.name, f"{frame.camera_source}")
+            views: tuple[View, ...] = (View(frame, SE3.identity()),)
+            truth = None
+        else:
+            views = tuple(self.capture.views(self._split, self._rigs[place]))
+            (shot,), truth = self.capture.select(self._split, self._rigs[place][-1:]), views[-1].T_ref_camera
+        rays = None if self._points is None else self._points.rays(views, self._split or "")
+        return Query(views[-1].frame.name, views, truth, rays, shot.file)
+
+    def _remark(self, name: str, text: str) -> None:
+        """Log the source of a camera, or an assumption, unless the same was logged for an earlier photo."""
+        if text not in self._remarks:
+            self._remarks.add(text)
+            log.info("%s: %s", name, text)
+
+
+class Photos(Queries):
     """Image files, each of them a query.
 
     ``depth`` holds the depth files of photos that have one, ``depth_unit`` is the length of one of its steps
@@ -98,99 +141,55 @@ class Photos:
         points: DepthPoints | None = None,
         masks: MaskFolder | None = None,
     ) -> None:
-        self._files, self._background, self._points, self._masks = files, background, points, masks
-        self._camera = CameraSource() if camera is None else camera
-        self._depth, self._depth_unit, self._sensor = depth or {}, depth_unit, sensor
-        self._names = unique_names([(*file.parts[:-1], file.stem) for file in files])
-        self._remarks: set[str] = set()
+        source, depth = camera or CameraSource(), depth or {}
+        shots = [
+            PhotoShot(
+                image=file, camera=source, depth_image=depth.get(file), depth_unit=depth_unit, sensor=sensor
+            )
+            for file in files
+        ]
+        capture = Capture(Path("photos"), shots, background_colour(background))
         if masks is not None:
-            masks.require_any(self._names)
-
-    @property
-    def names(self) -> Sequence[str]:
-        return self._names
+            capture = capture.masked(masks, by_stem=True)
+        super().__init__(capture, [(name,) for name in capture.names], None, points)
+        self._without_depth = {shot.name for shot in capture.shots if depth and shot.file not in depth}
 
     def read(self, place: int) -> Query:
-        file, name = self._files[place], self._names[place]
-        masks = self._masks
-        mask = None if masks is None else masks.file_of(name) or masks.file_of(file.stem)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", InputWarning)
-            frame = Frame.read(
-                file, self._camera, depth=self._depth.get(file), depth_unit=self._depth_unit,
-                sensor=self._sensor, background=self._background, mask=mask,
-                mask_hides="black" if masks is None else masks.hides,
-            )  # fmt: skip
-        for warning in caught:
-            self._remark(name, str(warning.message).partition(": ")[2] or str(warning.message))
-        self._remark(name, f"{frame.camera_source}")
-        if self._depth and file not in self._depth:
+        if (name := self.names[place]) in self._without_depth:
             log.info("%s: no measured depth was given; colour only", name)
-        views = (View(frame.replace(name=name), SE3.identity()),)
-        rays = None if self._points is None else self._points.rays(views, "")
-        return Query(name, views, depth_rays=rays, file=file)
-
-    def _remark(self, name: str, text: str) -> None:
-        """Log the source of a camera, or an assumption, unless the same was logged for an earlier photo."""
-        if text not in self._remarks:
-            self._remarks.add(text)
-            log.info("%s: %s", name, text)
+        return super().read(place)
 
 
-class DatasetFrames:
+class DatasetFrames(Queries):
     """Frames of a dataset as queries: one rig of ``names``, or each frame of a split with the ``window - 1`` before it."""
 
     def __init__(
         self,
-        dataset: Dataset,
+        dataset: Capture,
         split: str = "test",
         names: tuple[str, ...] = (),
         window: int = 1,
         points: DepthPoints | None = None,
     ) -> None:
-        self._dataset = dataset = with_all(dataset, split)
-        self._split, self._points = split, points
         listed = dataset.frame_names(split)
         if not listed:
             raise InputError(f"split {split!r} has no frames", where=dataset.path)
         if window > len(listed):
             raise UsageError(f"--window is {window}", expected=f"1 to {len(listed)}")
-        asked = [names] if names else [(name,) for name in listed]
-        self._rigs = [self._with_window(rig, listed, window) for rig in asked]
-
-    @property
-    def names(self) -> Sequence[str]:
-        return [rig[-1] for rig in self._rigs]
+        rigs = []
+        for rig in [names] if names else [(name,) for name in listed]:
+            if window > 1 and rig[0] in listed:  # an unknown name is rejected on reading
+                rig = windowed(listed, listed.index(rig[0]), window)
+                if len(rig) < window:
+                    before = f"{rig[-1]} has only {len(rig) - 1} before it in split {split!r}"
+                    log.info("--window %d: %s; a rig of %d", window, before, len(rig))
+            rigs.append(rig)
+        super().__init__(dataset, rigs, split, points)
 
     @property
     def names_by_split(self) -> dict[str, list[str]]:
         """The names of the dataset's frames in each split."""
-        return {split: self._dataset.frame_names(split) for split in self._dataset.splits}
-
-    def read(self, place: int) -> Query:
-        views = tuple(self._dataset.views(self._split, self._rigs[place]))
-        file = self._file(views[-1].frame.name)
-        rays = None if self._points is None else self._points.rays(views, self._split)
-        return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, file)
-
-    def _file(self, name: str) -> Path | None:
-        """Return the image file of a frame, if the format can tell."""
-        dataset, split = self._dataset, self._split
-        if isinstance(dataset, WholeDataset):
-            split, name = dataset.origin(name)
-            dataset = dataset.parts
-        if isinstance(dataset, MaskedDataset):
-            dataset = dataset.unmasked
-        return dataset.image_file(split, name) if isinstance(dataset, TransformsDataset) else None
-
-    def _with_window(self, rig: tuple[str, ...], listed: list[str], size: int) -> tuple[str, ...]:
-        if size == 1 or rig[0] not in listed:  # an unknown name is rejected on reading
-            return rig
-        names = windowed(listed, listed.index(rig[0]), size)
-        if len(names) < size:
-            before = f"{names[-1]} has only {len(names) - 1} before it in split {self._split!r}"
-            log.info("--window %d: %s; a rig of %d", size, before, len(names))
-        return names
+        return {split: self.capture.frame_names(split) for split in self.capture.splits}
 
 
 def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:

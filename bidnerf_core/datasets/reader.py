@@ -1,73 +1,236 @@
-"""The interface of a reader for one dataset format, and the options with which it opens a folder."""
+"""Readers of capture formats, and the options with which datasets, folders of images and videos are opened."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
-from bidnerf_core.camera import Camera
-from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.sequence import FrameSequence, sequence_of
+from bidnerf_core.camera import Camera, CameraSource, Intrinsics
+from bidnerf_core.datasets.capture import Capture, hold_out
 from bidnerf_core.depth import FARTHEST
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
-from bidnerf_core.errors import InputError, InputWarning, enumeration
-from bidnerf_core.io import IMAGE_SUFFIXES
+from bidnerf_core.errors import InputError, InputWarning, UsageError, amount, enumeration
+from bidnerf_core.frames import HiddenColour, MaskFolder, photos_in
+from bidnerf_core.io import IMAGE_SUFFIXES, background_colour
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
 """How depth is registered to colour images: from a given sensor or its file, from the format's own sensor
 (True), or not at all (False)."""
-Answer = TypeVar("Answer")
-OpenQuestion = Literal["camera", "register_depth", "depth_unit"]
-"""An option of ``ReadOptions`` that a format may leave open."""
+OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
+"""An option of ``DatasetOptions`` that a format may leave open."""
+UNREGISTERED = "no"
+"""The value of ``register_depth`` with which depth is used as it is, besides False."""
 
 
 @dataclass(frozen=True)
-class ReadOptions:
-    """The options with which a reader opens a folder.
+class DatasetOptions:
+    """How images are read: by commands, by Python and by the service; readers of a format receive the same options.
 
-    ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel;
-    None is the format's own. ``camera`` (intrinsics or a file of them), ``register_depth`` and ``depth_unit``
-    (metres per step of depth images, instead of the format's) are passed only to readers that accept them.
+    ``camera``, ``register_depth`` and ``depth_unit`` are passed only to readers that accept them.
     """
 
-    background: Background | None = None
-    camera: Camera | Path | None = None
+    camera: Camera | CameraSource | str | Path | None = None
+    """camera of images whose format stores none: a file with intrinsics from nerfstudio, COLMAP, ROS or OpenCV (YAML), Open3D,
+    hloc or 3D Gaussian Splatting (TUM RGB-D: also freiburg1, freiburg2 or freiburg3)"""
+
+    split: str = "train"
+    """split of the dataset; all: every image with a pose"""
+
     register_depth: DepthRegistration | None = None
+    """file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour images;
+    'no' if depth is already registered"""
+
     depth_unit: float | None = None
+    """metres per step of the depth images, such as 0.001 for millimetres"""
 
-    def sensor(self, folder: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
-        """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the
-        format's.
+    masks: str | Path | MaskFolder | None = None
+    """masks named like the images: black pixels (--mask-hides) are ignored, such as people or the robot itself"""
 
-        Raises ``InputError``, whose message begins with ``folder``, for True if the format has no sensor, and
+    mask_hides: HiddenColour = "black"
+    """colour in --masks that is ignored: black or white"""
+
+    largest: int | None = None
+    """longer side to which larger images are downscaled"""
+
+    background: Background | None = None
+    """colour behind images with alpha: white or black"""
+
+    def __post_init__(self) -> None:
+        if self.masks is None and self.mask_hides != "black":
+            raise UsageError(
+                f"--mask-hides {self.mask_hides} was given without --masks", expected="the folder of masks"
+            )
+        if self.depth_unit is not None and not 0 < self.depth_unit <= FARTHEST:
+            expected = "a positive number of metres per step, such as 0.001"
+            raise InputError(f"depth_unit is {self.depth_unit:g}", expected=expected)
+
+    def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
+        """Open the dataset in the folder ``path``. Metadata are read and checked immediately, images when views are
+        requested.
+
+        Files that are listed but missing, and images without a pose, are left out with an ``InputWarning`` that counts
+        them. Raises ``InputError`` if there is no such folder, if no reader recognizes it, if nothing is left, and if
+        a metadata file is invalid.
+        """
+        folder = Path(path)
+        if not folder.exists():
+            raise InputError("no such folder", where=folder)
+        reader = _reader_of(folder, readers)
+        if reader is None:
+            raise _without_dataset(folder, readers) if folder.is_dir() else _not_a_dataset(folder)
+        return self._read(reader, folder).require_poses()
+
+    def open_sequence(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
+        """Open the frames of a dataset, a folder of images or a video in chronological order; nothing is decoded yet.
+
+        Images without a camera take it from their EXIF; images without a focal length, and videos, use one of the
+        assumed cameras of a ``CameraSource``. Raises ``InputError`` if nothing is found, if a metadata file is invalid,
+        and for a missing or superfluous camera.
+        """
+        # The readers of photos and videos are not registered: they find no poses.
+        from bidnerf_core.datasets.formats.photos import PhotoReader
+        from bidnerf_core.datasets.formats.video import VideoReader
+        from bidnerf_core.datasets.video import VIDEO_SUFFIXES
+
+        place = Path(path)
+        if not place.exists():
+            raise InputError("no such file or folder", where=place)
+        others = (PhotoReader(), VideoReader())
+        reader = _reader_of(place, readers) or next(
+            (other for other in others if other.recognises(place)), None
+        )
+        if reader is None:
+            if place.is_dir():
+                raise InputError("no images in it", where=place, expected="image files or a dataset")
+            raise _not_a_dataset(place, f", or a video ({', '.join(VIDEO_SUFFIXES)})")
+        return self._read(reader, place).in_time_order()
+
+    @property
+    def camera_source(self) -> CameraSource:
+        """The camera as a source of cameras for single images."""
+        return self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
+
+    @property
+    def given_camera(self) -> Camera | Path | None:
+        """The camera for a format that stores none: intrinsics, or a file of them."""
+        camera = self.camera_source.camera
+        return Path(camera) if isinstance(camera, str) else camera
+
+    @property
+    def colour(self) -> tuple[float, float, float]:
+        """The background, by default black. Raises ``InputError`` for an unknown one."""
+        return background_colour("black" if self.background is None else self.background)
+
+    @property
+    def mask_folder(self) -> MaskFolder | None:
+        """The folder of masks. Raises ``InputError`` if there is no such folder, or no image in it."""
+        if self.masks is None or isinstance(self.masks, MaskFolder):
+            return self.masks
+        return MaskFolder(self.masks, self.mask_hides)
+
+    def sensor(self, where: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
+        """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the format's.
+
+        Raises ``InputError``, whose message begins with ``where``, for True if the format has no sensor, and
         as ``DepthCamera.read`` does.
         """
         register = self.register_depth
-        if register is None:
+        if register is None or register is True:
+            if register and own is None:
+                expected = "the file of one (register_depth=)"
+                raise InputError("its depth sensor is not known", where=where, expected=expected)
             return own
-        if register is False:
+        if register is False or register == UNREGISTERED:
             return None
-        if register is True and own is None:
+        return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
+
+    def _read(self, reader: Reader, path: Path) -> Capture:
+        """Return what a reader reads, in splits, with masks. Raises ``InputError`` for options that the format does not
+        accept, and if a third-party reader fails.
+        """
+        source = self.camera_source
+        if source.is_given and "camera" not in reader.accepts:
+            raise InputError("is a dataset with its own cameras; leave out the camera", where=path)
+        if source.is_given and source.camera is None and "focal" not in reader.accepts:
+            raise InputError("is a dataset", where=path, expected="a camera with all intrinsics (camera=)")
+        if self.register_depth not in (None, False, UNREGISTERED) and "register_depth" not in reader.accepts:
             raise InputError(
-                "its depth sensor is not known", where=folder, expected="the file of one (register_depth=)"
+                "has no depth, or its depth is already registered to its images; leave out register_depth",
+                where=path,
             )
-        if register is True or isinstance(register, DepthCamera):
-            return own if register is True else register
-        return DepthCamera.read(Path(register))
+        if self.depth_unit is not None and "depth_unit" not in reader.accepts:
+            raise InputError(
+                "has no depth images, or depth in a fixed unit; leave out depth_unit", where=path
+            )
+        try:
+            found: Any = reader.read(path, self)
+        except (InputError, OSError, MemoryError):
+            raise
+        except Exception as error:
+            if any(reader is READERS[name] for name in ORDER):
+                raise
+            who = f"reader {type(reader).__name__} failed to open it"
+            raise InputError(f"{who}: {type(error).__name__}: {error}", where=path) from error
+        if not isinstance(found, Capture):
+            who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
+            raise InputError(who, where=path, expected="a Capture")
+        shots = found.shots if found.splits else hold_out(found.shots)
+        faces = [face for shot in shots for face in shot.faces()]
+        found = replace(found, shots=[replace(shot, name="") for shot in faces], largest=self.largest)
+        return found if (masks := self.mask_folder) is None else found.masked(masks)
 
 
-def checked_unit(depth_unit: float | None) -> float | None:
-    """Return a depth unit as given. Raises ``InputError`` unless it is a positive number of metres per step."""
-    if depth_unit is not None and not 0 < depth_unit <= FARTHEST:
-        raise InputError(
-            f"depth_unit is {depth_unit:g}", expected="a positive number of metres per step, such as 0.001"
-        )
-    return depth_unit
+def open_dataset(
+    path: str | Path,
+    background: Background | None = None,
+    readers: Sequence[Reader] | None = None,
+    camera: Camera | str | Path | None = None,
+    register_depth: DepthRegistration | None = None,
+    depth_unit: float | None = None,
+    masks: str | Path | MaskFolder | None = None,
+) -> Capture:
+    """Open the dataset in the folder ``path``, see ``DatasetOptions.open``.
+
+    ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. It
+    defaults to white if the images have one, following NeRF-Synthetic, and to black otherwise. ``camera``
+    (intrinsics or a file of them) is for formats that store no camera, such as TUM RGB-D. ``register_depth``
+    determines whether depth is registered to the colour camera, and from which sensor; the default depends on
+    the format. ``depth_unit`` (metres per step of depth images) overrides the unit of the format. ``masks``
+    is a folder of images whose black pixels are ignored (see ``MaskFolder``).
+    """
+    options = DatasetOptions(
+        camera, register_depth=register_depth, depth_unit=depth_unit, masks=masks, background=background
+    )
+    return options.open(path, readers)
+
+
+def open_sequence(
+    path: str | Path,
+    *,
+    camera: Camera | str | Path | None = None,
+    focal: float | None = None,
+    hfov: float | None = None,
+    assumed: Sequence[Intrinsics] = (),
+    readers: Sequence[Reader] | None = None,
+    **options: Any,
+) -> Capture:
+    """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video. Nothing
+    is decoded yet.
+
+    The camera of images and videos is ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov``
+    (degrees), as in ``Frame.open``. Without these, images use their EXIF; images without a focal length, and
+    videos, use one of the ``assumed`` cameras. Datasets have their own cameras, except those for which
+    ``open_dataset`` accepts one. Further ``options`` are those of ``DatasetOptions``; depth in a folder of images is
+    registered if a sensor is given, and in millimetres unless a unit is given. Raises ``InputError`` as
+    ``DatasetOptions.open_sequence`` does.
+    """
+    source = CameraSource(camera, focal, hfov, tuple(assumed))
+    return DatasetOptions(source, **options).open_sequence(path, readers)
 
 
 @runtime_checkable
@@ -75,9 +238,9 @@ class Reader(Protocol):
     """A reader for one dataset format. Subclasses inherit the attributes and methods that have a default here."""
 
     accepts: Collection[OpenQuestion] = ()
-    """The options that the format accepts: "camera" if its files have none, "register_depth" if its depth may
-    not be registered to its images, "depth_unit" if its depth images may be in another unit. Others are
-    rejected before the reader is called."""
+    """The options that the format accepts: "camera" if its files have none, "focal" if a focal length suffices for it,
+    "register_depth" if its depth may not be registered to its images, "depth_unit" if its depth images may be in another
+    unit. Others are rejected before the reader is called."""
 
     suffixes: Collection[str] = ()
     """The extensions (".r3d") of single files that hold a whole dataset; the paths of such files are passed
@@ -92,18 +255,16 @@ class Reader(Protocol):
         """Return whether a folder has this format; no image is opened."""
         ...
 
-    def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Return the dataset in a folder. Raises ``InputError`` if it cannot be used."""
-        ...
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """Return the images in a folder. Raises ``InputError`` if it cannot be used.
 
-    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        """Return the frames in chronological order, including those in no split; by default, all frames in name order."""
-        return sequence_of(self.open(path, options))
+        Images without a pose belong to it as well. Without any splits, every eighth image with a pose is held out.
+        """
+        ...
 
 
 def _defects(reader: Any) -> Iterator[str]:
-    options = ("path", "options")
-    methods = {"recognises": ("path",), "open": options, "open_sequence": options}
+    methods = {"recognises": ("path",), "read": ("path", "options")}
     yield from interface_defects(reader, ("accepts", "expected"), methods)
 
 
@@ -143,33 +304,6 @@ def find_reader(folder: Path) -> Reader | None:
 def may_hold(reader: Reader, path: Path) -> bool:
     """Return whether ``path`` is a folder, or a file with one of the reader's extensions."""
     return path.is_dir() or path.suffix.lower() in getattr(reader, "suffixes", ())
-
-
-def opened(reader: Reader, folder: Path, options: ReadOptions) -> Dataset:
-    """Return what a reader opens. Raises ``InputError`` if a third-party reader fails, or does not return a dataset."""
-    return _answer(reader, folder, Dataset, lambda: reader.open(folder, options))
-
-
-def opened_sequence(reader: Reader, folder: Path, options: ReadOptions) -> FrameSequence:
-    """Return the sequence that a reader opens. Raises ``InputError`` as ``opened`` does."""
-    return _answer(reader, folder, FrameSequence, lambda: reader.open_sequence(folder, options))
-
-
-def _answer(reader: Reader, folder: Path, expected: type, ask: Callable[[], Answer]) -> Answer:
-    if any(reader is READERS[name] for name in ORDER):
-        return ask()
-    who = f"reader {type(reader).__name__}"
-    try:
-        answer = ask()
-    except (InputError, OSError, MemoryError):
-        raise
-    except Exception as error:
-        raise InputError(f"{who} failed to open it: {type(error).__name__}: {error}", where=folder) from error
-    if not isinstance(answer, expected):
-        raise InputError(
-            f"{who} returned a {type(answer).__name__}", where=folder, expected=f"a {expected.__name__}"
-        )
-    return answer
 
 
 def file_of_dataset(path: Path) -> str | None:
@@ -212,3 +346,40 @@ def _claims(name: str, reader: Reader, folder: Path) -> bool:
         why = f"{type(error).__name__}: {error}"
         warnings.warn(f"{folder}: reader {name!r} failed to examine it: {why}", InputWarning, stacklevel=2)
         return False
+
+
+def _not_a_dataset(file: Path, or_else: str = "") -> InputError:
+    """Return the error for a file in place of a dataset; ``or_else`` names what else could be given."""
+    if (instead := file_of_dataset(file)) is not None:
+        return InputError(f"{instead}{or_else}", where=file)
+    packed = file.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
+    unpack = "; unpack the archive first" if packed else ""
+    return InputError("is a file", where=file, expected=f"the folder of a dataset{unpack}{or_else}")
+
+
+def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> InputError:
+    """Return the error for a folder that is no dataset, and what to do."""
+    inside = [
+        child.name for child in sorted(folder.iterdir()) if child.is_dir() and _reader_of(child, readers)
+    ]
+    if inside:
+        expected = f"one of the folders in it, such as {inside[0]}"
+        return InputError("no dataset found", where=folder, expected=expected)
+    photos, _ = photos_in(folder)
+    if not photos and readers is None:
+        return no_dataset(folder)
+    found = "no dataset found"
+    if photos:
+        found += (
+            f": {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give those of an AR"
+            " framework or a robot;"
+        )
+    return InputError(found, where=folder, expected=expected_formats(readers))
+
+
+def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
+    if readers is None:
+        return find_reader(folder)
+    return next(
+        (reader for reader in readers if may_hold(reader, folder) and reader.recognises(folder)), None
+    )

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from bidnerf_core.datasets.incomplete import remark
+from bidnerf_core.datasets.capture import remark
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3, rigid_pose
 from bidnerf_core.io import LARGEST_ROWS, Row, parse_rows, read_file, read_rows

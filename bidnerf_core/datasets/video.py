@@ -1,14 +1,12 @@
-"""Video files as sequences; needs the extra ``video`` (PyAV, whose wheels include FFmpeg's libraries).
+"""Frames of video files; needs the extra ``video`` (PyAV, whose wheels include FFmpeg's libraries).
 
-Frames are decoded one after another, each with its time stamp from the file, in seconds from the start:
-phones record at a varying rate. A rotation in the file's metadata is applied, so the camera is that of the
-upright image. A video does not record its focal length, so the camera has to be given or assumed.
+Each frame has its time stamp from the file, in seconds from the start: phones record at a varying rate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +14,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from torch import Tensor
 
-from bidnerf_core.camera import CameraSource, Raster
-from bidnerf_core.datasets.sequence import TimedFrame
+from bidnerf_core.datasets.capture import BreaksOff
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame
 from bidnerf_core.io import LARGEST_IMAGE, looks_like_image, open_binary, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
@@ -30,79 +27,121 @@ MATROSKA = b"\x1aE\xdf\xa3"
 """First bytes of Matroska and WebM."""
 BT_2020 = 9
 """The YCbCr-to-RGB matrix (ITU-T H.273) used in place of those that FFmpeg lacks."""
-OPTIONS = {"protocol_whitelist": "file"}
-"""A playlist disguised as a video must not open connections."""
+OPTIONS = {
+    "protocol_whitelist": "file",  # a playlist disguised as a video must not open connections ...
+    "format_whitelist": "mov,matroska,avi,mpeg,mpegts,mpegvideo",  # ... nor other files
+}
+FORWARD = 90
+"""Number of frames up to which decoding continues instead of seeking; phones write a key frame about once a second."""
+
+
+class Video:
+    """The frames of a video file by number, in chronological order, and their ``times`` (seconds).
+
+    Frames are as stored: a rotation in the metadata is applied by ``upright`` alone. Raises ``InputError`` if the file
+    is not a video, and if the extra ``video`` is missing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require_av(path)
+        self.path = path
+        with open_binary(path, "a video file"):
+            pass
+        with _opened(path) as (container, stream):
+            self.size = int(stream.codec_context.width), int(stream.codec_context.height)
+            try:
+                found = [packet for packet in container.demux(stream) if packet.pts is not None]
+            except (OSError, ValueError) as error:
+                raise _no_video(path, reason(error)) from error
+            start = (container.start_time or 0) / MICROSECONDS
+            shown = [(p.pts, float(p.pts * stream.time_base) - start) for p in found if not p.is_discard]
+        shown = sorted(
+            frame for frame in shown if frame[1] >= 0
+        )  # others are only needed to decode what follows
+        if not shown:
+            raise _no_video(path, "it has no frames")
+        self._stamps, self.times = [stamp for stamp, _ in shown], [time for _, time in shown]
+        self._open: ExitStack | None = None
+        self._decoded: Iterator[Any] = iter(())
+        self._next = 0  # number of the next frame to decode
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __iter__(self) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
+        """Yield the time (seconds) and the upright pixels of each frame. Raises ``InputError`` if the file is truncated."""
+        return ((time, self.upright(number)) for number, time in enumerate(self.times))
+
+    def stored(self, number: int) -> UInt8[Tensor, "h w 3"]:
+        """Return the pixels of a frame as stored. Raises ``InputError`` if the file ends before it."""
+        return torch.from_numpy(_pixels(self._picture(number)))
+
+    def upright(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the pixels of a frame, turned by the rotation in the metadata. Raises ``InputError`` as ``stored`` does."""
+        picture = self._picture(number)
+        return np.ascontiguousarray(np.rot90(_pixels(picture), round(picture.rotation / 90)))
+
+    def close(self) -> None:
+        """Close the file; reading another frame reopens it."""
+        if self._open is not None:
+            self._open.close()
+        self._open, self._next = None, 0
+
+    def _picture(self, number: int) -> Any:
+        if not 0 <= number < len(self):
+            raise InputError(f"has {len(self)} frames, but frame {number} is needed", where=self.path)
+        why: Exception = ValueError("no further frame could be decoded")
+        try:
+            if self._open is None or not self._next <= number <= self._next + FORWARD:
+                self._seek(number)
+            for picture in self._decoded:
+                if picture.pts is not None and picture.pts >= self._stamps[number]:
+                    self._next = number + 1
+                    return picture
+        except (OSError, ValueError, MemoryError) as error:
+            why = error
+        self.close()
+        found = f"breaks off at frame {number} ({reason(why)})"
+        raise BreaksOff(found, where=self.path, expected="a complete video file") from why
+
+    def _seek(self, number: int) -> None:
+        """Seek to the key frame before a frame."""
+        self.close()
+        self._open = ExitStack()
+        container, stream = self._open.enter_context(_opened(self.path))
+        if number:
+            container.seek(self._stamps[number], stream=stream, backward=True)
+        self._decoded = container.decode(stream)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the open file, which another process cannot use."""
+        return {**self.__dict__, "_open": None, "_decoded": iter(()), "_next": 0}
 
 
 @dataclass(frozen=True)
-class Video:
-    """The frames of a video file in chronological order; see ``FrameSequence``.
+class VideoPicture:
+    """A frame of a video as stored, which is the image of a shot."""
 
-    Its length is the number of frames in the file. Iteration raises ``InputError`` if the file is truncated.
-    """
-
-    path: Path
-    camera: CameraSource
-    count: int
-
-    def __len__(self) -> int:
-        return self.count
+    video: Video
+    number: int
 
     @property
-    def names(self) -> list[str]:
-        """The names of the frames, which are their numbers."""
-        return [_name(number) for number in range(self.count)]
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.video.size
 
-    def __iter__(self) -> Iterator[TimedFrame]:
-        for number, (time, pixels) in enumerate(pictures(self.path)):
-            yield TimedFrame(time, self._frame(pixels, number))
+    def pixels(self) -> UInt8[Tensor, "h w 3"]:
+        """Decode it. Raises ``InputError`` if the file ends before it."""
+        return self.video.stored(self.number)
 
-    def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
-        found = self.camera.find(self.path, Raster(pixels.shape[1], pixels.shape[0]))
-        return Frame.taken(
-            _name(number), found.camera, torch.from_numpy(pixels), camera_source=found.description,
-            focal_is_approximate=found.approximate,
-        )  # fmt: skip
-
-
-def _name(number: int) -> str:
-    return f"{number:06d}"
-
-
-def pictures(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
-    """Yield the time (seconds) and the upright pixels of each frame of a video that ``open_video`` has
-    accepted.
-
-    Raises ``InputError`` if the file is truncated.
-    """
-    number = 0
-    with opened_video(path) as (container, stream):
-        decoded = container.decode(stream)
-        while True:
-            try:
-                if (picture := next(decoded, None)) is None:
-                    break
-                time, pixels = _time(container, picture), _upright(picture)
-            except (OSError, ValueError, MemoryError) as error:
-                raise _broken(path, number, error) from error
-            if time < 0:  # trimmed, but needed to decode what follows
-                continue
-            yield time, pixels
-            number += 1
-    if number == 0:
-        raise _broken(path, 0, ValueError("no frame could be decoded"))
-
-
-def _broken(path: Path, number: int, error: Exception) -> InputError:
-    return InputError(
-        f"breaks off at frame {number} ({reason(error)})", where=path, expected="a complete video file"
-    )
+    def __str__(self) -> str:
+        return f"{self.video.path}: frame {self.number}"
 
 
 def is_video(path: Path) -> bool:
     """Return whether a file is a video, judging by its name or first bytes; it is not decoded."""
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return True
+        return not path.is_dir()
     try:
         with open_binary(path, "a video file") as file:
             head = file.read(12)
@@ -110,32 +149,6 @@ def is_video(path: Path) -> bool:
         return False
     mp4 = head[4:8] == b"ftyp" and not looks_like_image(path)
     return mp4 or head[:4] == MATROSKA or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
-
-
-def open_video(path: Path, camera: CameraSource) -> Video:
-    """Open a video file. Raises ``InputError`` if it is not one, if there is no camera, and if the extra is missing."""
-    require_av(path)
-    camera.require(path, "a video does not record its focal length")
-    return Video(path, camera, frame_count(path))
-
-
-def frame_count(path: Path) -> int:
-    """Return the number of frames in a video file without decoding any. Raises ``InputError`` as ``open_video`` does."""
-    require_av(path)
-    with open_binary(path, "a video file"):
-        pass
-    with opened_video(path) as (container, stream):
-        try:
-            shown = [
-                packet
-                for packet in container.demux(stream)
-                if packet.pts is not None and not packet.is_discard
-            ]
-        except (OSError, ValueError) as error:
-            raise _no_video(path, reason(error)) from error
-    if not shown:
-        raise _no_video(path, "it has no frames")
-    return len(shown)
 
 
 def require_av(path: Path) -> None:
@@ -151,7 +164,7 @@ def require_av(path: Path) -> None:
 
 
 @contextmanager
-def opened_video(path: Path) -> Iterator[tuple[Any, Any]]:
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a video file; only its first video stream is read. Raises ``InputError`` if it is not a video."""
     import av
 
@@ -171,18 +184,7 @@ def _no_video(path: Path, why: str) -> InputError:
     return InputError(f"not readable as a video ({why})", where=path, expected="a video file")
 
 
-def _time(container: Any, picture: Any) -> float:
-    """Return the time (seconds) of a picture since the start of the file."""
-    if picture.pts is None:
-        raise ValueError("a frame without a time stamp")
-    return float(picture.pts * picture.time_base) - (container.start_time or 0) / MICROSECONDS
-
-
-def _upright(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
-    return np.ascontiguousarray(np.rot90(stored_pixels(picture), round(picture.rotation / 90)))
-
-
-def stored_pixels(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
+def _pixels(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
     """Return the pixels of a picture of any bit depth; HDR colours are kept as coded, without tone mapping."""
     try:
         pixels: np.ndarray = picture.to_ndarray(format="rgb24")

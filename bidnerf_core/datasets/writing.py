@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets.transforms_json import METRES_PER_DEPTH_UNIT, SPLITS, file_of
+from bidnerf_core.datasets.capture import SPLITS
+from bidnerf_core.datasets.formats.transforms_json import METRES_PER_DEPTH_UNIT, file_of
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3

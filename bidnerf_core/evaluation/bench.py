@@ -11,7 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass
 from typing import Any
 
-from bidnerf_core.datasets import Dataset, in_other_split, wholly_hidden
+from bidnerf_core.datasets import Capture, in_other_split
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.evaluation.arcs import arc
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
@@ -98,7 +98,7 @@ class Plan:
         object.__setattr__(self, "faults", expand_faults(self.faults) or (NO_FAULT,))
 
 
-def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
+def planned(plan: Plan, dataset: Capture | None = None) -> list[Trial]:
     """Return all trials in the order of the results. Raises ``InputError`` for a plan that cannot be carried
     out.
 
@@ -270,7 +270,7 @@ def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
             raise InputError(message.format(name, before, value))
 
 
-def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...]]:
+def _rigs(plan: Plan, dataset: Capture, names: list[str]) -> list[tuple[str, ...]]:
     """Return the names of the views for each frame that may be tried."""
     for name in plan.frames or ():
         if name not in names:
@@ -293,9 +293,9 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
     return rigs
 
 
-def _visible(plan: Plan, dataset: Dataset, kept: list[str]) -> list[str]:
+def _visible(plan: Plan, dataset: Capture, kept: list[str]) -> list[str]:
     """Return the frames of which masks leave something visible, with a warning that names the others."""
-    every = set(wholly_hidden(dataset, plan.split))
+    every = set(dataset.wholly_hidden(plan.split))
     hidden = [name for name in kept if name in every]
     if hidden:
         listed = ", ".join(hidden[:4]) + (", ..." if len(hidden) > 4 else "")
@@ -321,7 +321,7 @@ def check_points(plan: Plan, trials: Sequence[Trial], scene: Opened) -> None:
         )
 
 
-def _found_sequences(plan: Plan, dataset: Dataset, kept: list[str]) -> Iterator[tuple[str, ...]]:
+def _found_sequences(plan: Plan, dataset: Capture, kept: list[str]) -> Iterator[tuple[str, ...]]:
     poses = {view.frame.name: view.T_ref_camera for view in dataset.views(plan.split)}
     names = list(poses)  # without those that masks hide altogether
     for name in kept:

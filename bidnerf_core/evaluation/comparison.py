@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import nn
 
-from bidnerf_core.datasets import Dataset
+from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import amount, printable
 from bidnerf_core.evaluation.bench import Plan, planned
 from bidnerf_core.evaluation.json_lines import as_line
@@ -85,7 +85,7 @@ class Comparison:
         write_file(Path(path), as_line(to_plain(self)))
 
 
-def plan_comparison(plan: Plan, maps: Sequence[str], dataset: Dataset) -> list[list[Trial]]:
+def plan_comparison(plan: Plan, maps: Sequence[str], dataset: Capture) -> list[list[Trial]]:
     """Return, for each start, one trial per map, with the frames and seeds of the protocol.
 
     ``plan`` defines everything but the map. Raises ``InputError`` for a name or a number that cannot be used.

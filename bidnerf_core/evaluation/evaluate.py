@@ -6,11 +6,11 @@ import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from bidnerf_core.datasets import Dataset, ReadingProgress, positions
+from bidnerf_core.datasets import Capture, of_views
 from bidnerf_core.errors import Cancelled, InputError, amount, refuse_text
 from bidnerf_core.evaluation.bench import (
     Plan,
@@ -40,7 +40,7 @@ log = logging.getLogger("bidnerf")
 
 Scene: TypeAlias = Map | str | Path
 """A map in memory, the folder of a map, or demo:NAME."""
-Data: TypeAlias = Dataset | Sequence[View] | str | Path
+Data: TypeAlias = Capture | Sequence[View] | str | Path
 """A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
 
 
@@ -227,26 +227,6 @@ def run_comparison(
     return compare_maps(starts, list(named), list(opened.values()), progress, cancel)
 
 
-@dataclass(frozen=True, eq=False)
-class _GivenViews:
-    """Posed images in memory as a ``Dataset``; every split contains all of them."""
-
-    given: tuple[View, ...]
-    path: Path = Path("views")
-    splits: tuple[str, ...] = ("test",)
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def frame_names(self, split: str) -> list[str]:
-        return [view.frame.name for view in self.given]
-
-    def views(
-        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-    ) -> list[View]:
-        known = self.frame_names(split)
-        asked = known if names is None else names
-        return [self.given[place] for place in positions(known, known, asked, "views")]
-
-
 def _note_kept(trials: Sequence[Trial], todo: Sequence[Trial], file: ResultsFile) -> None:
     """Log how many trials are not run again, and how many results of an earlier version cannot be checked."""
     if len(todo) < len(trials):
@@ -278,14 +258,14 @@ def _opened(scene: Scene, data: Data, plan: Plan) -> Opened:
     return stored, _dataset(data, plan, stored)
 
 
-def _dataset(data: Data, plan: Plan, stored: Map | None = None) -> Dataset:
+def _dataset(data: Data, plan: Plan, stored: Map | None = None) -> Capture:
     if isinstance(data, str | Path):
         return Reading.of(plan).open(str(data), stored)
     return Reading.of(plan).in_memory(_in_memory(data))
 
 
-def _in_memory(data: Dataset | Sequence[View]) -> Dataset:
-    if isinstance(data, Dataset):
+def _in_memory(data: Capture | Sequence[View]) -> Capture:
+    if isinstance(data, Capture):
         return data
     views = tuple(view for view in data if isinstance(view, View)) if isinstance(data, Sequence) else ()
     if not views or len(views) < len(data):
@@ -295,7 +275,7 @@ def _in_memory(data: Dataset | Sequence[View]) -> Dataset:
     name, count = Counter(view.frame.name for view in views).most_common(1)[0]
     if count > 1:  # trials identify their frames by name
         raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
-    return _GivenViews(views)
+    return of_views(views, Path("views"))
 
 
 def _device(scene: Scene, asked: str) -> str:
@@ -309,7 +289,7 @@ def _name(value: Scene | Data) -> str:
         return value.info.backend
     if isinstance(value, str | Path):
         return str(value)
-    return str(value.path) if isinstance(value, Dataset) else "views"
+    return str(value.path) if isinstance(value, Capture) else "views"
 
 
 def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import torch
 from torch import Tensor
 
-from bidnerf_core.datasets import Dataset, MaskedDataset, SparseChoice, SparsePoints, open_dataset, with_all
+from bidnerf_core.datasets import Capture, SparseChoice, SparsePoints, open_dataset
 from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty, parse_faults
@@ -45,7 +45,7 @@ from bidnerf_core.settings import to_flat
 if TYPE_CHECKING:
     from bidnerf_core.evaluation.bench import Plan
 
-Opened: TypeAlias = tuple[Map, Dataset]
+Opened: TypeAlias = tuple[Map, Capture]
 """A map, and a dataset of the same scene."""
 
 STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -92,7 +92,7 @@ def _localized(
     return localizer(views, start, rays, trial.seed)
 
 
-def trial_views(trial: Trial, dataset: Dataset) -> list[View]:
+def trial_views(trial: Trial, dataset: Capture) -> list[View]:
     """Return the views that the method receives, with T_world_camera.
 
     They include the trial's faults, and have no depth if the trial withholds it.
@@ -109,7 +109,7 @@ def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:
     return InputDigests(views_digest(views), points, stored.info.surface)
 
 
-def start_of(trial: Trial, views: list[View], dataset: Dataset) -> SE3 | None:
+def start_of(trial: Trial, views: list[View], dataset: Capture) -> SE3 | None:
     """Return T_world_camera at which the trial starts; None if its protocol gives no start."""
     protocol = find_protocol(trial.protocol)
     protocol.check_size(trial.size)
@@ -146,7 +146,7 @@ class Reading:
         """Return the options of a trial or a plan."""
         return cls(work.masks, work.mask_hides, work.camera, work.register_depth, work.depth_unit, work.split)
 
-    def open(self, name: str, stored: Map | None = None) -> Dataset:
+    def open(self, name: str, stored: Map | None = None) -> Capture:
         """Return the dataset in a folder, or of a closed-form scene; a map gives the colour behind its images."""
         if is_closed_form(name):
             return self.in_memory(closed_form_data(name))
@@ -156,7 +156,7 @@ class Reading:
         )  # fmt: skip
         return self._masked(found)
 
-    def in_memory(self, dataset: Dataset) -> Dataset:
+    def in_memory(self, dataset: Capture) -> Capture:
         """Return a dataset that is open already, with its masks. Raises ``InputError`` for options of files."""
         files = self.camera, self.register_depth, self.depth_unit
         if any(option is not None for option in files):
@@ -166,10 +166,8 @@ class Reading:
             )
         return self._masked(dataset)
 
-    def _masked(self, dataset: Dataset) -> Dataset:
-        if self.masks is not None:
-            dataset = MaskedDataset(dataset, MaskFolder(self.masks, self.mask_hides))
-        return with_all(dataset, self.split)
+    def _masked(self, dataset: Capture) -> Capture:
+        return dataset if self.masks is None else dataset.masked(MaskFolder(self.masks, self.mask_hides))
 
 
 def opened(map_name: str, data_name: str, device: str = "cpu", reading: Reading = Reading()) -> Opened:

@@ -23,13 +23,12 @@ from bidnerf_core.backend import load_backend
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import at_stored_poses, stored_cameras
 from bidnerf_core.datasets import (
-    Dataset,
+    Capture,
     DatasetOptions,
     Photos,
     find_reader,
     open_dataset,
     photo_files,
-    reading_at,
 )
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields import RadianceField, render_image, trained_field
@@ -57,7 +56,7 @@ from bidnerf_core.training import TrainingStopped
 
 log = logging.getLogger("bidnerf")
 
-NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Dataset | str | Path
+NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Capture | str | Path
 """Photos to add: frames, a dataset or the path to one (whose own poses are ignored), or the path to a photo
 or a folder of photos."""
 
@@ -166,7 +165,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
     """Read photos, downscaled to the size of the map's largest image; also return those that cannot be read."""
     side, frames, unread = longest_side(scene.info), list[Frame](), list[LeftOut]()
-    source: Sequence[Frame] | Sequence[View] | Dataset | Photos
+    source: Sequence[Frame] | Sequence[View] | Capture | Photos
     if isinstance(photos, str | Path):
         path, background = Path(photos), scene.bounds.background
         if path.is_dir() and find_reader(path) is not None:
@@ -176,19 +175,13 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
             source = Photos(photo_files([path]), camera, background=background)
     else:
         source = photos
-    if isinstance(source, Dataset | Photos):
-        names = source.names if isinstance(source, Photos) else source.frame_names(split)
-        for place, name in enumerate(names):
+    if isinstance(source, Capture | Photos):
+        capture = source.capture if isinstance(source, Photos) else source.split(split)
+        for place, name in enumerate(capture.names):
             try:
-                with reading_at(side, asked=side is not None):
-                    if isinstance(source, Photos):
-                        views: Sequence[View] = source.read(place).views
-                    else:
-                        views = source.views(split, [name])
+                frames.append(capture.at_most(side)[place].frame)
             except InputError as error:
                 unread.append((name, str(error)))
-                continue
-            frames += [view.frame for view in views]
     else:
         frames = [item.frame if isinstance(item, View) else item for item in source]
     for frame in frames:

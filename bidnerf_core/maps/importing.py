@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.captures import stored_cameras
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.fields import RadianceField, SceneBounds, device_of, render
@@ -121,7 +121,7 @@ def import_map(
         return baked_if_possible(scene, lambda scene: _baked(scene, found, views, baking))
 
 
-def _own_photos(found: ImportedField, where: str) -> Dataset | None:
+def _own_photos(found: ImportedField, where: str) -> Capture | None:
     """Return the dataset of the training images that the file names, or None if it names none or they cannot be read."""
     if found.photos is None:
         return None

@@ -15,13 +15,10 @@ from torch import Tensor
 
 from bidnerf_core.camera import checked_side
 from bidnerf_core.datasets import (
-    Dataset,
+    Capture,
     DatasetOptions,
-    Georeferenced,
     SparseChoice,
     SparsePoints,
-    reading_at,
-    with_all,
 )
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import (
@@ -40,7 +37,7 @@ from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
-Images: TypeAlias = Dataset | Sequence[View] | str | Path
+Images: TypeAlias = Capture | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
 AS_STORED = DatasetOptions()
 """Images of split "train" as their dataset stores them."""
@@ -116,7 +113,7 @@ def read_views(
         raise InputError(
             "camera is given for images that have cameras; it is only for the path to images without"
         )
-    if isinstance(data, Dataset):
+    if isinstance(data, Capture):
         if background is not None and background_colour(background) != data.background:
             raise InputError(
                 f"was opened with background {data.background}, got {background!r}", where=data.path
@@ -145,45 +142,40 @@ def read_views(
     return _with_depth(read, Path(depth_points), point_choice or SparseChoice(), split)
 
 
-def _read_dataset(data: Dataset, split: str, largest: int | None, folder: Path | None) -> ReadViews:
+def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path | None) -> ReadViews:
     """Read the views of a split one after another, so that only one image is in memory at full size."""
-    unit: LengthUnit | None = None
-    up: tuple[float, float, float] | None = None
-    if isinstance(data, Georeferenced):
-        unit, up = data.unit, data.up
-    step, data = getattr(data, "depth_unit", None), with_all(data, split)
-    names, place = data.frame_names(split), str(data.path)
-    if not names:
+    place, whole = str(data.path), data if largest is None else data.at_most(largest)
+    shots = whole.select(split)
+    if not shots:
         raise InputError(f"split {split!r} has no frames", where=place)
     count, views = counter("reading", "images"), list[View]()
-    store, limit = PixelStore(0), 0  # the first image is read at full size, which is logged
-    for number, name in enumerate(names, start=1):
+    store, limit = PixelStore(0), largest or 0  # the first image is read at full size, which is logged
+    for number, shot in enumerate(shots, start=1):
         try:
-            with reading_at(limit if views else None, largest is not None):
-                read = data.views(split, [name])
+            view = whole.view(shot, limit or None)
         except WhollyHidden:  # by a mask
-            read = []
-        for view in read:
+            pass
+        else:
             if not views:
-                limit = largest or useful_size(view.frame, len(names))
+                limit = largest or useful_size(view.frame, len(shots))
                 small = view.frame.at_most(limit)
-                store = PixelStore(len(names) * bytes_of(small), folder)
+                store = PixelStore(len(shots) * bytes_of(small), folder)
                 if small is not view.frame:
                     before, after = (
                         f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (view.frame, small)
                     )
                     log.info(
-                        f"{place}: {amount(len(names), 'image')} of {before} read at {after},"
-                        f" {len(names) * bytes_of(small) / 1e6:.0f} MB; --largest (largest=) sets another size"
+                        f"{place}: {amount(len(shots), 'image')} of {before} read at {after},"
+                        f" {len(shots) * bytes_of(small) / 1e6:.0f} MB; --largest (largest=) sets another size"
                     )
             views.append(replace(view, frame=store.stored(view.frame.at_most(limit))))
-        count(number, len(names))
-    if left_out := len(names) - len(views):
+        count(number, len(shots))
+    if left_out := len(shots) - len(views):
         log.info(f"{place}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
     if not views:
         raise InputError(f"masks hide every image in split {split!r} entirely; {INVERTED}", where=place)
     source = data.path.resolve().name
-    return ReadViews(views, source, place, data.background, 0, unit or _unit_of(views), up, depth_unit=step)
+    return ReadViews(views, source, place, data.background, 0, data.unit or _unit_of(views), data.up, depth_unit=data.depth_unit)
 
 
 USEFUL_SIDE, LEAST_SIDE = 1600, 800

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, open_sequence
+from bidnerf_core.datasets import BreaksOff, Capture, TimedFrame, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import Localizer, SceneMap, Tracker, landmark_cameras
@@ -22,7 +21,7 @@ can be read."""
 
 def track(
     scene: SceneMap | Localizer | Tracker,
-    sequence: FrameSequence | str | Path,
+    sequence: Capture | str | Path,
     *,
     every: int = 1,
     depth: bool = True,
@@ -47,7 +46,7 @@ def track(
     tracker = scene
     if not isinstance(tracker, Tracker):
         tracker = Tracker(tracker if isinstance(tracker, Localizer) else Localizer(tracker))
-    if not isinstance(sequence, FrameSequence):
+    if not isinstance(sequence, Capture):
         sequence = opened_for(tracker.localizer.scene, sequence)
     if answers is None:
         answers = Answers(tracker.localizer.scene, is_sequence=True)
@@ -73,18 +72,17 @@ def track(
     return answers
 
 
-def opened_for(scene: SceneMap, path: str | Path, **options: Any) -> FrameSequence:
+def opened_for(scene: SceneMap, path: str | Path, **options: Any) -> Capture:
     """Open a sequence as ``open_sequence`` does, with the map's background and its cameras for images that have none."""
     return open_sequence(path, assumed=landmark_cameras(scene), background=scene.bounds.background, **options)
 
 
-def _every(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
-    """Yield every n-th frame; if each has its own files, an unreadable one is yielded as an error."""
-    if not isinstance(frames, FileSequence):
-        yield from islice(frames, 0, None, every)
-        return
+def _every(frames: Capture, every: int) -> Iterator[TimedFrame | InputError]:
+    """Yield every n-th frame; one that cannot be read is yielded as an error, unless no later one can be."""
     for place in range(0, len(frames), every):
         try:
             yield frames[place]
+        except BreaksOff:
+            raise
         except InputError as error:
             yield error

@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import ReadingProgress
+from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds, render_image
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import BLACK, Frame
 from bidnerf_core.geometry import SE3, turned_about
 from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.scenes.demo import demo_object, demo_room
@@ -31,75 +31,74 @@ PREFIX = "demo:"
 DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 FRAMES, TRAINING_FRAMES = 24, 40
 BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-FRAME_NAME = re.compile(r"(?P<place>\d{4})(?:@(?P<angle>-?\d+(?:\.\d+)?))?")
-"""A frame's name: its number and, in a sequence, the angle in degrees by which it is rotated."""
+ANGLE = re.compile(r"-?\d+(?:\.\d+)?")
+"""The angle in degrees by which a frame of a sequence is rotated, after its number and @."""
 
 Scene = TypeVar("Scene")
 Render = Callable[[SE3, str], Frame]
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedFormData:
-    """A ``Dataset`` with split "test", and split "train" if ``training`` has poses.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderedShot(Shot):
+    """A frame that is rendered from its pose."""
 
-    Frame "0003@15" is frame 0003 rotated by 15 degrees about the middle.
+    render: Render
+
+    def frame(self, background: tuple[float, float, float] = BLACK, side: int | None = None) -> Frame:
+        """Render it, whatever the background: the scene has its own."""
+        assert self.T_world_camera is not None  # that of every frame is known
+        found = self.render(self.T_world_camera, self.name)
+        return found if side is None else found.at_most(side)
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedFormData(Capture):
+    """Frames of a scene with split "test", and split "train" if it has frames to train on.
+
+    Frame "0003@15" is frame 0003 rotated by 15 degrees about the ``middle`` of the scene.
     """
 
-    name: str
-    poses: tuple[SE3, ...]  # T_world_camera
-    render: Render
-    background: tuple[float, float, float]
     middle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, world
-    training: tuple[SE3, ...] = ()  # T_world_camera
 
-    @property
-    def path(self) -> Path:
-        """The name of the scene, in place of a folder."""
-        return Path(PREFIX + self.name)
+    @staticmethod
+    def rendered(
+        name: str,
+        poses: Sequence[SE3],
+        render: Render,
+        background: tuple[float, float, float],
+        middle: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        training: Sequence[SE3] = (),
+    ) -> ClosedFormData:
+        """Return the frames of the scene ``name`` at ``poses`` and ``training`` (T_world_camera)."""
+        shots = [
+            RenderedShot(render=render, T_world_camera=pose, splits=(split,), stem=f"{place:04d}")
+            for split, group in (("train", training), ("test", poses))
+            for place, pose in enumerate(group)
+        ]
+        return ClosedFormData(Path(PREFIX + name), shots, background, middle=middle)
 
-    @property
-    def splits(self) -> tuple[str, ...]:
-        """The names of all splits."""
-        return ("train", "test") if self.training else ("test",)
-
-    def frame_names(self, split: str) -> list[str]:
-        """Return the names of the frames of ``split``."""
-        return [f"{place:04d}" for place in range(len(self._poses(split)))]
-
-    def _poses(self, split: str) -> tuple[SE3, ...]:
-        if split not in self.splits:
-            raise InputError(f"no split {split!r}", where=self.path, expected=" or ".join(self.splits))
-        return self.poses if split == "test" else self.training
-
-    def views(
-        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-    ) -> list[View]:
-        """Render the frames with these names, by default all of the split."""
-        asked, views = self.frame_names(split) if names is None else names, []
-        for done, name in enumerate(asked, start=1):
-            pose = self._pose(name, split)
-            views.append(View(self.render(pose, name), pose))
-            if progress is not None:
-                progress(done, len(asked))
-        return views
+    def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
+        """Return the frames with these names, by default all of the split."""
+        listed = super().select(split)
+        if names is None:
+            return listed
+        by_name = {shot.name: shot for shot in listed}
+        return [self._turned(by_name, name) for name in names]
 
     def sequence(self, name: str, count: int, angle: float) -> tuple[str, ...]:
         """Return the names of ``count`` frames, ``angle`` degrees apart, ending with frame ``name``."""
         return (*(f"{name}@{k * angle:g}" for k in range(count - 1, 0, -1)), name)
 
-    def _pose(self, name: str, split: str) -> SE3:
-        found, poses = FRAME_NAME.fullmatch(name), self._poses(split)
-        if found is None or int(found["place"]) >= len(poses):
-            last = len(poses) - 1
-            raise InputError(
-                f"no frame {name!r}",
-                where=self.path,
-                expected=f"0000 to {last:04d} or a name such as 0000@15",
-            )
-        pose, up = poses[int(found["place"])], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        return turned_about(
-            pose, torch.tensor(self.middle, dtype=torch.float64), up, float(found["angle"] or 0)
-        )
+    def _turned(self, by_name: Mapping[str, Shot], name: str) -> Shot:
+        own, _, angle = name.partition("@")
+        if own not in by_name or (angle and ANGLE.fullmatch(angle) is None):
+            first, *_, last = by_name
+            expected = f"{first} to {last} or a name such as {first}@15"
+            raise InputError(f"no frame {name!r}", where=self.path, expected=expected)
+        pose, up = by_name[own].T_world_camera, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        assert pose is not None
+        turned = turned_about(pose, torch.tensor(self.middle, dtype=torch.float64), up, float(angle or 0))
+        return replace(by_name[own], T_world_camera=turned, name=name)
 
 
 def is_closed_form(name: str) -> bool:
@@ -132,7 +131,7 @@ def _object() -> ClosedFormData:
     scene = demo_object()
     poses = tuple(orbit(3.5, FRAMES, elevation=(15.0, 50.0), seed=1))
     training = tuple(orbit(3.5, TRAINING_FRAMES))
-    return ClosedFormData(
+    return ClosedFormData.rendered(
         "object",
         poses,
         lambda T, name: scene.render(DEMO_CAMERA, T, name),
@@ -146,7 +145,7 @@ def _room() -> ClosedFormData:
     middle = (0.0, 0.0, 1.25)
     poses = tuple(look_around(scene.bounds, FRAMES, seed=1))
     training = tuple(look_around(scene.bounds, TRAINING_FRAMES))
-    return ClosedFormData(
+    return ClosedFormData.rendered(
         "room",
         poses,
         lambda T, name: scene.render(DEMO_CAMERA, T, name),
@@ -164,7 +163,7 @@ def _blobs() -> ClosedFormData:
         depth = torch.where(image.opacity > 0.99, image.depth, 0)  # only nearly opaque pixels have depth
         return Frame(name, image.rgb, half, depth, image.opacity)
 
-    return ClosedFormData("blobs", tuple(orbit(3.5, FRAMES, seed=1)), render, BLOBS.background)
+    return ClosedFormData.rendered("blobs", tuple(orbit(3.5, FRAMES, seed=1)), render, BLOBS.background)
 
 
 def _blob_field() -> GaussianBlobs:

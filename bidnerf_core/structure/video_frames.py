@@ -19,7 +19,7 @@ from PIL import Image
 
 from bidnerf_core.camera import reduced_size
 from bidnerf_core.captures import sharpness
-from bidnerf_core.datasets import frame_count, pictures
+from bidnerf_core.datasets import Video
 from bidnerf_core.progress import counter
 from bidnerf_core.structure.sources import SourceImage
 
@@ -53,9 +53,10 @@ class FrameMeasure:
 def measured(video: Path) -> list[FrameMeasure]:
     """Measure each frame of a video."""
     count = counter("measuring frames", "frames")
-    total = frame_count(video)
+    frames = Video(video)
+    total = len(frames)
     path, found = _Motion(), list[FrameMeasure]()
-    for time, pixels in pictures(video):
+    for time, pixels in frames:
         grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         found.append(FrameMeasure(time, path.advance(_small(grey)), sharpness(grey.astype(np.float32) / 255)))
         count(min(len(found), total), total)
@@ -79,7 +80,7 @@ def write_frames(video: Path, folder: Path, wanted: Sequence[int]) -> list[Sourc
     """Write the frames with indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
     folder.mkdir(parents=True, exist_ok=True)
     asked, found, count = set(wanted), list[SourceImage](), counter("writing frames", "frames")
-    for number, (time, pixels) in enumerate(pictures(video)):
+    for number, (time, pixels) in enumerate(Video(video)):
         if number in asked:
             image = SourceImage(f"{number:06d}", folder / f"{number:06d}.jpg", time)
             Image.fromarray(pixels).save(image.file, quality=JPEG_QUALITY, subsampling=0)

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets import open_dataset, open_sequence
-
 # Inside: which frames of a sequence are kept, and the frames of a video in any order
 from bidnerf_core.datasets.phone_scans import thinned
 from bidnerf_core.datasets.posed_images import ImageFrame
 from bidnerf_core.datasets.video_frames import VideoFrames
+
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.frames import View
 from bidnerf_core.testing import training_views
 from refusals import refused

@@ -10,21 +10,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-# Inside: a limit of size that small images reach, and what readers state about unit and gravity
+# Inside: a limit of size that small images reach
 from bidnerf_core.datasets import (
     READERS,
-    Georeferenced,
-    ReadOptions,
-    Splits,
+    DatasetFrames,
+    DatasetOptions,
     find_reader,
+    lidar,
     open_dataset,
     open_sequence,
-    phone_scans,
     read_trajectory,
 )
-from bidnerf_core.datasets.polycam import PolycamDataset
-from bidnerf_core.datasets.record3d import Record3DDataset
-from bidnerf_core.datasets.whole import WholeDataset
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
@@ -60,7 +56,7 @@ def test_the_contract_of_readers(layout: tuple[str, Path]) -> None:
     attributes = {
         "name": LAYOUTS[kind].reader,
         "folder": folder,
-        "options": ReadOptions(**LAYOUTS[kind].options),
+        "options": DatasetOptions(**LAYOUTS[kind].options),
     }
     subject = type("Subject", (ReaderContract,), attributes)()
     for law in LAWS:
@@ -72,7 +68,7 @@ def test_what_is_read_is_what_was_written(layout: tuple[str, Path], written: lis
     expected = LAYOUTS[kind]
     assert find_reader(folder) is READERS[expected.reader]
     frames, views = list(open_sequence(folder, **expected.options)), read_all(folder, **expected.options)
-    assert getattr(open_dataset(folder), "unit", None) == expected.unit
+    assert open_dataset(folder).unit == expected.unit
     assert len(frames) == len(views) == COUNT
     held_out = (0, 1) if kind == "twelve-scenes" else (0, 8)  # by its split.txt; else every eighth
     assert [timed.split for timed in frames] == ["test" if n in held_out else "train" for n in range(COUNT)]
@@ -173,7 +169,7 @@ def test_photos_of_phone_apps_have_the_size_that_is_asked_for(
 ) -> None:
     """Their usual size is small, and a larger one is had for the asking."""
     folder = LAYOUTS[kind].write(tmp_path, written)
-    monkeypatch.setattr(phone_scans, "LARGEST_SIDE", 40)
+    monkeypatch.setattr(lidar, "LARGEST_SIDE", 40)
     whole = written[0].frame.intrinsics
     for asked, side in ((None, 40), (30, 30), (50, 50), (2000, max(whole.width, whole.height))):
         frames = [view.frame for view in read_views(folder, largest=asked).views]
@@ -205,16 +201,24 @@ def test_poses_that_are_written_are_read_again(
             write_poses(tmp_path / name, [posed[0], *posed[2:]])
 
 
-def test_datasets_that_wrap_others_keep_what_these_know() -> None:
-    """A scan's unit and gravity reach training whatever masks or splits are chosen."""
-    scan = PolycamDataset(Splits(Path("scan"), {"train": []}), None)
-    whole = WholeDataset(scan)
-    assert isinstance(scan, Georeferenced)
-    assert isinstance(whole, Georeferenced)
-    assert (whole.unit, whole.up) == ("metres", (0.0, 1.0, 0.0))
+@pytest.mark.parametrize(
+    ("kind", "up"), [("polycam", (0.0, 1.0, 0.0)), ("stray-scanner", (0.0, 1.0, 0.0)), ("record3d", None)]
+)
+def test_scans_know_their_vertical_axis(
+    kind: str, up: tuple[float, float, float] | None, tmp_path: Path
+) -> None:
+    """Whatever masks or splits are chosen. The world of Record3D is the camera of the first frame, however it was held."""
+    scan = open_dataset(LAYOUTS[kind].write(tmp_path, small_views(3)))
+    assert all(
+        (part.unit, part.up) == ("metres", up) for part in (scan, scan.split("all"), scan.in_time_order()[:1])
+    )
 
 
-def test_the_world_of_record3d_has_no_vertical_axis() -> None:
-    """It is the camera of the first frame, however the phone was held."""
-    assert Record3DDataset.up is None
-    assert Record3DDataset.unit == "metres"
+@pytest.mark.parametrize("kind", OF_IMAGE_FILES)
+def test_an_answer_knows_its_image_file(kind: str, tmp_path: Path) -> None:
+    folder = LAYOUTS[kind].write(tmp_path, small_views(3))
+    for split in ("test", "all"):
+        source = DatasetFrames(open_dataset(folder, **LAYOUTS[kind].options), split)
+        files = [source.read(place).file for place in range(len(source.names))]
+        assert all(file is not None and file.is_file() and file.suffix in (".png", ".jpg") for file in files)
+        assert len(set(files)) == len(files)

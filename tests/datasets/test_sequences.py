@@ -16,17 +16,14 @@ import torch
 import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import (
-    Dataset,
-    FileSequence,
-    FrameSequence,
+    Capture,
+    DatasetOptions,
     Reader,
-    ReadingProgress,
-    ReadOptions,
+    of_views,
     open_dataset,
     open_sequence,
     write_transforms,
 )
-from bidnerf_core.frames import View
 from refusals import refused
 from scan_layouts import edit_frame, edit_keys, small_views, write_nerfstudio
 
@@ -47,14 +44,13 @@ def write_file(folder: Path, extra: Sequence[dict[str, Any]], **lists: list[str]
     return folder
 
 
-def names(sequence: FrameSequence) -> list[str]:
+def names(sequence: Capture) -> list[str]:
     return [timed.frame.name for timed in sequence]
 
 
 @pytest.mark.parametrize("key", ["time", "timestamp"])
 def test_frames_are_in_the_order_of_their_times(key: str, tmp_path: Path) -> None:
     sequence = open_sequence(write_file(tmp_path, [{key: time} for time in (3.5, -1, 2.0, 0)]))
-    assert isinstance(sequence, FrameSequence)
     assert names(sequence) == ["b_2", "b_1", "a_3", "b_10"]
     assert [timed.time for timed in sequence] == [-1, 0, 2, 3.5]
     for timed in sequence:  # pose and image belong together
@@ -104,7 +100,6 @@ def test_names_that_splits_share_are_told_apart(tmp_path: Path) -> None:
 
 def test_sequences_are_indexed_and_reversed_without_reading(tmp_path: Path) -> None:
     sequence = open_sequence(write_file(tmp_path, [{"time": n} for n in range(4)]))
-    assert isinstance(sequence, FileSequence)
     (tmp_path / "images/b_2.png").unlink()
     assert sequence.names == list(NAMES)
     assert sequence.times == [0, 1, 2, 3]
@@ -117,18 +112,8 @@ def test_sequences_are_indexed_and_reversed_without_reading(tmp_path: Path) -> N
         sequence[4]
 
 
-def test_datasets_of_other_readers_have_sequences(tmp_path: Path) -> None:
-    class Others:
-        path, splits, background = tmp_path, ("train", "test"), (0.0, 0.0, 0.0)
-        seen = {view.frame.name: view for view in tiny.views(3)}  # noqa: RUF012
-
-        def frame_names(self, split: str) -> list[str]:
-            return list(self.seen)[:2] if split == "train" else list(self.seen)[2:]
-
-        def views(
-            self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-        ) -> list[View]:
-            return [self.seen[name] for name in names or self.frame_names(split)]
+def test_captures_of_other_readers_are_sequences(tmp_path: Path) -> None:
+    views = tiny.views(3)
 
     class Anything(Reader):
         expected = "anything"
@@ -136,11 +121,12 @@ def test_datasets_of_other_readers_have_sequences(tmp_path: Path) -> None:
         def recognises(self, path: Path) -> bool:
             return True
 
-        def open(self, path: Path, options: ReadOptions) -> Dataset:
-            return Others()
+        def read(self, path: Path, options: DatasetOptions) -> Capture:
+            train, test = of_views(views[:2], path, ("train",)), of_views(views[2:], path, ("test",))
+            return Capture(path, [*train.shots, *test.shots])
 
     sequence = open_sequence(tmp_path, readers=[Anything()])
-    assert names(sequence) == list(Others.seen)
+    assert names(sequence) == [view.frame.name for view in views]
     assert [timed.split for timed in sequence] == ["train", "train", "test"]
     with refused(where=tmp_path, found="its own cameras"):
         open_sequence(tmp_path, readers=[Anything()], focal=100.0)
@@ -189,7 +175,6 @@ def test_places_without_a_sequence(tmp_path: Path) -> None:
 def test_a_recorded_sequence_is_one_video(data_dir: Path) -> None:
     """Train and test together are every fourth frame of a video at 30 Hz, in which the camera does not jump."""
     sequence = open_sequence(data_dir / "tum_fr1_xyz")
-    assert isinstance(sequence, FileSequence)
     times = torch.tensor([time for time in sequence.times if time is not None], dtype=torch.float64)
     assert len(times) == len(sequence) == 199
     assert 0.1 < float(times.diff().min()) < float(times.diff().max()) < 0.3  # one frame is missing

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
+from bidnerf_core.datasets import Capture, open_dataset, open_sequence
 
 # Inside: the published calibration, with which the recording is rendered
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
@@ -67,7 +67,7 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path / "scene"
 
 
-def wrong_share(dataset: Dataset) -> float:
+def wrong_share(dataset: Capture) -> float:
     """Return the share of pixels with depth whose point of the plane has another colour than the pixel."""
     shares = []
     for view in dataset.views("test"):

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import FrameSequence, TimedFrame, open_sequence
-
 # Inside: masks beside a sequence that is no folder of files
 from bidnerf_core.datasets.masked import masked_sequence
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import Capture, TimedFrame, open_sequence
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame, MaskFolder
 from photo_files import write_photo
@@ -77,7 +77,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_frames_come_in_order_with_their_times(clip: Path) -> None:
     sequence = open_sequence(clip, hfov=60)
-    assert isinstance(sequence, FrameSequence)
+    assert isinstance(sequence, Capture)
     assert len(sequence) == COUNT
     for _ in range(2):  # an iteration starts anew
         frames = list(sequence)

@@ -20,7 +20,6 @@ from bidnerf_core.camera import Orientation, Raster
 # Inside: each quantity computed from pixels, which is equal whatever a mask hides
 from bidnerf_core.captures.photos import photo_measures
 from bidnerf_core.carving import FreeSpace
-from bidnerf_core.datasets import wholly_hidden, with_all
 from bidnerf_core.fields import RenderedImage
 from bidnerf_core.frames import DRAWERS, DrawerName, MaskFolder, WhollyHidden, masks_sentence, read_mask
 from bidnerf_core.localization.by_surface import is_blank
@@ -171,11 +170,10 @@ def test_mask_path_and_dynamic_masks_are_read(tmp_path: Path) -> None:
     with refused(error=WhollyHidden):  # the one hides the left, the other the rest
         opened.views("train", names[:1])
     assert [view.frame.name for view in opened.views("train")] == names[1:]
-    assert wholly_hidden(opened, "train") == []  # neither mask hides everything by itself
+    assert opened.wholly_hidden("train") == []  # neither mask hides everything by itself
     saved(data / "masks" / f"{names[1]}.png", np.zeros((48, 48), np.uint8))
-    assert wholly_hidden(opened, "train") == names[1:2]
-    whole = with_all(opened, "all")
-    assert wholly_hidden(whole, "all") == names[1:2]
+    assert opened.wholly_hidden("train") == names[1:2]
+    assert opened.wholly_hidden("all") == names[1:2]
     assert names[1] not in [view.frame.name for view in whole.views("all")]
 
 

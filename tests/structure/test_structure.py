@@ -21,7 +21,6 @@ from PIL import Image
 
 import bidnerf_core as bn
 import tiny
-from bidnerf_core.datasets import all_views
 from bidnerf_core.geometry import fit_similarity
 
 # Inside: each stage of the search for poses, with its damaged files and rare geometry
@@ -103,7 +102,7 @@ def errors(views: dict[str, bn.View], truth: dict[str, bn.SE3]) -> tuple[float, 
 
 
 def test_photos_without_poses_get_the_true_ones(search: Search) -> None:
-    views = {view.frame.name: view for view in all_views(bn.open_dataset(search.out))}
+    views = {view.frame.name: view for view in bn.open_dataset(search.out).views("all")}
     assert sorted(views) == [f"{number:03d}" for number in range(PLACED)]
     truth = {f"{number:03d}": pose for number, pose in enumerate(walk(PLACED))}
     metres, degrees = errors(views, truth)
@@ -136,7 +135,7 @@ def test_interrupted_work_goes_on(search: Search) -> None:
 
 
 def test_the_world_is_upright(search: Search) -> None:
-    views = sorted(all_views(bn.open_dataset(search.out)), key=lambda view: view.frame.name)
+    views = sorted(bn.open_dataset(search.out).views("all"), key=lambda view: view.frame.name)
     up = torch.stack([-view.T_ref_camera.rotation[:, 1] for view in views])
     true = torch.stack([-pose.rotation[:, 1] for pose in walk(PLACED)])
     torch.testing.assert_close(up[:, 2], true[:, 2], atol=0.01, rtol=0)
@@ -291,7 +290,7 @@ def test_three_photos_of_one_wall_by_a_known_camera(tmp_path: Path) -> None:
     found = bn.find_poses(tmp_path / "wall", tmp_path / "out", camera=CAMERA)
     assert (found.placed, found.turned) == (4, 1)
     assert "1 photo turned by EXIF: the dataset has the cameras of the images as stored" in str(found)
-    views = {view.frame.name: view for view in all_views(bn.open_dataset(tmp_path / "out"))}
+    views = {view.frame.name: view for view in bn.open_dataset(tmp_path / "out").views("all")}
     metres, degrees = errors(views, {f"{number:03d}": pose for number, pose in enumerate(poses)})
     assert metres < 0.02
     assert degrees < 0.5
@@ -431,11 +430,11 @@ def test_split_all_reads_every_view_once(tmp_path: Path) -> None:
         for split, value, pose in zip(("train", "test"), (0.2, 0.8), walk(2), strict=True)
     }
     bn.write_transforms(tmp_path, frames)
-    read = all_views(bn.open_dataset(tmp_path))
+    read = bn.open_dataset(tmp_path).views("all")
     assert [view.frame.name for view in read] == ["train_a", "train", "test_a", "test"]
     single = tmp_path / "single"
     write_single(single, frames["train"][0])
-    assert len(all_views(bn.open_dataset(single))) == 1  # in both splits
+    assert len(bn.open_dataset(single).views("all")) == 1  # in both splits
 
 
 def write_single(folder: Path, view: bn.View) -> None:

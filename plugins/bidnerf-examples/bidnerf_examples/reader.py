@@ -8,22 +8,16 @@ A row of ``poses.csv`` has the name of an image, its time in seconds, and the tw
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 
-from bidnerf_core import SE3, Dataset, Frame, FrameSequence, InputError, View
-from bidnerf_core.datasets import (
-    Background,
-    FileSequence,
-    Reader,
-    ReadingProgress,
-    ReadOptions,
-    SequenceEntry,
-)
-from bidnerf_core.io import background_colour
+from bidnerf_core import SE3, InputError
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets import Capture, DatasetOptions, DepthFile, Reader, Shot
+from bidnerf_core.depth import read_depth_image
 
 TABLE, CAMERA = "poses.csv", "camera.json"
 
@@ -37,65 +31,6 @@ class Row:
     T_world_camera: SE3
 
 
-class PoseTable(Dataset):
-    """The images of a folder, all in one split."""
-
-    def __init__(self, path: Path, background: Background | None) -> None:
-        self._path, self._rows = path, {row.name: row for row in read_table(path / TABLE)}
-        self._background = background_colour("black" if background is None else background)
-
-    @property
-    def path(self) -> Path:
-        return self._path
-
-    @property
-    def splits(self) -> tuple[str, ...]:
-        return ("train",)
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        return self._background
-
-    def frame_names(self, split: str) -> list[str]:
-        if split not in self.splits:
-            raise InputError(f"no split {split!r}", where=self.path, expected="'train'")
-        return list(self._rows)
-
-    def views(
-        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-    ) -> list[View]:
-        wanted = self.frame_names(split) if names is None else list(names)
-        views = []
-        for name in wanted:
-            views.append(self.view(name))
-            if progress is not None:
-                progress(len(views), len(wanted))
-        return views
-
-    def view(self, name: str) -> View:
-        """Read one image. Raises ``InputError`` for an unknown name."""
-        if name not in self._rows:
-            raise InputError(f"no image {name!r} in {TABLE}", where=self.path)
-        frame = Frame.open(
-            self.path / f"{name}.png",
-            depth=self.path / f"{name}.depth.png",
-            depth_unit=0.001,
-            camera=self.path / CAMERA,
-            background=self._background,
-        )
-        return View(frame, self._rows[name].T_world_camera)
-
-    def sequence(self) -> FrameSequence:
-        """Return the images in chronological order."""
-        rows = sorted(self._rows.values(), key=lambda row: row.time)
-        return FileSequence(
-            self.path, [SequenceEntry(r.name, r.time, "train", self._reading(r)) for r in rows]
-        )
-
-    def _reading(self, row: Row) -> Callable[[], tuple[Frame, SE3]]:
-        return lambda: (self.view(row.name).frame, row.T_world_camera)
-
-
 class PoseTableReader(Reader):
     """The object that the entry point names."""
 
@@ -104,11 +39,21 @@ class PoseTableReader(Reader):
     def recognises(self, path: Path) -> bool:
         return (path / TABLE).is_file() and (path / CAMERA).is_file()
 
-    def open(self, path: Path, options: ReadOptions) -> PoseTable:
-        return PoseTable(path, options.background)
-
-    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        return PoseTable(path, options.background).sequence()
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        shots = []
+        for row in read_table(path / TABLE):
+            depth = path / f"{row.name}.depth.png"
+            shots.append(
+                Shot(
+                    image=path / f"{row.name}.png",
+                    camera=CameraSource(path / CAMERA),
+                    T_world_camera=row.T_world_camera,
+                    time=row.time,
+                    depth=DepthFile(depth, partial(read_depth_image, depth, 0.001)),
+                    splits=("train",),
+                )
+            )
+        return Capture(path, shots, options.colour)
 
 
 reader = PoseTableReader()

@@ -20,9 +20,9 @@ from typing import Any
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 
-from bidnerf_core import Dataset, InputError, Intrinsics
+from bidnerf_core import Frame, InputError, Intrinsics
 from bidnerf_core.camera import same_aspect
-from bidnerf_core.datasets import FrameSequence, Reader, ReadOptions, TimedFrame
+from bidnerf_core.datasets import BreaksOff, Capture, DatasetOptions, Reader, Shot
 from bidnerf_ros2.conversions import seconds
 from bidnerf_ros2.messages import frame_of, intrinsics, is_depth
 
@@ -49,41 +49,68 @@ class Topics:
     interval: float  # seconds, the mean of the images or of depth, whichever come faster
 
 
-@dataclass(frozen=True)
-class BagSequence:
-    """The frames of a bag in chronological order, see ``FrameSequence``."""
+class Bag:
+    """The images of a bag in chronological order, with the depth of each, decoded one after another."""
 
-    path: Path
-    topics: Topics
-    camera: Intrinsics  # of the images, or the given one instead
+    def __init__(self, path: Path, topics: Topics) -> None:
+        self._path, self._topics = path, topics
+        self._decoded: Iterator[tuple[Any, Any | None]] = iter(())
+        self._next = 0  # number of the next image to decode
 
-    def __len__(self) -> int:
-        return self.topics.frames
+    def read(self, number: int) -> tuple[Any, Any | None]:
+        """Return the message of an image, and that of its depth. Raises ``BreaksOff`` if the bag ends before it."""
+        if number < self._next or self._next == 0:
+            self._decoded, self._next = self._paired(), 0
+        try:
+            for found in self._decoded:
+                self._next += 1
+                if self._next > number:
+                    return found
+        except InputError as error:
+            raise BreaksOff(error) from error
+        raise BreaksOff(f"ends before image {number}", where=self._path, expected="a complete bag")
 
-    def __iter__(self) -> Iterator[TimedFrame]:
-        for number, (time, image, depth) in enumerate(self._paired()):
-            yield TimedFrame(time, frame_of(image, self.camera, depth, f"{number:06d}"))
-
-    def _paired(self) -> Iterator[tuple[float, Any, Any | None]]:
-        """Yield images with their times and depth, once the depth can have been recorded."""
+    def _paired(self) -> Iterator[tuple[Any, Any | None]]:
+        """Yield images with their depth, once the depth can have been recorded."""
         images: deque[tuple[float, Any]] = deque()
         depths: deque[tuple[float, Any]] = deque(maxlen=2 * WAITING)
-        for topic, time, message in _messages(self.path, (self.topics.image, self.topics.depth)):
-            (images if topic == self.topics.image else depths).append((time, message))
+        for topic, time, message in _messages(self._path, (self._topics.image, self._topics.depth)):
+            (images if topic == self._topics.image else depths).append((time, message))
             while images and (self._is_complete(images[0][0], depths) or len(images) > WAITING):
                 yield self._with_depth(*images.popleft(), depths)
         for image in images:
             yield self._with_depth(*image, depths)
 
     def _is_complete(self, time: float, depths: deque[tuple[float, Any]]) -> bool:
-        return self.topics.depth is None or any(other >= time for other, _ in depths)
+        return self._topics.depth is None or any(other >= time for other, _ in depths)
 
     def _with_depth(
         self, time: float, image: Any, depths: deque[tuple[float, Any]]
-    ) -> tuple[float, Any, Any | None]:
+    ) -> tuple[Any, Any | None]:
         nearest = min(depths, key=lambda depth: abs(depth[0] - time), default=None)
-        close = nearest is not None and abs(nearest[0] - time) <= max(FASTEST, self.topics.interval / 2)
-        return time, image, nearest[1] if nearest is not None and close else None
+        close = nearest is not None and abs(nearest[0] - time) <= max(FASTEST, self._topics.interval / 2)
+        return image, nearest[1] if nearest is not None and close else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the open bag, which another process cannot use."""
+        return {**self.__dict__, "_decoded": iter(()), "_next": 0}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BagShot(Shot):
+    """An image of a bag."""
+
+    camera: Intrinsics
+    bag: Bag
+    number: int
+
+    def frame(
+        self, background: tuple[float, float, float] = (0.0, 0.0, 0.0), side: int | None = None
+    ) -> Frame:
+        """Decode the image and its depth."""
+        image, depth = self.bag.read(self.number)
+        found = frame_of(image, self.camera, depth, self.name)
+        return found if side is None else found.at_most(side)
 
 
 class BagReader(Reader):
@@ -101,23 +128,23 @@ class BagReader(Reader):
         """Return whether a folder is a ROS 2 bag, or a file is a bag by its name."""
         return (path / METADATA).is_file() or (path.is_file() and path.suffix.lower() in SUFFIXES)
 
-    def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Raise ``InputError``: a bag is a sequence, not a dataset."""
-        raise InputError(
-            "a bag has no poses for its images",
-            where=path,
-            expected=f"'bidnerf track MAP {path}', or a dataset with poses",
-        )
-
-    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        """Return the images of a bag. Raises ``InputError`` for a bag without images and matching camera infos."""
-        topics = _topics(path)
-        given = options.camera
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """Return the images of a bag, without poses. Raises ``InputError`` for a bag without images and matching camera
+        infos.
+        """
+        topics, given = _topics(path), options.given_camera
         if given is not None and not isinstance(given, Intrinsics):
             raise InputError("a bag has its own camera;", where=path, expected="Intrinsics to replace it")
         depth = "no depth" if topics.depth is None else f"depth of {topics.depth}"
         log.info("%s: images of %s, camera of %s, %s", path, topics.image, topics.info, depth)
-        return BagSequence(path, topics, given or topics.camera)
+        bag, camera = Bag(path, topics), given or topics.camera
+        times = (time for _, time, _ in _messages(path, (topics.image,)))
+        shots = [
+            BagShot(bag=bag, number=number, camera=camera, time=time, stem=f"{number:06d}")
+            for number, time in enumerate(times)
+        ]
+        tracked = f"'bidnerf track MAP {path}', or a dataset with poses"
+        return Capture(path, shots, options.colour, poses_expected=tracked)
 
 
 def _messages(path: Path, names: tuple[str | None, ...]) -> Iterator[tuple[str, float, Any]]:

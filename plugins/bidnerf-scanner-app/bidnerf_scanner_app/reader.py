@@ -19,42 +19,31 @@ Otherwise, half a pixel is added.
 
 from __future__ import annotations
 
-import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics, Raster, same_aspect
+from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.datasets import (
-    Dataset,
-    FrameSequence,
+    Capture,
+    DatasetOptions,
+    DepthFile,
+    LidarDepth,
     Reader,
-    ReadOptions,
-    SplitDataset,
-    Splits,
+    Shot,
     hold_out,
-    largest_side,
     pose_of_rows,
-    read_rgbd,
 )
-from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame, fit_depth
-from bidnerf_core.geometry import SE3, LengthUnit
-from bidnerf_core.io import Background, Record, decode, read_file, read_record, reduced
+from bidnerf_core.frames import Frame
+from bidnerf_core.io import Record, read_file, read_header, read_record
 
 LARGEST_SIDE = 640
 """Default limit of the pixels on a photo's longer side."""
-RANGE = 5.0
-"""Range of the LiDAR (metres) according to Apple; depth beyond it was inferred from the photo."""
-HIGH_CONFIDENCE = 2
 POSE, INTRINSICS, PROJECTION = "cameraPoseARFrame", "intrinsics", "projectionMatrix"
 PHOTO = re.compile(r"frame_(\d+)\.jpe?g", re.IGNORECASE)
 DEPTH = re.compile(r"depth_(\d+)\.png")
@@ -62,31 +51,28 @@ OTHER_SIZE = 0.01
 """Relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that indicates another image size."""
 
 
-@dataclass(frozen=True, eq=False)
-class ScannerFrame:
-    """A frame with a photo, with depth, or with both."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DepthShot(Shot):
+    """A frame that has only depth. Its metadata file holds the camera of a photo that was not saved."""
 
-    description: Path
-    photo: Path | None
     record: Record
-    T_world_camera: SE3
-    has_depth: bool
+    depth: DepthFile
 
-    @property
-    def stem(self) -> str:
-        return self.description.stem
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        return (self.stem,)
-
-    @property
-    def time(self) -> float | None:
-        return self.record.number("time")
-
-    def beside(self, kind: str) -> Path:
-        """Return the frame's file "depth" or "conf"."""
-        return self.description.with_name(f"{kind}_{self.stem.split('_')[1]}.png")
+    def frame(
+        self, background: tuple[float, float, float] = (0.0, 0.0, 0.0), side: int | None = None
+    ) -> Frame:
+        """Read the depth, at its own resolution."""
+        metres = self.depth.read().metres
+        height, width = metres.shape
+        photo_width, photo_height = projected_size(self.record)
+        if not same_aspect((width, height), (photo_width, photo_height)):
+            raise InputError(
+                f"depth is {width}x{height}, but its camera's photos are {photo_width}x{photo_height};",
+                where=self.depth.path,
+                expected="the same aspect ratio",
+            )
+        camera = scanner_camera(self.record, photo_width, photo_height).resized(width, height)
+        return Frame(self.name, torch.zeros(height, width, 3), camera, metres, has_colour=False)
 
 
 @dataclass(frozen=True)
@@ -104,103 +90,57 @@ class ScannerAppReader(Reader):
         except InputError:
             return False
 
-    def open(self, path: Path, options: ReadOptions) -> Dataset:
-        """Read the metadata of all frames. Raises ``InputError`` if a file is missing or invalid."""
-        return self._dataset(path, options)
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """Read the metadata of all frames; those with only depth are in no split. Raises ``InputError`` if a file is
+        missing or invalid.
 
-    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        """Read the metadata of all frames, including those that have only depth."""
-        return self._dataset(path, options).sequence(depth_frames(path))
-
-    def _dataset(self, path: Path, options: ReadOptions) -> ScannerAppDataset:
-        splits = Splits(path, hold_out(scanner_frames(path)))
-        return ScannerAppDataset(splits, options.background, self.largest)
-
-
-class ScannerAppDataset(SplitDataset[ScannerFrame]):
-    """Views of a "3D Scanner App" folder; see ``Dataset``."""
-
-    unit: LengthUnit | None = "metres"
-    up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
-
-    def __init__(self, frames: Splits[ScannerFrame], background: Background | None, largest: int) -> None:
-        super().__init__(frames, background)
-        self._largest = largest
-
-    def _pose(self, frame: ScannerFrame) -> SE3:
-        return frame.T_world_camera
-
-    def _frame(self, frame: ScannerFrame, name: str) -> Frame:
-        return _between(frame, name) if frame.photo is None else self._with_photo(frame, frame.photo, name)
-
-    def _with_photo(self, frame: ScannerFrame, photo: Path, name: str) -> Frame:
-        whole = read_rgbd(name, photo, partial(scanner_camera, frame.record), self._background)
-        camera = whole.intrinsics
-        limit = largest_side(self._largest) or math.inf
-        small = camera.scaled(min(1.0, limit / max(camera.width, camera.height)))
-        rgb = whole.rgb if small == camera else reduced(whole.rgb, small.width, small.height)
-        depth = None
-        if frame.has_depth:
-            measured = read_measured(frame.beside("depth"), frame.beside("conf"))
-            raster, where = Raster(camera.width, camera.height), f"{frame.beside('depth')}: depth"
-            depth = fit_depth(measured, raster, (small.width, small.height), where)
-        return Frame(name, rgb, small, depth)
-
-
-def _between(frame: ScannerFrame, name: str) -> Frame:
-    """Read a frame that has only depth. Its metadata file holds the camera of a photo that was not saved."""
-    depth = read_measured(frame.beside("depth"), frame.beside("conf")).metres
-    height, width = depth.shape
-    photo_width, photo_height = projected_size(frame.record)
-    if not same_aspect((width, height), (photo_width, photo_height)):
-        raise InputError(
-            f"depth is {width}x{height}, but its camera's photos are {photo_width}x{photo_height};",
-            where=frame.beside("depth"),
-            expected="the same aspect ratio",
+        Depth is expected for all frames or, from phones without a LiDAR, for none.
+        """
+        numbered = {file: PHOTO.fullmatch(file.name) for file in path.iterdir()}
+        photos = sorted((int(found[1]), file) for file, found in numbered.items() if found)
+        if not photos:
+            expected = "frame_N.jpg next to some of them"
+            raise InputError("has frame_N.json but no photo", where=path, expected=expected)
+        for (number, file), (following, other) in pairwise(photos):
+            if number == following:
+                found = f"{file.name} and {other.name} have the same number"
+                raise InputError(found, where=path, expected="each once")
+        measured = {file: DEPTH.fullmatch(file.name) for file in sorted(path.glob("depth_*.png"))}
+        between = {path / f"frame_{found[1]}.json": None for found in measured.values() if found}
+        read = LidarDepth() if measured or any(path.glob("conf_*.png")) else None
+        described = {file.with_suffix(".json"): file for _, file in photos}
+        shots = [self._shot(file, photo, read) for file, photo in {**between, **described}.items()]
+        shots.sort(key=lambda shot: int(shot.stem.split("_")[1]))
+        up = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
+        return Capture(
+            path, hold_out(shots, lambda shot: shot.image is not None), options.colour, unit="metres", up=up
         )
-    camera = scanner_camera(frame.record, photo_width, photo_height).resized(width, height)
-    return Frame(name, torch.zeros(height, width, 3), camera, depth, has_colour=False)
 
-
-def scanner_frames(folder: Path) -> list[ScannerFrame]:
-    """Read the metadata of all photos, ordered by number. Raises ``InputError`` if a file is missing or
-    invalid.
-
-    Depth is expected for all frames or, from phones without a LiDAR, for none.
-    """
-    numbered = {path: PHOTO.fullmatch(path.name) for path in folder.iterdir()}
-    photos = sorted((int(found[1]), path) for path, found in numbered.items() if found)
-    if not photos:
-        raise InputError(
-            "has frame_N.json but no photo", where=folder, expected="frame_N.jpg next to some of them"
-        )
-    for (number, path), (following, other) in pairwise(photos):
-        if number == following:
-            raise InputError(
-                f"{path.name} and {other.name} have the same number", where=folder, expected="each once"
-            )
-    has_depth = any(folder.glob("depth_*.png")) or any(folder.glob("conf_*.png"))
-    return [_frame(path.with_suffix(".json"), path, has_depth) for _, path in photos]
-
-
-def depth_frames(folder: Path) -> list[ScannerFrame]:
-    """Read the metadata of the frames that have depth and no photo. Raises ``InputError`` as ``scanner_frames`` does."""
-    photos = {path.stem for path in folder.iterdir() if PHOTO.fullmatch(path.name)}
-    numbered = {path: DEPTH.fullmatch(path.name) for path in sorted(folder.glob("depth_*.png"))}
-    descriptions = [folder / f"frame_{found[1]}.json" for found in numbered.values() if found]
-    return [_frame(path, None, True) for path in descriptions if path.stem not in photos]
-
-
-def _frame(description: Path, photo: Path | None, has_depth: bool) -> ScannerFrame:
-    record = read_record(description)
-    numbers = _numbers(record, POSE, 16)
-    rows = [numbers[first : first + 4] for first in range(0, 16, 4)]
-    frame = ScannerFrame(description, photo, record, pose_of_rows(record, POSE, rows), has_depth)
-    for kind in ("depth", "conf") if has_depth else ():
-        if not frame.beside(kind).is_file():
-            there = description if photo is None else photo
-            raise InputError(f"no such file, although {there.name} exists", where=frame.beside(kind))
-    return frame
+    def _shot(self, description: Path, photo: Path | None, read: LidarDepth | None) -> Shot:
+        record = read_record(description)
+        numbers = _numbers(record, POSE, 16)
+        rows = [numbers[first : first + 4] for first in range(0, 16, 4)]
+        about = {
+            "T_world_camera": pose_of_rows(record, POSE, rows),
+            "time": record.number("time"),
+            "stem": description.stem,
+            "folders": (),
+        }
+        measured = None
+        if read is not None:
+            number = description.stem.split("_")[1]
+            depth, confidence = (description.with_name(f"{kind}_{number}.png") for kind in ("depth", "conf"))
+            for file in (depth, confidence):
+                if not file.is_file():
+                    there = description if photo is None else photo
+                    raise InputError(f"no such file, although {there.name} exists", where=file)
+            measured = DepthFile(depth, partial(read, depth, confidence))
+        if photo is None:
+            assert measured is not None  # which is why it is listed
+            return DepthShot(record=record, depth=measured, **about)  # type: ignore[arg-type]
+        header = read_header(photo)
+        camera = scanner_camera(record, header.width, header.height)
+        return Shot(image=photo, camera=camera, depth=measured, usual_side=self.largest, **about)  # type: ignore[arg-type]
 
 
 def projected_size(record: Record) -> tuple[int, int]:
@@ -230,28 +170,6 @@ def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
     if not (width / 4 < centre[0] < width * 3 / 4 and height / 4 < centre[1] < height * 3 / 4):
         raise _other_size(record, width, height)
     return Intrinsics(fx, fy, *centre, width, height)
-
-
-def read_measured(depth: Path, confidence: Path) -> DepthImage:
-    """Read depth (metres), 0 where the confidence is not high and outside the sensor's range.
-
-    Raises ``InputError`` if a file cannot be read or does not have the expected content.
-    """
-    measured = read_depth_image(depth, MILLIMETRE)
-    sure = decode(confidence)
-    height, width = measured.metres.shape
-    if sure.shape != (height, width):
-        found = "x".join(map(str, sure.shape[1::-1] + sure.shape[2:]))
-        raise InputError(f"is {found}", where=confidence, expected=f"{width}x{height} as {depth.name}")
-    if sure.dtype != np.uint8 or sure.max() > HIGH_CONFIDENCE:
-        raise InputError(
-            f"has values up to {sure.max()}", where=confidence, expected="confidences of 0, 1 and 2"
-        )
-    return replace(measured, metres=_kept(measured.metres, torch.from_numpy(sure)))
-
-
-def _kept(metres: Float[Tensor, "h w"], confidence: Tensor) -> Float[Tensor, "h w"]:
-    return torch.where((confidence == HIGH_CONFIDENCE) & (metres <= RANGE), metres, 0)
 
 
 def _other_size(record: Record, width: int, height: int) -> InputError:

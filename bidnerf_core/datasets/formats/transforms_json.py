@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, get_args
 
-from bidnerf_core.camera import PANORAMA, CameraRecord, camera_record
+from bidnerf_core.camera import CameraRecord, camera_record
+from bidnerf_core.datasets.capture import SPLITS, remark
 from bidnerf_core.datasets.file_names import posix_name
-from bidnerf_core.datasets.incomplete import remark
-from bidnerf_core.datasets.panoramas import faces_of
+from bidnerf_core.datasets.formats.photos import timestamp
 from bidnerf_core.datasets.pose_rows import pose_and_scale
-from bidnerf_core.datasets.sequence import timestamp
-from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 
-SPLITS = ("train", "val", "test")
 METRES_PER_DEPTH_UNIT = 0.001
 DEPTH_KEYS = ("depth_file_path", "depth_path")
 """The keys of a depth image: nerfstudio's, and that of instant-ngp and NeRFCapture."""
@@ -50,23 +47,7 @@ class FrameRecord:
     @property
     def stem(self) -> str:
         known = self.file_path.suffix.lower() in IMAGE_SUFFIXES
-        stem = self.file_path.stem if known else self.file_path.name  # "r_0.5" may have no extension
-        return stem if self.camera.face is None else f"{stem}_{self.camera.face}"
-
-    def faces(self) -> list[FrameRecord]:
-        """Return the pinhole views of a panorama; the frame itself if it is not one. Raises ``InputError``
-        for a panorama with depth.
-        """
-        if self.camera.lens != PANORAMA:
-            return [self]
-        if self.depth_path is not None:
-            raise self.record.error(
-                "an equirectangular image has depth", expected="none, or pinhole images with depth"
-            )
-        return [
-            replace(self, camera=replace(self.camera, face=face), T_world_camera=T)
-            for face, T in faces_of(self.T_world_camera)
-        ]
+        return self.file_path.stem if known else self.file_path.name  # "r_0.5" may have no extension
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -74,19 +55,31 @@ class FrameRecord:
         return (*self.file_path.parts[:-1], self.stem)
 
 
-def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
-    """Read the frame records of each split of the folder ``path``. Raises ``InputError`` for an invalid ``transforms*.json``."""
+def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
+    """Read the frames of the folder ``path`` with their splits, none of them if a single file lists no splits.
+
+    Raises ``InputError`` for an invalid ``transforms*.json``.
+    """
     files = {split: path / file_of(split) for split in SPLITS if (path / file_of(split)).is_file()}
     if files:
-        return _cut({split: read_frames(read_record(file)) for split, file in files.items()})
+        return [
+            (frame, (split,)) for split, file in files.items() for frame in read_frames(read_record(file))
+        ]
     record = read_record(path / "transforms.json")
-    return _cut(split_frames(record, read_frames(record)))
-
-
-def _cut(splits: dict[str, list[FrameRecord]]) -> dict[str, list[FrameRecord]]:
-    """Return the splits with panoramas divided into pinhole views; splits may share frames."""
-    views = {id(frame): frame.faces() for group in splits.values() for frame in group}
-    return {split: [view for frame in group for view in views[id(frame)]] for split, group in splits.items()}
+    frames, lists = read_frames(record), {split: record.items(f"{split}_filenames") for split in SPLITS}
+    if not any(lists.values()):
+        return [(frame, ()) for frame in frames]
+    by_path = {frame.file_path: frame for frame in frames}
+    splits = {frame.file_path: list[str]() for frame in frames}
+    for split, listed in lists.items():
+        for frame in _listed(record, by_path, f"{split}_filenames", listed or []):
+            splits[frame.file_path].append(split)
+    if not any(splits.values()):
+        (key, listed), *_ = ((f"{split}_filenames", listed) for split, listed in lists.items() if listed)
+        raise record.error(
+            f"{key} lists {listed[0]!r}", expected=f"the file_path of one of its {len(by_path)} frames"
+        )
+    return [(frame, tuple(splits[frame.file_path])) for frame in frames if splits[frame.file_path]]
 
 
 def read_frames(file: Record) -> list[FrameRecord]:
@@ -105,6 +98,9 @@ def read_frames(file: Record) -> list[FrameRecord]:
         if first != number:
             raise frame.record.error(f"has the same image as frame {first}", expected="each image once")
     _remark_scales(file, frames)
+    for row in file.items("applied_transform") or []:  # which is not undone
+        for number in row if isinstance(row, list) else [row]:
+            file.checked_number(number, "an entry of applied_transform")
     if file.value("enable_depth_loading") is False and any(
         "depth_path" in frame.record.values for frame in frames
     ):
@@ -150,26 +146,6 @@ def _remark_scales(file: Record, frames: list[FrameRecord]) -> None:
             f"{whose} {len(frames)} matrices have a scale (frame {first.file_path}: {first.scale:.6g}), which is removed; the"
             " positions of the cameras are those of the matrices",
         )
-
-
-def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[FrameRecord]]:
-    """Split one ``transforms.json`` by its lists of file names, or hold out every eighth frame if it has none."""
-    lists = {split: file.items(f"{split}_filenames") for split in SPLITS}
-    if not any(lists.values()):
-        return hold_out(frames)
-    by_path = {frame.file_path: frame for frame in frames}
-    found = {
-        split: _listed(file, by_path, f"{split}_filenames", listed)
-        for split, listed in lists.items()
-        if listed
-    }
-    splits = {split: listed for split, listed in found.items() if listed}
-    if not splits:
-        (key, listed), *_ = ((f"{split}_filenames", listed) for split, listed in lists.items() if listed)
-        raise file.error(
-            f"{key} lists {listed[0]!r}", expected=f"the file_path of one of its {len(by_path)} frames"
-        )
-    return splits
 
 
 def _listed(

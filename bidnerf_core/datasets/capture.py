@@ -1,0 +1,463 @@
+"""Captures: images, each with all that is known of it, read one at a time. Every reader returns one.
+
+A ``Capture`` is a list of ``Shot``s. Choosing a split, adding masks and ordering by time are operations on that list, and none
+of them opens an image. Photos without poses, the frames of a video and images in memory are captures too.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, TypeAlias, TypeVar, overload
+
+import torch
+from jaxtyping import Bool, Shaped
+from torch import Tensor
+
+from bidnerf_core.camera import Camera, CameraSource, Intrinsics, Lens, PanoramaFace, Raster, same_aspect
+from bidnerf_core.datasets.names import positions, unique_names
+from bidnerf_core.datasets.panoramas import faces_of
+from bidnerf_core.depth import DepthCamera, DepthImage
+from bidnerf_core.errors import InputError, InputWarning, amount
+from bidnerf_core.frames import (
+    BLACK,
+    Frame,
+    HiddenColour,
+    MaskFolder,
+    View,
+    WhollyHidden,
+    fit_depth,
+    hides_everything,
+    natural_order,
+    pinhole_of,
+    read_mask,
+)
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import ImageSource, is_file, read_compact_image, read_header, reduced
+
+Item = TypeVar("Item")
+ReadingProgress: TypeAlias = Callable[[int, int], None]
+"""Called with (frames read, frames requested) after each frame."""
+Colour: TypeAlias = tuple[float, float, float]
+
+ALL = "all"
+"""The split of all images with a pose, unless a capture has a split of that name."""
+HOLD_OUT_EVERY = 8
+SPLITS = ("train", "val", "test")
+"""The usual splits, in their order."""
+
+
+class BreaksOff(InputError):
+    """A recording that is decoded in order ends too early: none of the later frames can be read either."""
+
+
+class Picture(Protocol):
+    """An image that is not a file of its own, such as a frame of a video."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        ...
+
+    def pixels(self) -> Shaped[Tensor, "h w 3"]:
+        """Decode it. Raises ``InputError`` if that is impossible."""
+        ...
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """The depth image of a shot: ``read`` returns it in metres; it is registered to the image from ``sensor``, if given."""
+
+    path: Path | str  # for messages
+    read: Callable[[], DepthImage]
+    sensor: DepthCamera | None = None
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """A mask of a shot, and the colour in it of the pixels that are ignored."""
+
+    path: Path
+    hides: HiddenColour = "black"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shot:
+    """An image and what its format knows of it; nothing is decoded before ``frame`` is called.
+
+    Formats whose images are not stored in the usual way derive a class that overrides ``frame``.
+    """
+
+    image: ImageSource | Picture | None = None
+    camera: Camera | CameraSource = CameraSource()
+    T_world_camera: SE3 | None = None  # float64, OpenCV axes
+    time: float | None = None  # seconds, from an origin that depends on the recording
+    depth: DepthFile | None = None  # planar z
+    masks: tuple[MaskFile, ...] = ()
+    border: int = 0  # width in pixels of the border of the stored image that shows nothing
+    splits: tuple[str, ...] = ()  # empty if it belongs to no split, as without a pose
+    name: str = ""  # unique in its capture, which assigns it
+    stem: str = ""  # by default the image file's name without its suffix
+    folders: tuple[str, ...] | None = None  # those in front of the stem, by default the image file's
+    usual_side: int | None = (
+        None  # to which the format's images are downscaled unless the user gives another size
+    )
+
+    def __post_init__(self) -> None:
+        file = self.file
+        if not self.stem and file is not None:
+            object.__setattr__(self, "stem", file.stem)
+        if self.folders is None:
+            object.__setattr__(self, "folders", () if file is None else file.parts[:-1])
+
+    @property
+    def file(self) -> Path | None:
+        """The image file, if the image is one of its own."""
+        return self.image if isinstance(self.image, Path) else None
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The folders, then the stem."""
+        return *(self.folders or ()), self.stem
+
+    def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
+        """Read the image, composited over ``background`` (rgb) if it has an alpha channel, and its depth.
+
+        An image with more than ``side`` pixels along the longer side is downscaled to that, unless it is taken
+        through a ``Lens``: those are resampled to the pinhole camera of the lens. The camera is checked before a
+        pixel is decoded. Registered depth may be of any size: each pixel has the depth of the nearest measurement.
+        Raises ``InputError`` for an unreadable file, and for a camera or registered depth of another aspect ratio.
+        """
+        assert self.image is not None  # else a subclass reads it
+        if isinstance(self.image, ImageSource):
+            header = read_header(self.image)
+            stored = header.width, header.height
+        else:
+            stored = self.image.size
+        source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
+        camera, size = source.find(str(self.image), Raster(*stored)).camera, stored
+        if side is not None and isinstance(camera, Intrinsics) and max(stored) > side:
+            camera = camera.scaled(side / max(stored))
+            size = camera.width, camera.height
+        if isinstance(self.image, ImageSource):
+            rgb, alpha = read_compact_image(self.image, background, None if size == stored else size)
+        else:
+            pixels = self.image.pixels()
+            rgb, alpha = pixels if size == stored else reduced(pixels, *size), None
+        metres, hidden = None, None
+        if self.depth is not None:
+            measured, where = self.depth.read(), Path(self.depth.path)
+            metres = (
+                fit_depth(measured, Raster(*stored), size, f"{where}: depth")
+                if self.depth.sensor is None
+                else self.depth.sensor.registered(measured.metres, pinhole_of(camera, where), where)
+            )
+        if self.border:
+            width = max(1, round(self.border * size[0] / stored[0]))
+            hidden = torch.ones(rgb.shape[:2], dtype=torch.bool)
+            hidden[width:-width, width:-width] = False
+            hidden = None if bool(hidden.all()) else hidden
+        return Frame.taken(self.name, camera, rgb, metres, alpha, hidden)
+
+    def read(self, background: Colour = BLACK, side: int | None = None) -> Frame:
+        """Read the frame, and hide what its masks hide. Raises ``WhollyHidden`` if that is everything."""
+        found = self.frame(background, side)
+        for mask in self.masks:
+            found = found.with_hidden(_hidden(mask, found))
+        return found
+
+    @property
+    def is_wholly_hidden(self) -> bool:
+        """Whether a mask leaves nothing visible; no image is read."""
+        return any(hides_everything(mask.path, mask.hides) for mask in self.masks)
+
+    def faces(self) -> list[Shot]:
+        """Return the pinhole views of a panorama with a pose; the shot itself if it is not one."""
+        if not isinstance(self.camera, PanoramaFace) or self.T_world_camera is None:
+            return [self]
+        return [
+            replace(
+                self, camera=replace(self.camera, face=face), T_world_camera=T, stem=f"{self.stem}_{face}"
+            )
+            for face, T in faces_of(self.T_world_camera)
+        ]
+
+
+def _hidden(mask: MaskFile, frame: Frame) -> Bool[Tensor, "h w"] | None:
+    """Return what a mask hides of a frame. A mask of the stored image is undistorted, or cut, with it."""
+    lens: Lens | None = frame.lens
+    if isinstance(lens, PanoramaFace):
+        header = read_header(mask.path)
+        lens = lens if same_aspect((header.width, header.height), lens.stored_size) else None
+    camera = frame.intrinsics if lens is None else lens
+    size, orientation = (camera.width, camera.height), frame.orientation
+    stored = orientation.upright_size(*size)  # which exchanges the sides back
+    hidden = read_mask(mask.path, Raster(*stored, orientation), size, mask.hides)
+    if lens is None:
+        return hidden
+    return torch.from_numpy(lens.resampled(hidden.byte().numpy(), nearest=True)) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class TimedFrame:
+    """A frame of a sequence, its time, and its true pose if known."""
+
+    time: float | None  # seconds, from an origin that depends on the recording
+    frame: Frame  # without colours (``has_colour``) if only depth was recorded at this time
+    truth: SE3 | None = None  # T_world_camera, OpenCV axes, if the recording has it
+    split: str | None = None  # the split of the dataset that holds the frame
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Images with what is known of them. Poses are ``T_world_camera`` with OpenCV axes; depth is planar z in metres.
+
+    A frame's name is the stem of its image file. If several files of a split share a stem, the names are prefixed
+    with just enough folders to make them unique ("left_0001", "right_0001"); the bare stem is then rejected as
+    ambiguous. Indices and iteration read frames, slices do not.
+    """
+
+    # Not a subclass of collections.abc.Sequence: run-time type checkers inspect an item of those, which would read a file.
+
+    path: Path
+    shots: Sequence[Shot]
+    background: Colour = BLACK  # behind images with an alpha channel
+    unit: LengthUnit | None = None  # of the poses; None if the format does not specify it
+    up: Colour | None = (
+        None  # the upward direction in the world if the capture measured gravity, as phones do
+    )
+    depth_unit: float | None = None  # metres per step of depth images, if the format accepts another unit
+    largest: int | None = (
+        None  # longer side to which the user asked to downscale images, instead of the usual one
+    )
+    poses: Path | str | None = None  # what records the poses, for messages
+    poses_expected: str = "at least one"  # what has to be there for an image to have a pose
+    unposed: str = ""  # why some images have none
+
+    def __post_init__(self) -> None:
+        if not all(shot.name for shot in self.shots):
+            object.__setattr__(self, "shots", _named(self.shots))
+
+    @cached_property
+    def splits(self) -> tuple[str, ...]:
+        """The names of the splits; "train" comes first if it exists. Empty if no image has a pose."""
+        found = dict.fromkeys(split for shot in self.shots for split in shot.splits)
+        return tuple(sorted(found, key=lambda split: SPLITS.index(split) if split in SPLITS else len(SPLITS)))
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the frames."""
+        return [shot.name for shot in self.shots]
+
+    @property
+    def times(self) -> list[float | None]:
+        """The times of the frames (seconds)."""
+        return [shot.time for shot in self.shots]
+
+    def __len__(self) -> int:
+        return len(self.shots)
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        return (self[index] for index in range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int) -> TimedFrame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Capture: ...
+
+    def __getitem__(self, index: int | slice) -> TimedFrame | Capture:
+        if isinstance(index, slice):
+            return replace(self, shots=self.shots[index])
+        shot = self.shots[index]
+        return TimedFrame(shot.time, self._read(shot), shot.T_world_camera, next(iter(shot.splits), None))
+
+    def split(self, name: str) -> Capture:
+        """Return the frames of a split; "all" has every frame that is in any. Raises ``InputError`` for an unknown split."""
+        if name == ALL and ALL not in self.splits:
+            return replace(self, shots=_named([shot for shot in self.shots if shot.splits]))
+        if name not in self.splits:
+            known = ", ".join(self.splits) or "none, since only images with poses are in a split"
+            raise InputError(f"no split {name!r}", where=self.path, expected=f"one of {known}")
+        return replace(
+            self, shots=_named([shot for shot in self.shots if name in shot.splits], one_split=True)
+        )
+
+    def in_time_order(self) -> Capture:
+        """Return all frames in chronological order; if any lacks a time, in natural order of names and without times."""
+        shots = sorted(self.shots, key=lambda shot: natural_order("/".join(shot.parts)))
+        if any(shot.time is None for shot in shots):
+            return replace(self, shots=[replace(shot, time=None) for shot in shots])
+        return replace(self, shots=sorted(shots, key=lambda shot: shot.time or 0.0))
+
+    def masked(self, folder: MaskFolder, by_stem: bool = False) -> Capture:
+        """Return the frames with what the masks in a folder hide; ``by_stem``, without regard to folders.
+
+        Raises ``InputError`` if no frame has a mask by name.
+        """
+        own = [[shot.name, *([shot.stem] if by_stem else [])] for shot in self.shots]
+        for split in self.splits:  # where masks may be named as well
+            inside = [index for index, shot in enumerate(self.shots) if split in shot.splits]
+            for index, name in zip(inside, self.frame_names(split), strict=True):
+                own[index].append(name)
+        folder.require_any([name for names in own for name in names])
+        files = [next((file for name in names if (file := folder.file_of(name))), None) for names in own]
+        return replace(
+            self,
+            shots=[
+                shot if file is None else replace(shot, masks=(*shot.masks, MaskFile(file, folder.hides)))
+                for shot, file in zip(self.shots, files, strict=True)
+            ],
+        )
+
+    def at_most(self, largest: int | None) -> Capture:
+        """Return the frames downscaled to ``largest`` pixels along the longer side, even if the format has another limit."""
+        return replace(self, largest=largest)
+
+    def frame_names(self, split: str) -> list[str]:
+        """Return the names in a split, in order. Raises ``InputError`` for an unknown split."""
+        return self.split(split).names
+
+    def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
+        """Return the frames ``names`` of a split, in that order, or all. Raises ``InputError`` for an unknown split or name."""
+        chosen = self.split(split)
+        if names is None:
+            return list(chosen.shots)
+        stems, where = [shot.stem for shot in chosen.shots], f"{self.path}: split {split!r}"
+        found = positions(
+            chosen.names, stems, names, where, lambda: {s: self.frame_names(s) for s in self.splits}
+        )
+        return [chosen.shots[index] for index in found]
+
+    def views(
+        self,
+        split: str,
+        names: Sequence[str] | None = None,
+        progress: ReadingProgress | None = None,
+        limit: int | None = None,
+    ) -> list[View]:
+        """Read the frames ``names``, in that order, or the whole split; no other image is opened.
+
+        When reading a whole split, frames that a mask hides entirely are left out. Images with more than ``limit``
+        pixels along the longer side are downscaled to that, where the user asked for nothing else. Raises
+        ``InputError`` for an unknown split or frame, and for a file that is missing or invalid.
+        """
+        shots, views = self.select(split, names), list[View]()
+        for done, shot in enumerate(shots, start=1):
+            try:
+                views.append(self.view(shot, limit))
+            except WhollyHidden:
+                if names is not None:
+                    raise
+            if progress is not None:
+                progress(done, len(shots))
+        return views
+
+    def wholly_hidden(self, split: str) -> list[str]:
+        """Return the frames of a split of which a mask leaves nothing visible; only masks are read."""
+        return [shot.name for shot in self.select(split) if shot.is_wholly_hidden]
+
+    def require_poses(self) -> Capture:
+        """Return the capture; a remark counts frames without a pose. Raises ``InputError`` if no frame has one."""
+        posed, where = sum(shot.T_world_camera is not None for shot in self.shots), self.poses or self.path
+        images = amount(len(self), "image")
+        if not posed:
+            raise InputError(f"has no pose for any of {images}", where=where, expected=self.poses_expected)
+        if posed < len(self):
+            why = f": {self.unposed}" if self.unposed else ""
+            remark(where, f"{len(self) - posed} of {images} have no pose and are left out{why}")
+        return self
+
+    def view(self, shot: Shot, limit: int | None = None) -> View:
+        """Read a frame that has a pose, of at most ``limit`` pixels along the longer side as in ``views``."""
+        assert shot.T_world_camera is not None  # only frames with a pose are in splits
+        return View(self._read(shot, limit), shot.T_world_camera)
+
+    def _read(self, shot: Shot, limit: int | None = None) -> Frame:
+        sides = self.largest or shot.usual_side, limit
+        return shot.read(self.background, min((side for side in sides if side is not None), default=None))
+
+
+def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
+    """Return the shots with names that are unique among them, and that name their split where nothing else tells."""
+    mixed = not one_split and len({shot.splits[:1] for shot in shots}) > 1
+    paths = [(*(shot.splits[:1] or ("",) if mixed else ()), *shot.parts) for shot in shots]
+    return [replace(shot, name=name) for shot, name in zip(shots, unique_names(paths), strict=True)]
+
+
+def hold_out(shots: Sequence[Shot], where: Callable[[Shot], bool] = lambda shot: True) -> list[Shot]:
+    """Return the shots in splits: of those with a pose, every eighth (the first, the ninth ...) is "test", the others "train".
+
+    A single one is in both splits. Shots of which ``where`` is false are in no split.
+    """
+    posed = [shot.T_world_camera is not None and where(shot) for shot in shots]
+    single, number, found = sum(posed) == 1, -1, list[Shot]()
+    for shot, chosen in zip(shots, posed, strict=True):
+        number += chosen
+        split = ("train", "test") if single else ("train",) if number % HOLD_OUT_EVERY else ("test",)
+        found.append(replace(shot, splits=split if chosen else ()))
+    return found
+
+
+def of_views(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
+    """Return views in memory as a capture, each of whose ``splits`` has all of them."""
+    return Capture(
+        path,
+        [
+            _ViewShot(view=view, stem=view.frame.name, T_world_camera=view.T_ref_camera, splits=splits)
+            for view in views
+        ],
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _ViewShot(Shot):
+    view: View
+
+    def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
+        found = self.view.frame.replace(name=self.name)
+        return found if side is None else found.at_most(side)
+
+
+def remark(where: Path | str, text: str) -> None:
+    """Issue a one-line ``InputWarning`` about what was assumed or left out in ``where``."""
+    warnings.warn(f"{where}: {text}", InputWarning, stacklevel=3)
+
+
+def present(
+    shots: Sequence[Item],
+    is_there: Callable[[Item], bool],
+    where: Path | str,
+    name: Callable[[Item], object],
+    error: Callable[[Item], InputError] | None = None,
+    noun: str = "image",
+) -> list[Item]:
+    """Return the items whose files exist; a remark counts the others, with the ``name`` of the first missing file.
+
+    If nothing is left, the ``error`` of the first is raised, if there is one.
+    """
+    there = [item for item in shots if is_there(item)]
+    if len(there) < len(shots):
+        first = next(item for item in shots if not is_there(item))
+        if not there and error is not None:
+            raise error(first)
+        gone = len(shots) - len(there)
+        are = "is" if gone == 1 else "are"
+        remark(
+            where, f"{gone} of {amount(len(shots), noun)} {are} missing and left out, first: {name(first)}"
+        )
+    return there
+
+
+def images_there(where: Path, shots: Sequence[Shot]) -> list[Shot]:
+    """Return the shots whose image file exists; a remark about ``where``, the list that names them, counts the others."""
+    return present(
+        shots,
+        lambda shot: shot.file is not None and is_file(shot.file),
+        where,
+        lambda shot: shot.file and shot.file.name,
+        lambda shot: InputError(f"no such file, although {where} lists it", where=shot.file),
+    )

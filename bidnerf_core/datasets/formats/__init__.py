@@ -1,0 +1,1 @@
+"""The bundled readers, one format a file; each is registered by its name."""

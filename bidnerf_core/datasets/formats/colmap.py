@@ -1,0 +1,160 @@
+"""Folders of a COLMAP project: images and a sparse model, with no other file.
+
+Models are looked for in ``sparse``, ``colmap/sparse`` (nerfstudio), the folder itself, ``dense`` and the
+like, as .bin or .txt (``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). If the
+mapper wrote several (``sparse/0``, ``sparse/1`` ...), the one with the most images is used, with a remark.
+Among the usual image folders, the one that holds most of the model's images is used. Missing images and
+photos that are not registered are left out and counted. Every eighth registered image in natural name order
+(the first, the ninth ...) is held out as "test" and the others are "train", as is usual for captures.
+
+In a dense workspace (``images``, ``sparse``, ``stereo/depth_maps``) the depth maps provide the images' depth:
+the geometrically filtered ones, or else the photometric ones.
+
+The world is that of the model, whose unit of length is arbitrary: poses and maps use that unit, not metres.
+Images are used as stored, as in COLMAP, whose pixel centres are at +0.5 like ours. The camera of an image
+that was resized after the reconstruction is scaled. COLMAP records no times: a sequence is in name order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+from bidnerf_core.camera import Camera
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, present, remark
+from bidnerf_core.datasets.colmap_depth import depth_map_of, read_colmap_depth
+from bidnerf_core.datasets.colmap_files import (
+    ModelImage,
+    count_posed_images,
+    has_posed_images,
+    read_posed_images,
+)
+from bidnerf_core.datasets.file_names import FileNames, posix_name
+from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.frames import natural_order
+from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES
+
+MODELS = (
+    "sparse",
+    "colmap/sparse",
+    ".",
+    "colmap",
+    "dense/sparse",
+    "dense/0/sparse",
+    "undistorted/sparse",
+    "model",
+)
+"""Where to look for a model, or numbered folders of models, in order of preference."""
+IMAGES = (
+    "images", "colmap/images", "dense/images", "dense/0/images", "undistorted/images", "input", "image", "photos", "rgb", ".",
+    "../images", "../../images",
+)  # fmt: skip
+"""Where to look for the images, relative to the folder; those next to the model come first."""
+
+
+class ColmapReader(Reader):
+    """Reader for COLMAP project folders."""
+
+    expected = "images with a sparse model in sparse/0 (COLMAP)"
+
+    def recognises(self, path: Path) -> bool:
+        return bool(_models(path))
+
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """Read the model. Raises ``InputError`` if it is damaged or has no registered image."""
+        model = _largest(path, _models(path))
+        images, cameras = read_posed_images(model)
+        if not images:
+            raise InputError("has no registered image", where=model, expected="at least one")
+        folder, files = _image_folder(path, model, images)
+        there = present(
+            images,
+            lambda image: image.name in files,
+            folder,
+            lambda image: image.name,
+            lambda image: InputError(
+                f"no such file, although {model} lists that image", where=folder / image.name
+            ),
+        )
+        _remark_unregistered(path, folder, files)
+        there.sort(key=lambda image: natural_order(str(posix_name(image.name))))
+        for image, following in pairwise(there):
+            if posix_name(image.name) == posix_name(following.name):
+                raise InputError(f"image {image.name} is registered twice", where=model, expected="once")
+        return Capture(
+            path, [_shot(model, image, files[image.name], cameras) for image in there], options.colour
+        )
+
+
+def _models(path: Path) -> list[Path]:
+    """Return the models at the first location that has any: the location itself, or numbered folders in it."""
+    for place in MODELS:
+        folder = path / place
+        inside = [child for child in folder.glob("*") if child.name.isdecimal() and has_posed_images(child)]
+        if inside or has_posed_images(folder):
+            own = [folder] if has_posed_images(folder) else []
+            return [*own, *sorted(inside, key=lambda child: natural_order(child.name))]
+    return []
+
+
+def _largest(path: Path, models: Sequence[Path]) -> Path:
+    """Return the model with the most images; a remark names the others."""
+    if len(models) == 1:
+        return models[0]
+    sizes = {model: count_posed_images(model) for model in models}
+    chosen = max(models, key=lambda model: sizes[model])
+    others = ", ".join(f"{model.relative_to(path)} ({sizes[model]})" for model in models if model != chosen)
+    remark(
+        path,
+        f"has {len(models)} models, of which {chosen.relative_to(path)} with"
+        f" {amount(sizes[chosen], 'image')} is used, not {others}; each model has its own world frame",
+    )
+    return chosen
+
+
+def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tuple[Path, dict[str, Path]]:
+    """Return the folder that holds most of the images, and the image files by their names in the model."""
+    beside = [model.parent / "images", model.parent.parent / "images"]
+    places = list(dict.fromkeys([*beside, *(path / place for place in IMAGES)]))
+    best: tuple[Path, dict[str, Path]] = (path / IMAGES[0], {})
+    for folder in filter(Path.is_dir, places):
+        names = FileNames(folder)
+        found = {image.name: names.find(posix_name(image.name)) for image in images}
+        files = {name: file for name, file in found.items() if file is not None}
+        if len(files) > len(best[1]):
+            best = folder, files
+        if len(files) == len(images):
+            break
+    return best
+
+
+def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> None:
+    """Count the photos in an image folder that the model lacks."""
+    if folder == path:
+        return
+    photos = [file for file in folder.rglob("*") if file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
+    others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
+    if others:
+        text = f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out"
+        remark(folder, f"{text}, first: {others[0].relative_to(folder)}")
+
+
+def _shot(model: Path, image: ModelImage, file: Path, cameras: dict[int, Camera]) -> Shot:
+    if image.camera not in cameras:
+        found = f"image {image.name!r} has the camera {image.camera}, which is missing from cameras"
+        raise InputError(found, where=model)
+    name, depth = posix_name(image.name), depth_map_of(model, image.name)
+    return Shot(
+        image=file,
+        camera=cameras[image.camera],
+        T_world_camera=image.T_camera_model.inverse(),
+        depth=None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth, 1.0)),
+        stem=name.stem,
+        folders=name.parts[:-1],
+    )
+
+
+reader = ColmapReader()

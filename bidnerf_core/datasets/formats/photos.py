@@ -1,0 +1,72 @@
+"""Folders of images without poses.
+
+Images are ordered by timestamp if every name is one (``12.345.png``), else in natural name order. The depth of ``NAME.png``, if
+any, is ``NAME.depth.png``, as written by ``bidnerf render``. Unlike the images of datasets, photos are turned upright
+according to their EXIF orientation, and their camera comes from EXIF where none is given, as in ``Frame.open``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets.capture import Capture, Colour, Shot
+from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
+from bidnerf_core.depth import MILLIMETRE, DepthCamera
+from bidnerf_core.frames import BLACK, DEPTH_STEM, Frame, photos_in
+
+TIMESTAMP = re.compile(r"\d+\.\d+")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhotoShot(Shot):
+    """A photo, and a depth image of it if one is given: in steps of ``depth_unit`` metres, registered from ``sensor``."""
+
+    image: Path
+    depth_image: Path | None = None
+    depth_unit: float | None = None
+    sensor: DepthCamera | None = None
+
+    def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
+        """Read the photo as ``Frame.read`` does."""
+        source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
+        found = Frame.read(
+            self.image, source, depth=self.depth_image, depth_unit=self.depth_unit, sensor=self.sensor,
+            background=background, largest=side,
+        )  # fmt: skip
+        return found.replace(name=self.name)
+
+
+class PhotoReader(Reader):
+    """Reader for folders of images, which finds no poses."""
+
+    accepts: tuple[OpenQuestion, ...] = ("camera", "focal", "register_depth", "depth_unit")
+    expected = "image files"
+
+    def recognises(self, path: Path) -> bool:
+        return path.is_dir() and bool(photos_in(path)[0])
+
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """List the images. Raises ``InputError`` for a depth sensor that cannot be read."""
+        sensor, unit = options.sensor(path), options.depth_unit or MILLIMETRE
+        shots = list[Shot]()
+        for photo in photos_in(path)[0]:
+            depth = photo.with_name(f"{photo.stem}{DEPTH_STEM}.png")
+            shots.append(
+                PhotoShot(
+                    image=photo,
+                    camera=options.camera_source,
+                    time=timestamp(photo.stem),
+                    depth_image=depth if depth.is_file() else None,
+                    depth_unit=unit,
+                    sensor=sensor,
+                )
+            )
+        return Capture(path, shots, options.colour)
+
+
+def timestamp(stem: str) -> float | None:
+    """Return the time (seconds) in a file name such as ``1305031102.175304.png``; None for names without a fraction."""
+    return float(stem) if TIMESTAMP.fullmatch(stem) else None

@@ -1,0 +1,180 @@
+"""Folders of the TUM RGB-D benchmark as it is distributed (https://cvg.cit.tum.de/data/datasets/rgbd-dataset).
+
+``rgb.txt`` and ``depth.txt`` list images with their time stamps (seconds), ``groundtruth.txt`` the poses of
+the colour camera in the motion-capture frame: ``timestamp tx ty tz qx qy qz qw``, camera to world, OpenCV
+axes. The three are sampled at different times and rates. A colour image is paired with the depth image
+nearest in time if they are mutual nearest neighbours at most 20 ms apart, and with the pose interpolated
+between the samples before and after it. A frame outside the time span of the ground truth, or in a gap of
+more than 0.1 s, has no pose: it is in the sequence but not in the dataset, and a remark counts it. The ground
+truth may also be in the format of EuRoC, or of KITTI with one pose for each image. Every eighth posed frame
+(the first, the ninth ...) is held out as "test" and the others are "train". Listed images that are missing
+are left out with a remark; names may contain spaces.
+
+Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image.
+The published images already include the depth scale correction. Depth of other recordings in this layout is
+registered if a sensor is given.
+
+The camera is, in this order: the given one, as a file or as ``freiburg1``, 2 or 3; the one in the folder's
+``camera.json`` or ``cameras.txt`` (in the formats of ``bidnerf localize --camera``); the published one of
+freiburg1, 2 or 3, according to the folder's name. Published principal points are relative to the centre of
+the upper left pixel, so half a pixel is added here. Colour images of freiburg1 and freiburg2 are distorted;
+the camera models this (k1 k2 p1 p2 k3), and no image is resampled.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from bidnerf_core.camera import Camera, Intrinsics, folder_camera
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, images_there, present
+from bidnerf_core.datasets.file_names import FileNames, posix_name
+from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.datasets.trajectories import (
+    LARGEST_GAP,
+    TimedRow,
+    Trajectory,
+    read_timed_rows,
+    read_trajectory,
+    require_distinct_times,
+)
+from bidnerf_core.depth import DepthReader
+from bidnerf_core.io import is_file
+
+COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
+METRES_PER_STEP = 1 / 5000
+LARGEST_DIFFERENCE = 0.02
+"""Maximum time (seconds) between a colour image and its depth image, as in the benchmark's own association."""
+CAMERAS = {
+    "1": Intrinsics(517.3, 516.5, 319.1, 255.8, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": Intrinsics(520.9, 521.0, 325.6, 250.2, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": Intrinsics(535.4, 539.2, 320.6, 248.1, 640, 480),
+}
+"""The benchmark's calibrations of its three colour cameras, not its "ROS default"."""
+SENSORS = "freiburg1, freiburg2 and freiburg3"
+SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
+
+
+class TumReader(Reader):
+    """Reader for folders of the TUM RGB-D benchmark.
+
+    A given camera (intrinsics, a file, or the name of one of the benchmark's sensors) takes precedence over
+    all others; depth is registered if a sensor is given.
+    """
+
+    accepts = ("camera", "register_depth", "depth_unit")
+    expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
+
+    def recognises(self, path: Path) -> bool:
+        return (path / COLOUR_LIST).is_file()
+
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """Read the lists, and associate them by time. Raises ``InputError`` if one is missing or malformed."""
+        names, colours, truth = FileNames(path), _listed(path / COLOUR_LIST), path / TRUTH
+        times = [row.time for row in colours]
+        trajectory = read_trajectory(truth, times) if truth.is_file() else None
+        given = options.given_camera
+        named = None if given is None else _named_camera(given) or given
+        unknown, ways = f"its name contains none of {SENSORS}", f"one of {SENSORS}, or a file"
+        camera = folder_camera(path, named, published_camera(path), unknown, ways)
+        sensor, unit = options.sensor(path), options.depth_unit or METRES_PER_STEP
+        listed = (
+            [(row.time, _file(row, names, path)) for row in _listed(path / DEPTHS)]
+            if is_file(path / DEPTHS)
+            else []
+        )
+        depths = present(
+            listed,
+            lambda depth: is_file(depth[1]),
+            path / DEPTHS,
+            lambda depth: depth[1].name,
+            noun="depth image",
+        )
+        partners = associate(times, [time for time, _ in depths], LARGEST_DIFFERENCE)
+        measured = {
+            index: DepthFile(file, partial(read_depth, file, unit), sensor)
+            for read_depth in [DepthReader(documented=("65535",))]
+            for index, (_, file) in ((index, depths[other]) for index, other in partners.items())
+        }
+        shots = [
+            Shot(
+                image=_file(row, names, path),
+                camera=camera,
+                T_world_camera=None if trajectory is None else trajectory.at(row.time),
+                time=row.time,
+                depth=measured.get(index),
+            )
+            for index, row in enumerate(colours)
+        ]
+        samples = f"samples before and after the times of images, at most {LARGEST_GAP:g} s apart"
+        return Capture(
+            path, images_there(path / COLOUR_LIST, shots), options.colour, unit="metres", depth_unit=unit, poses=truth,
+            poses_expected="the poses of the frames of a dataset" if trajectory is None else samples,
+            unposed=_unposed(trajectory),
+        )  # fmt: skip
+
+
+def published_camera(folder: Path) -> Intrinsics | None:
+    """Return the benchmark's calibration of the sensor in the folder's name, or None."""
+    found = SENSOR.search(folder.resolve().name)
+    return CAMERAS[found[1]] if found else None
+
+
+def _named_camera(given: Camera | Path) -> Intrinsics | None:
+    """Return the calibration of a sensor given by name, such as ``freiburg1``, or None."""
+    found = None if not isinstance(given, Path) or given.exists() else SENSOR.fullmatch(str(given))
+    return CAMERAS[found[1]] if found else None
+
+
+def _file(row: TimedRow, names: FileNames, folder: Path) -> Path:
+    """Return the file that a row lists, whose name may contain spaces; it may be missing."""
+    found = (names.find(posix_name(name)) for name in (row.rest.strip("\"'"), row.words[0]))
+    return next((file for file in found if file is not None), folder / row.words[0])
+
+
+def _unposed(trajectory: Trajectory | None) -> str:
+    """Return why images may have no pose, with the usual gap between poses if that is large."""
+    gap = float(trajectory.times.diff().median()) if trajectory is not None and len(trajectory) > 1 else 0.0
+    if trajectory is None or gap <= LARGEST_GAP:
+        return f"before its first pose, after its last, or in gaps of more than {LARGEST_GAP:g} s"
+    return (
+        f"its {len(trajectory)} poses are usually {gap:.2g} s apart, like those of keyframes, and none is"
+        f" interpolated over more than {LARGEST_GAP:g} s"
+    )
+
+
+def associate(times: Sequence[float], others: Sequence[float], largest: float) -> dict[int, int]:
+    """Return the pairs of indices that are mutual nearest neighbours in time, at most ``largest`` seconds
+    apart.
+
+    Both lists are in chronological order.
+    """
+    if not len(times) or not len(others):
+        return {}
+    forth, back = _nearest(np.array(times), np.array(others)), _nearest(np.array(others), np.array(times))
+    return {
+        place: int(other)
+        for place, other in enumerate(forth)
+        if back[other] == place and abs(times[place] - others[other]) <= largest
+    }
+
+
+def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the index of the other time nearest to each time; the earlier one if two are equally near."""
+    after = np.searchsorted(others, times).clip(1, max(1, len(others) - 1))
+    before = after - 1
+    after = after.clip(max=len(others) - 1)
+    return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
+
+
+def _listed(path: Path) -> list[TimedRow]:
+    rows = read_timed_rows(path, "filename")
+    require_distinct_times(rows)
+    return rows
+
+
+reader = TumReader()

@@ -1,0 +1,121 @@
+"""Folders of 12-Scenes (https://graphics.stanford.edu/projects/reloc): an iPad's photos with a Structure sensor's depth.
+
+A scene has ``info.txt`` (``m_calibrationColorIntrinsic`` and ``m_calibrationDepthIntrinsic``, 4x4, of images
+of ``m_colorWidth`` x ``m_colorHeight`` and ``m_depthWidth`` x ``m_depthHeight``), ``split.txt`` (``sequence0
+[frames=357] [start=0 ; end=356]``) and ``data`` with ``frame-000000.color.jpg``, ``frame-000000.depth.png``
+(16-bit planar z in millimetres) and ``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres;
+-INF if tracking failed). Depth is registered to the colour camera by the two calibrations. As in the
+relocalization literature (the successors of SCoRe Forests, DSAC, ACE) the first sequence is "test" and the
+others are "train"; without ``split.txt`` every eighth frame is held out.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from bidnerf_core.camera import CameraSource, Intrinsics
+from bidnerf_core.datasets.capture import Capture, Shot
+from bidnerf_core.datasets.formats.seven_scenes import images_of, reading_frames
+from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
+from bidnerf_core.depth import MILLIMETRE, DepthCamera
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import is_file, read_rows
+
+INFO = ("info.txt", "_info.txt")
+RANGE = re.compile(r"start\s*=\s*(\d+)\s*;\s*end\s*=\s*(\d+)")
+FOCAL_TOLERANCE = 1e-3
+"""Relative difference of two focal lengths below which depth needs no registration."""
+
+
+class TwelveScenesReader(Reader):
+    """Reader for 12-Scenes folders."""
+
+    accepts: tuple[OpenQuestion, ...] = ("camera", "register_depth", "depth_unit")
+    expected = "info.txt with data/frame-000000.color.jpg ... (12-Scenes)"
+
+    def recognises(self, path: Path) -> bool:
+        return _beside(path, *INFO) is not None and _data(path) is not None
+
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """Read the poses and splits. Raises ``InputError`` if a metadata file is invalid."""
+        folder, info = _data(path), _beside(path, *INFO)
+        assert folder is not None  # ensured by recognises
+        assert info is not None
+        colour, own = _cameras(info)
+        unit, sensor = options.depth_unit or MILLIMETRE, options.sensor(path, own)
+        shots = reading_frames(CameraSource(options.given_camera or colour), unit, sensor)(folder)
+        return Capture(
+            path, _in_splits(path, shots), options.colour, unit="metres", depth_unit=unit,
+            poses_expected="frame-000000.pose.txt of finite numbers",
+        )  # fmt: skip
+
+
+def _beside(path: Path, *names: str) -> Path | None:
+    files = (place / name for place in (path, path.parent) for name in names)
+    return next((file for file in files if is_file(file)), None)
+
+
+def _data(path: Path) -> Path | None:
+    return next((place for place in (path / "data", path) if place.is_dir() and images_of(place)), None)
+
+
+def _cameras(info: Path) -> tuple[Intrinsics, DepthCamera | None]:
+    """Return the colour camera, and the depth sensor if it is a different camera."""
+    values: dict[str, list[float]] = {}
+    for row in read_rows(info, "12-Scenes' info.txt", "name = numbers"):
+        name, _, text = row.text.partition("=")
+        if name.strip().startswith(("m_calibration", "m_color", "m_depth")):
+            values[name.strip()] = row.plain_numbers(text.split())
+    colour, depth = (_camera(info, values, kind) for kind in ("Color", "Depth"))
+    if colour is None:
+        raise InputError(
+            "no m_calibrationColorIntrinsic",
+            where=info,
+            expected="16 numbers, with m_colorWidth and m_colorHeight",
+        )
+    if depth is None or abs(depth.resized(colour.width, colour.height).fx / colour.fx - 1) < FOCAL_TOLERANCE:
+        return colour, None
+    return colour, DepthCamera(depth, SE3.identity())
+
+
+def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics | None:
+    matrix = values.get(f"m_calibration{kind}Intrinsic", [])
+    size = [values.get(f"m_{kind.lower()}{side}", []) for side in ("Width", "Height")]
+    if len(matrix) not in (9, 16) or not all(size):
+        return None
+    row = 4 if len(matrix) == 16 else 3
+    try:
+        return Intrinsics(
+            matrix[0],
+            matrix[row + 1],
+            matrix[2] + 0.5,
+            matrix[row + 2] + 0.5,
+            int(size[0][0]),
+            int(size[1][0]),
+        )
+    except InputError as error:
+        raise InputError(error, where=info) from error
+
+
+def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
+    """Return the frames with those of the first sequence as "test" and the others as "train"."""
+    file = _beside(path, "split.txt")
+    if file is None:
+        return shots
+    ranges = [RANGE.search(row.text) for row in read_rows(file, "a list of sequences", "start and end")]
+    first = next((found for found in ranges if found is not None), None)
+    if first is None:
+        raise InputError("has no [start=0 ; end=356]", where=file, expected="the frames of each sequence")
+    test = range(int(first[1]), int(first[2]) + 1)
+    return [
+        replace(shot, splits=("test" if int(shot.stem.partition("-")[2]) in test else "train",))
+        if shot.T_world_camera
+        else shot
+        for shot in shots
+    ]
+
+
+reader = TwelveScenesReader()
