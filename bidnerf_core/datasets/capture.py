@@ -6,6 +6,7 @@ of them opens an image. Photos without poses, the frames of a video and images i
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -458,6 +459,6 @@ def images_there(where: Path, shots: Sequence[Shot]) -> list[Shot]:
         shots,
         lambda shot: shot.file is not None and is_file(shot.file),
         where,
-        lambda shot: shot.file and shot.file.name,
+        lambda shot: shot.file and os.path.relpath(shot.file, where.parent),
         lambda shot: InputError(f"no such file, although {where} lists it", where=shot.file),
     )

@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.datasets import READERS, Dataset, Reader, ReadOptions, open_dataset
+from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, open_dataset
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
 from refusals import refused
@@ -223,7 +223,7 @@ def test_splits_of_several_files(blender: Path) -> None:
     """They come before the single file."""
     (blender / JSON).write_text("{}")
     dataset = open_dataset(blender)
-    assert isinstance(dataset, Dataset)
+    assert isinstance(dataset, Capture)
     assert dataset.splits == ("train", "val", "test")
     assert dataset.frame_names("train") == ["r_0", "r_1", "r_2"]
     (blender / "transforms_train.json").unlink()
@@ -280,7 +280,7 @@ def test_another_reader_can_join(tmp_path: Path, blender: Path) -> None:
         def recognises(self, path: Path) -> bool:
             return (path / "magic.bin").exists()
 
-        def open(self, path: Path, options: ReadOptions) -> Dataset:
+        def read(self, path: Path, options: DatasetOptions) -> Capture:
             return open_dataset(blender)
 
     (tmp_path / "magic.bin").touch()

@@ -14,13 +14,10 @@ import pytest
 import torch
 
 # Inside: which frames of a sequence are kept, and the frames of a video in any order
-from bidnerf_core.datasets.phone_scans import thinned
-from bidnerf_core.datasets.posed_images import ImageFrame
-from bidnerf_core.datasets.video_frames import VideoFrames
-
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets import open_dataset, open_sequence
+from bidnerf_core.datasets import Shot, Video, open_dataset, open_sequence
+from bidnerf_core.datasets.lidar import thinned
 from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
 from bidnerf_core.testing import training_views
 from refusals import refused
 from scan_layouts import (
@@ -71,9 +68,9 @@ def zero_pose(root: Path) -> None:
 
 INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int], list[str]]] = {
     # What happens to six frames; how many a sequence has then, which of them have no pose and no depth; the remarks.
-    "record3d, unpacked": (lost_pose, 4, [], [1], [
+    "record3d, unpacked": (lost_pose, 5, [2], [1], [
         "1 of 6 images is missing and left out, first: rgbd/1.jpg", "1 of 5 frames have no depth",
-        "1 of 5 frames have no pose and are left out",
+        "1 of 5 images have no pose and are left out",
     ]),
     "polycam": (
         unlinked("corrected_cameras/1000250000.json", "depth/1000500000.png", "corrected_images/1000750000.jpg"), 4, [], [1], [
@@ -85,7 +82,7 @@ INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int],
         "2 poses of 12 not finite or zero, left out (first: line 4)", "1 of 6 images have no pose",
     ]),
     "seven-scenes": (unlinked("frame-000001.pose.txt", "frame-000002.depth.png"), 6, [1], [2], [
-        "1 of 6 poses is missing and left out, first: frame-000001.pose.txt",
+        "1 of 6 images have no pose and are left out",
     ]),
     "twelve-scenes": (lost_tracking, 6, [2], [], ["1 of 6 images have no pose and are left out"]),
     "reality-capture": (unlinked("2.png"), 5, [], [*range(5)], [
@@ -223,28 +220,30 @@ def test_intrinsics_of_each_frame(views: list[View], tmp_path: Path) -> None:
 def test_frames_of_a_video_in_any_order(tmp_path: Path) -> None:
     """Each frame is of one grey, which tells its number."""
     write_video(tmp_path / "v.mp4", [np.full((32, 48, 3), 8 * number, np.uint8) for number in range(30)])
-    video = VideoFrames(tmp_path / "v.mp4")
+    video = Video(tmp_path / "v.mp4")
     assert len(video) == 30
     assert video.size == (48, 32)
     for number in (0, 1, 2, 9, 8, 29, 13, 14, 0):
-        assert float(video.read(number).float().mean()) == pytest.approx(8 * number, abs=2)
+        assert float(video.stored(number).float().mean()) == pytest.approx(8 * number, abs=2)
     with refused(where=tmp_path / "v.mp4", found="has 30 frames, but frame 30"):
-        video.read(30)
+        video.stored(30)
     content = (tmp_path / "v.mp4").read_bytes()
     (tmp_path / "v.mp4").write_bytes(content[: len(content) // 2])
     with refused(where=tmp_path / "v.mp4", expected="a video file"):
-        VideoFrames(tmp_path / "v.mp4").read(0)
+        Video(tmp_path / "v.mp4").stored(0)
 
 
 def test_five_frames_a_second_are_kept() -> None:
-    camera = CameraSource()
     for rate, kept in ((60, 12), (30, 6), (10, 2), (5, 1), (2, 1)):
-        frames = [ImageFrame(Path(f"{n}.png"), camera, None, 10 + n / rate) for n in range(120)]
+        frames = [
+            Shot(image=Path(f"{n}.png"), T_world_camera=SE3.identity(), time=10 + n / rate)
+            for n in range(120)
+        ]
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            found, others = thinned(Path("scan"), frames)
-        assert [int(frame.stem) for frame in found] == list(range(0, 120, kept))
-        assert len(found) + len(others) == 120
+            found = thinned(Path("scan"), frames)
+        assert [int(shot.stem) for shot in found if shot.splits] == list(range(0, 120, kept))
+        assert len(found) == 120
         assert len(said) == (kept > 1)
 
 

@@ -97,7 +97,7 @@ DIALECTS: dict[str, tuple[Edit, str]] = {
     "upper case, no extension": (upper_case, ""),
     "folder in another case": (
         paths(lambda path: path.replace("images", "Images"), "file_path"),
-        "'Images/r_1.png' is taken for images/r_1.png",
+        "'Images/r_0.png' is taken for images/r_0.png",
     ),
     "homogeneous": (
         each_frame(lambda frame: scaled(frame, 4, 0.00118)), "all 10 matrices have a scale (frame images/r_0.png: 0.00118)",
@@ -172,8 +172,8 @@ def test_missing_images_are_left_out_and_counted(capture: Path) -> None:
     assert [name for name, view in views.items() if view.frame.depth is None] == ["r_6"]
     for file in (capture / "images").iterdir():
         file.unlink()
-    image = capture / "images/r_1.png"
-    where = f"{capture / 'transforms.json'}: frame 1 (images/r_1.png)"
+    image = capture / "images/r_0.png"
+    where = f"{capture / 'transforms.json'}: frame 0 (images/r_0.png)"
     with refused(where=where, found=f"no image {image}", expected="that file"):
         read_all(capture)
 

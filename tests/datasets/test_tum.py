@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
+from bidnerf_core.datasets.formats.tum import CAMERAS, associate
 
 # Inside: the published cameras and the association of times, compared with OpenCV and SciPy
 from bidnerf_core.datasets.trajectories import Trajectory
-from bidnerf_core.datasets.tum import CAMERAS, associate
 from bidnerf_core.geometry import SE3
 from refusals import refused
 from scan_layouts import remarks_of, small_views, write_tum
@@ -138,7 +138,7 @@ def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
     for file in (folder / "rgb").iterdir():
         file.unlink()
     image = folder / "rgb/1305031102.175304.png"
-    with refused(where=f"{folder / 'rgb.txt'}: line 4", found=f"no image {image}", expected="that file"):
+    with refused(where=image, found="no such file, although"):
         open_dataset(folder)
 
 

@@ -13,13 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-# Inside: masks beside a sequence that is no folder of files
-from bidnerf_core.datasets.masked import masked_sequence
-
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, TimedFrame, open_sequence
-from bidnerf_core.errors import InputWarning
-from bidnerf_core.frames import Frame, MaskFolder
+from bidnerf_core.frames import Frame
 from photo_files import write_photo
 from refusals import refused
 
@@ -232,9 +228,3 @@ class Stream:
 
     def __iter__(self) -> Iterator[TimedFrame]:
         yield TimedFrame(0.0, Frame("a", torch.zeros(8, 8, 3), Intrinsics.from_focal(9, 8, 8)))
-
-
-def test_a_stream_without_masks_says_so_at_its_end(tmp_path: Path) -> None:
-    write_photo(tmp_path / "b.png", np.eye(8, dtype=np.uint8) * 255)
-    with pytest.warns(InputWarning, match="no mask in it matches any of 1 image "):
-        assert len(list(masked_sequence(Stream(), MaskFolder(tmp_path)))) == 1

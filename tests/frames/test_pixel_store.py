@@ -18,7 +18,7 @@ from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
 
 # Inside: blocks are made so small that the images of a test fill several
 from bidnerf_core.captures.photos import nearby
-from bidnerf_core.datasets import DatasetOptions, open_dataset, reading_at
+from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import (
@@ -229,8 +229,7 @@ def test_images_that_are_reduced_while_read_are_those_reduced_afterwards(
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     dataset = open_dataset(tmp_path)
     (whole,) = dataset.views("train")
-    with reading_at(20):
-        (read,) = dataset.views("train")
+    (read,) = dataset.views("train", limit=20)
     small = whole.frame.at_most(20)
     assert read.frame.intrinsics == small.intrinsics
     assert read.frame.rgb_bytes.dtype == small.rgb_bytes.dtype == torch.uint8

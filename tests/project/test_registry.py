@@ -17,7 +17,7 @@ import pytest
 
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.cli import _warnings_as_lines
-from bidnerf_core.datasets import Dataset, Reader, ReadOptions, find_reader, open_dataset, open_sequence
+from bidnerf_core.datasets import Capture, DatasetOptions, Reader, find_reader, open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.localization import find_method
 from bidnerf_core.mapping import FEATURES, find_features
@@ -405,7 +405,7 @@ class Claiming(Reader):
             raise self.error
         return True
 
-    def open(self, path: Path, options: ReadOptions) -> Dataset:
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
         return self.opens()  # type: ignore[no-any-return]
 
 
@@ -453,8 +453,8 @@ def test_a_reader_that_fails_is_named_once_and_passed_over(
     [
         (lambda: {}["poses"], open_dataset, "failed to open it: KeyError: 'poses'", None),
         (lambda: {}["poses"], open_sequence, "failed to open it: KeyError: 'poses'", None),
-        (lambda: None, open_dataset, "returned a NoneType", "a Dataset"),
-        (lambda: None, open_sequence, "failed to open it: AttributeError", None),
+        (lambda: None, open_dataset, "returned a NoneType", "a Capture"),
+        (lambda: None, open_sequence, "returned a NoneType", "a Capture"),
     ],
 )
 def test_a_reader_that_cannot_open_what_it_recognised_is_named(

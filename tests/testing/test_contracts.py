@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.datasets import READERS, Dataset, Reader, ReadOptions, write_transforms
+from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, of_views, write_transforms
 from bidnerf_core.evaluation import FAULTS, find_fault
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
@@ -99,11 +99,10 @@ class Converting(Reader):
     def recognises(self, path: Path) -> bool:
         return READERS["transforms"].recognises(path)
 
-    def open(self, path: Path, options: ReadOptions) -> Dataset:
-        dataset = READERS["transforms"].open(path, options)
-        views = dataset.views
-        dataset.views = lambda *a, **k: [self.mistake(view) for view in views(*a, **k)]  # type: ignore[method-assign]
-        return dataset
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        capture = options.open(path, [READERS["transforms"]])
+        mistaken = of_views([self.mistake(view) for view in capture.views("train")], path, ("train",))
+        return replace(mistaken, background=capture.background)
 
 
 def reversed_axes(view: View) -> View:
@@ -139,8 +138,8 @@ def test_a_mistake_of_a_reader_is_named(
 class Deaf(Converting):
     """A reader that ignores its options."""
 
-    def open(self, path: Path, options: ReadOptions) -> Dataset:
-        return super().open(path, ReadOptions())
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        return super().read(path, DatasetOptions())
 
 
 def test_a_reader_that_ignores_its_options_is_named(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,16 +70,16 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
     if not any(lists.values()):
         return [(frame, ()) for frame in frames]
     by_path = {frame.file_path: frame for frame in frames}
-    splits = {frame.file_path: list[str]() for frame in frames}
+    splits: dict[FrameRecord, tuple[str, ...]] = {}  # in the order of the lists
     for split, listed in lists.items():
         for frame in _listed(record, by_path, f"{split}_filenames", listed or []):
-            splits[frame.file_path].append(split)
-    if not any(splits.values()):
+            splits[frame] = *splits.get(frame, ()), split
+    if not splits:
         (key, listed), *_ = ((f"{split}_filenames", listed) for split, listed in lists.items() if listed)
         raise record.error(
             f"{key} lists {listed[0]!r}", expected=f"the file_path of one of its {len(by_path)} frames"
         )
-    return [(frame, tuple(splits[frame.file_path])) for frame in frames if splits[frame.file_path]]
+    return list(splits.items())
 
 
 def read_frames(file: Record) -> list[FrameRecord]:
