@@ -19,7 +19,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, open_dataset, open_sequence
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
-from bidnerf_scanner_app.reader import LARGEST_SIDE, RANGE, ScannerAppReader
+from bidnerf_scanner_app.reader import LARGEST_SIDE, ScannerAppReader
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 960, 720, 800.0, (473.5, 363.25)
 """The photo's camera; ``CENTRE`` counts pixels from the centre of the upper left one, as ARKit does."""
@@ -77,7 +77,7 @@ def write_frame(folder: Path, number: int, name: str, photo: bool = True) -> Non
         image = np.stack([red, green, np.zeros_like(red)], -1) * np.uint8(255)
         iio.imwrite(folder / f"frame_{name}.jpg", image, quality=95, subsampling=0)
     depth = np.round(seen(number, SMALL)[1] * 1000).astype(np.uint16)
-    depth[0, 0] = round(RANGE * 1000) + 1
+    depth[0, 0] = 5000 + 1
     iio.imwrite(folder / f"depth_{name}.png", depth)
     sure = np.full(depth.shape, 2, np.uint8)
     sure[10, 20], sure[11, 20] = 1, 0

@@ -1,0 +1,154 @@
+"""Photos whose cameras were exported by Agisoft Metashape (File > Export > Export Cameras, "Agisoft XML").
+
+A ``camera`` has the camera-to-chunk matrix ``transform`` (4x4, row by row; OpenCV axes), the photo's name in ``label``, and the
+``sensor`` that took it: ``resolution`` and the adjusted ``calibration`` with ``f`` (pixels), ``cx cy`` (from the image centre) and
+the distortion ``k1 k2 k3 p1 p2``, whose p1 and p2 are OpenCV's p2 and p1. The chunk's ``scale``, if it is georeferenced or has scale
+bars, makes positions metres; its rotation and translation are not applied, so the world is the chunk. Photos are in the folder or
+in ``images``. Every eighth one (the first, the ninth ...) is held out as "test" and the others are "train".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import torch
+
+from bidnerf_core.camera import Camera, CentralLens, Intrinsics, PanoramaFace
+from bidnerf_core.datasets.capture import Capture, Shot, present
+from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames, posix_name
+from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import natural_order
+from bidnerf_core.geometry import SE3, rigid_pose
+from bidnerf_core.io import open_binary, read_file
+
+IMAGES = (".", "images", "photos", "input")
+HEAD = 4096
+"""Bytes in which the root and the chunk of a file begin."""
+
+
+class MetashapeReader(Reader):
+    """Reader for cameras exported by Metashape."""
+
+    expected = "photos with a .xml of a chunk's cameras (Agisoft Metashape)"
+
+    def recognises(self, path: Path) -> bool:
+        return _file(path) is not None
+
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        """Read the cameras. Raises ``InputError`` if one is invalid, and if no photo is found."""
+        file = _file(path)
+        assert file is not None  # ensured by recognises
+        chunk = _chunk(file)
+        sensors = {
+            sensor.get("id"): _camera(sensor, f"{file}: sensor {sensor.get('id')}")
+            for sensor in chunk.iter("sensor")
+        }
+        metric = chunk.find("transform/scale")
+        scale = 1.0 if metric is None else _numbers(metric, f"{file}: the scale of the chunk", 1)[0]
+        places = [FileNames(path / place) for place in IMAGES if (path / place).is_dir()]
+        cameras = {camera.get("label") or "": camera for camera in chunk.iter("camera")}
+        files = {
+            label: image
+            for label in cameras
+            if (image := next((i for p in places if (i := p.find(posix_name(label), IMAGE_ENDINGS))), None))
+            is not None
+        }
+        labels = present(
+            sorted(cameras, key=natural_order),
+            files.__contains__,
+            file,
+            str,
+            lambda label: InputError(
+                f"no photo {label}", where=file, expected="it in the folder or in images"
+            ),
+            noun="photo",
+        )
+        shots = list[Shot]()
+        for label in labels:
+            transform, sensor = cameras[label].find("transform"), sensors.get(cameras[label].get("sensor_id"))
+            where, pose = f"{file}: camera {label}", None
+            if sensor is None:
+                raise InputError("has no calibrated sensor", where=where, expected="the id of one")
+            if transform is not None:
+                matrix = torch.tensor(_numbers(transform, where, 16), dtype=torch.float64).reshape(4, 4)
+                pose = rigid_pose(matrix[:3], where)
+                pose = SE3(pose.rotation, pose.translation * scale)
+            shots.append(Shot(image=files[label], camera=sensor, T_world_camera=pose))
+        return Capture(
+            path, shots, options.colour, unit=None if metric is None else "metres", poses=file,
+            poses_expected="a transform of each aligned camera", unposed="they are not aligned",
+        )  # fmt: skip
+
+
+def _file(path: Path) -> Path | None:
+    for file in sorted(path.glob("[!.]*.xml")) if path.is_dir() else ():
+        try:
+            with open_binary(file, "cameras of Metashape") as opened:
+                head = opened.read(HEAD)
+        except InputError:
+            continue
+        if b"<document" in head and b"<chunk" in head:
+            return file
+    return None
+
+
+def _chunk(file: Path) -> ElementTree.Element:
+    """Return the first chunk. Raises ``InputError`` for anything but XML, and for entities, which may expand without bound."""
+    content, expected = read_file(file, "cameras of Metashape"), "cameras exported by Metashape"
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise InputError("declares a document type", where=file, expected=expected)
+    try:
+        chunk = ElementTree.fromstring(content).find("chunk")
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"is no XML ({error})", where=file, expected=expected) from error
+    if chunk is None:
+        raise InputError("has no chunk", where=file, expected=expected)
+    return chunk
+
+
+def _numbers(element: ElementTree.Element, where: str, count: int) -> list[float]:
+    try:
+        numbers = [float(word) for word in (element.text or "").split()]
+    except ValueError as error:
+        raise InputError(error, where=where, expected=f"{count} numbers") from error
+    if len(numbers) != count:
+        raise InputError(f"has {len(numbers)} numbers", where=where, expected=f"{count}")
+    return numbers
+
+
+def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
+    """Return the camera of a sensor; None if it is not calibrated."""
+    size, found = sensor.find("resolution"), sensor.findall("calibration")
+    adjusted = next(
+        (each for each in reversed(found) if each.get("class") in ("adjusted", None)), next(iter(found), None)
+    )
+    if size is None:
+        return None
+    width, height = (int(size.get(side) or 0) for side in ("width", "height"))
+    if sensor.get("type") == "spherical":
+        return PanoramaFace("front", (width, height))
+    if adjusted is None:
+        return None
+    values = {
+        child.tag: _numbers(child, where, 1)[0]
+        for child in adjusted
+        if child.tag not in ("resolution", "covariance", "params")
+    }
+    f, cx, cy, k1, k2, k3, k4, p1, p2, b1 = (
+        values.get(key, 0.0) for key in ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1")
+    )
+    centre = width / 2 + cx, height / 2 + cy
+    try:
+        if sensor.get("type") == "fisheye":
+            return CentralLens(
+                "OPENCV_FISHEYE", Intrinsics(f + b1, f, *centre, width, height), (k1, k2, k3, k4)
+            )
+        lens = (k1, k2, p2, p1, k3)
+        return Intrinsics(f + b1, f, *centre, width, height, lens if any(lens) else ())
+    except InputError as error:
+        raise InputError(error, where=where) from error
+
+
+reader = MetashapeReader()
