@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -144,12 +145,12 @@ def read_views(
 
 def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path | None) -> ReadViews:
     """Read the views of a split one after another, so that only one image is in memory at full size."""
-    place, whole = str(data.path), data if largest is None else data.at_most(largest)
-    shots = whole.select(split)
+    place, shots = str(data.path), data.select(split)
     if not shots:
         raise InputError(f"split {split!r} has no frames", where=place)
     count, views = counter("reading", "images"), list[View]()
-    store, limit = PixelStore(0), largest or 0  # the first image is read at full size, which is logged
+    whole = data if largest is None else data.at_most(sys.maxsize)  # the first image's own size is logged
+    store, limit = PixelStore(0), 0
     for number, shot in enumerate(shots, start=1):
         try:
             view = whole.view(shot, limit or None)
@@ -157,6 +158,7 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
             pass
         else:
             if not views:
+                whole = data if largest is None else data.at_most(largest)
                 limit = largest or useful_size(view.frame, len(shots))
                 small = view.frame.at_most(limit)
                 store = PixelStore(len(shots) * bytes_of(small), folder)
@@ -175,7 +177,16 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
     if not views:
         raise InputError(f"masks hide every image in split {split!r} entirely; {INVERTED}", where=place)
     source = data.path.resolve().name
-    return ReadViews(views, source, place, data.background, 0, data.unit or _unit_of(views), data.up, depth_unit=data.depth_unit)
+    return ReadViews(
+        views,
+        source,
+        place,
+        data.background,
+        0,
+        data.unit or _unit_of(views),
+        data.up,
+        depth_unit=data.depth_unit,
+    )
 
 
 USEFUL_SIDE, LEAST_SIDE = 1600, 800

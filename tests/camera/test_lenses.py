@@ -209,7 +209,7 @@ def test_cameras_are_scaled_to_images_that_were_resized(
     expected = Intrinsics(60 * factor, 62 * factor, 100 * factor, 76 * factor, *size)
     assert view.frame.intrinsics == expected
     Image.fromarray(np.zeros((100, 100, 3), np.uint8)).save(folder / "0.png")
-    with refused(where=folder / "transforms.json", found="0.png is 100x100", expected="200x160"):
+    with refused(where=folder / "0.png", found="image is 100x100, but its camera is for 200x160"):
         open_dataset(folder).views("test")
 
 

@@ -172,7 +172,7 @@ def test_photos_of_phone_apps_have_the_size_that_is_asked_for(
     monkeypatch.setattr(lidar, "LARGEST_SIDE", 40)
     whole = written[0].frame.intrinsics
     for asked, side in ((None, 40), (30, 30), (50, 50), (2000, max(whole.width, whole.height))):
-        frames = [view.frame for view in read_views(folder, largest=asked).views]
+        frames = [view.frame for view in read_views(folder, DatasetOptions(largest=asked)).views]
         assert {max(frame.rgb.shape[:2]) for frame in frames} == {side}
         found, expected = frames[0].intrinsics, whole.scaled(side / max(whole.width, whole.height))
         torch.testing.assert_close(found.matrix(), expected.matrix(), atol=1e-4, rtol=0)

@@ -174,7 +174,7 @@ def test_mask_path_and_dynamic_masks_are_read(tmp_path: Path) -> None:
     saved(data / "masks" / f"{names[1]}.png", np.zeros((48, 48), np.uint8))
     assert opened.wholly_hidden("train") == names[1:2]
     assert opened.wholly_hidden("all") == names[1:2]
-    assert names[1] not in [view.frame.name for view in whole.views("all")]
+    assert names[1] not in [view.frame.name for view in opened.views("all")]
 
 
 def test_a_folder_of_masks_serves_datasets_and_sequences(tmp_path: Path) -> None:

@@ -183,7 +183,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
     assert read_views(tmp_path).views[0].frame.intrinsics.width == 192
     assert "read at" not in caplog.text
 
-    small = read_views(tmp_path, largest=96).views
+    small = read_views(tmp_path, DatasetOptions(largest=96)).views
     assert [view.frame.intrinsics for view in small] == [Intrinsics(75.0, 75.0, 47.5, 30.0, 96, 60)] * 2
     assert "2 images of 192x120 read at 96x60, 0 MB; --largest (largest=) sets another size" in caplog.text
     monkeypatch.setattr(views_of_map, "MOST_BYTES", 10_000)

@@ -21,8 +21,8 @@ import bidnerf_core as bn
 import drawn
 from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets import Photos, write_transforms
-from bidnerf_core.frames import View
+from bidnerf_core.datasets import Photos, Shot, write_transforms
+from bidnerf_core.frames import BLACK, View
 from bidnerf_core.localization import Evidence
 from bidnerf_core.progress import Progress
 from bidnerf_core.results import Answer, Answers, Failure, TrajectoryErrors, localize_each, within
@@ -86,17 +86,17 @@ def test_a_cancelled_and_an_interrupted_tracking_leave_their_frames(folder: Path
     assert len(path) == 1
 
 
+class Damaged(Shot):
+    """A frame whose files cannot be read."""
+
+    def frame(self, background: tuple[float, float, float] = BLACK, side: int | None = None) -> Frame:
+        raise InputError(f"{self.stem}: damaged")
+
+
 def test_a_frame_that_cannot_be_read_is_left_out_with_a_warning(folder: Path, tmp_path: Path) -> None:
-    frames = bn.open_sequence(folder)
-
-    def damaged(place: int) -> Any:
-        raise InputError(f"{place}: damaged")
-
-    entries: Any = frames
-    entries._entries = [
-        replace(entry, read=lambda n=n: damaged(n)) if n in (1, 3) else entry
-        for n, entry in enumerate(entries._entries)
-    ]
+    sound = bn.open_sequence(folder)
+    places = [Damaged(stem=f"{n}") if n in (1, 3) else shot for n, shot in enumerate(sound.shots)]
+    frames = bn.Capture(folder, places, sound.background)
     with pytest.warns(InputWarning, match="left out") as caught:
         path = bn.track(scene(), frames)
     assert [str(each.message) for each in caught] == ["1: damaged; left out", "3: damaged; left out"]

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera import PANORAMA_FACES, Camera, CentralLens, Intrinsics, PanoramaFace
+from bidnerf_core.camera import Camera, CentralLens, Intrinsics, PanoramaFace
 from bidnerf_core.datasets.capture import Capture, Shot, present, remark
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames, posix_name
 from bidnerf_core.datasets.reader import DatasetOptions, Reader
@@ -43,20 +43,19 @@ class OpenSfMReader(Reader):
         """Read the reconstruction. Raises ``InputError`` if it is invalid, and if no photo is found."""
         file = _file(path)
         assert file is not None  # ensured by recognises
-        found = read_json(file)
+        found = read_json(file, "a reconstruction of OpenSfM")
         parts = [part for part in found if isinstance(part, dict)] if isinstance(found, list) else []
-        shots = max(
-            (part.get("shots") for part in parts if isinstance(part.get("shots"), dict)), key=len, default={}
-        )
-        if not shots:
-            raise InputError(
-                "has no shots", where=file, expected="a list of reconstructions with shots and cameras"
-            )
+        parts = [part for part in parts if isinstance(part.get("shots"), dict) and part["shots"]]
+        if not parts:
+            expected = "a list of reconstructions with shots and cameras"
+            raise InputError("has no shots", where=file, expected=expected)
+        part = max(parts, key=lambda part: len(part["shots"]))
+        shots: dict[str, Any] = part["shots"]
+        cameras = part.get("cameras")
         if len(parts) > 1:
             remark(
                 file, f"has {len(parts)} reconstructions, of which the one with {len(shots)} images is used"
             )
-        cameras = next(part.get("cameras") for part in parts if part.get("shots") is shots)
         places = [FileNames(path / place) for place in IMAGES if (path / place).is_dir()]
         files = {
             name: image
@@ -115,7 +114,7 @@ def _camera(record: Record) -> Camera:
     if width is None or height is None:
         raise record.error("no width and height", expected="the size of its images")
     if kind in ("spherical", "equirectangular"):
-        return PanoramaFace(PANORAMA_FACES[0], (width, height))
+        return PanoramaFace("front", (width, height))
     if kind not in (*PERSPECTIVE, *FISHEYE):
         raise record.error(
             f"projection_type is {kind}", expected=f"one of {', '.join((*PERSPECTIVE, *FISHEYE))}"
