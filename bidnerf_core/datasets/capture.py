@@ -234,7 +234,7 @@ class Capture:
     largest: int | None = (
         None  # longer side to which the user asked to downscale images, instead of the usual one
     )
-    poses: Path | str | None = None  # what records the poses, for messages
+    pose_file: Path | str | None = None  # what records the poses, for messages
     poses_expected: str = "at least one"  # what has to be there for an image to have a pose
     unposed: str = ""  # why some images have none
 
@@ -363,7 +363,10 @@ class Capture:
 
     def require_poses(self) -> Capture:
         """Return the capture; a remark counts frames without a pose. Raises ``InputError`` if no frame has one."""
-        posed, where = sum(shot.T_world_camera is not None for shot in self.shots), self.poses or self.path
+        posed, where = (
+            sum(shot.T_world_camera is not None for shot in self.shots),
+            self.pose_file or self.path,
+        )
         images = amount(len(self), "image")
         if not posed:
             raise InputError(f"has no pose for any of {images}", where=where, expected=self.poses_expected)

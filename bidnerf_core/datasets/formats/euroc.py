@@ -56,7 +56,7 @@ class EurocReader(Reader):
             image = root / "cam0" / "data" / row.words[0]
             shots.append(Shot(image=image, camera=camera, T_world_camera=pose, time=row.time))
         return Capture(
-            path, images_there(images, shots), options.colour, unit="metres", poses=truth,
+            path, images_there(images, shots), options.colour, unit="metres", pose_file=truth,
             poses_expected=f"mav0/{TRUTHS[0]}/data.csv at the times of the images",
         )  # fmt: skip
 

@@ -73,7 +73,7 @@ class KittiReader(Reader):
             for index, image in ((int(image.stem), image) for image in images)  # the name is the number
         ]
         return Capture(
-            path, shots, options.colour, unit="metres", poses=file,
+            path, shots, options.colour, unit="metres", pose_file=file,
             poses_expected=f"poses.txt in it, or ../../poses/{name}.txt",
         )  # fmt: skip
 

@@ -63,7 +63,7 @@ class LLFFReader(Reader):
             except InputError as error:
                 raise InputError(error, where=where) from error
             shots.append(Shot(image=image, camera=camera, T_world_camera=pose))
-        return Capture(path, shots, options.colour, poses=file)
+        return Capture(path, shots, options.colour, pose_file=file)
 
 
 reader = LLFFReader()

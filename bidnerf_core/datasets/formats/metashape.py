@@ -77,7 +77,7 @@ class MetashapeReader(Reader):
                 pose = SE3(pose.rotation, pose.translation * scale)
             shots.append(Shot(image=files[label], camera=sensor, T_world_camera=pose))
         return Capture(
-            path, shots, options.colour, unit=None if metric is None else "metres", poses=file,
+            path, shots, options.colour, unit=None if metric is None else "metres", pose_file=file,
             poses_expected="a transform of each aligned camera", unposed="they are not aligned",
         )  # fmt: skip
 

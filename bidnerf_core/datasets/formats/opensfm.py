@@ -74,7 +74,7 @@ class OpenSfMReader(Reader):
             path,
             [_shot(file, name, shots[name], cameras, files[name]) for name in names],
             options.colour,
-            poses=file,
+            pose_file=file,
         )
 
 

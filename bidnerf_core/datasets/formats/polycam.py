@@ -80,7 +80,7 @@ class PolycamReader(Reader):
         if 0 < measured < len(shots):
             remark(path, f"{len(shots) - measured} of {amount(len(shots), 'photo')} have no depth")
         up = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
-        return Capture(path, shots, options.colour, unit="metres", up=up, poses=cameras)
+        return Capture(path, shots, options.colour, unit="metres", up=up, pose_file=cameras)
 
 
 def _folders(path: Path, corrected: bool) -> tuple[Path, Path] | None:

@@ -85,7 +85,7 @@ class RealityCaptureReader(Reader):
         )
         shots = [_shot(row, value, image) for row, value, image in there if image is not None]
         shots.sort(key=lambda shot: natural_order("" if shot.file is None else shot.file.name))
-        return Capture(path, shots, options.colour, poses=file)
+        return Capture(path, shots, options.colour, pose_file=file)
 
 
 def _list(path: Path) -> Path | None:

@@ -103,7 +103,7 @@ class Record3DReader(Reader):
             for number in numbers
         ]
         return Capture(
-            path, lidar.thinned(path, shots), options.colour, unit="metres", poses=metadata.where,
+            path, lidar.thinned(path, shots), options.colour, unit="metres", pose_file=metadata.where,
             poses_expected="finite qx qy qz qw tx ty tz of each frame",
         )  # fmt: skip
 

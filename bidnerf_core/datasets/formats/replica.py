@@ -58,7 +58,9 @@ class ReplicaReader(Reader):
                     depth=DepthFile(depth, partial(read, depth, unit)) if is_file(depth) else None,
                 )
             )
-        return Capture(path, shots, options.colour, unit="metres", depth_unit=unit, poses=path / TRAJECTORY)
+        return Capture(
+            path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=path / TRAJECTORY
+        )
 
 
 def _camera(path: Path) -> tuple[Intrinsics, float]:

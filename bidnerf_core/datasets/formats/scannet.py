@@ -63,7 +63,7 @@ class ScanNetReader(Reader):
                 )
             )
         return Capture(
-            path, shots, options.colour, unit="metres", depth_unit=unit, poses=path / "pose",
+            path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=path / "pose",
             poses_expected="NUMBER.txt of finite numbers for each image",
         )  # fmt: skip
 

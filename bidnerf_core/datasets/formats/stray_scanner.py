@@ -56,7 +56,7 @@ class StrayScannerReader(Reader):
         )
         up = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
         return Capture(
-            path, lidar.thinned(path, there), options.colour, unit="metres", up=up, poses=path / ODOMETRY,
+            path, lidar.thinned(path, there), options.colour, unit="metres", up=up, pose_file=path / ODOMETRY,
             poses_expected="a finite one for each frame",
         )  # fmt: skip
 

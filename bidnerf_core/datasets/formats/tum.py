@@ -112,7 +112,7 @@ class TumReader(Reader):
         ]
         samples = f"samples before and after the times of images, at most {LARGEST_GAP:g} s apart"
         return Capture(
-            path, images_there(path / COLOUR_LIST, shots), options.colour, unit="metres", depth_unit=unit, poses=truth,
+            path, images_there(path / COLOUR_LIST, shots), options.colour, unit="metres", depth_unit=unit, pose_file=truth,
             poses_expected="the poses of the frames of a dataset" if trajectory is None else samples,
             unposed=_unposed(trajectory),
         )  # fmt: skip
