@@ -144,11 +144,16 @@ class Photos(Queries):
         source, depth = camera or CameraSource(), depth or {}
         shots = [
             PhotoShot(
-                image=file, camera=source, depth_image=depth.get(file), depth_unit=depth_unit, sensor=sensor
+                image=file,
+                camera=source,
+                depth_image=depth.get(file),
+                depth_unit=depth_unit,
+                sensor=sensor,
+                awaits_background=background is None,
             )
             for file in files
         ]
-        capture = Capture(Path("photos"), shots, background_colour(background))
+        capture = Capture(Path("photos"), shots, background_colour(background or "black"))
         if masks is not None:
             capture = capture.masked(masks, by_stem=True)
         super().__init__(capture, [(name,) for name in capture.names], None, points)

@@ -22,19 +22,23 @@ TIMESTAMP = re.compile(r"\d+\.\d+")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhotoShot(Shot):
-    """A photo, and a depth image of it if one is given: in steps of ``depth_unit`` metres, registered from ``sensor``."""
+    """A photo, and a depth image of it if one is given: in steps of ``depth_unit`` metres, registered from ``sensor``.
+
+    If it ``awaits_background``, the map in which it is localized gives the colour behind transparent pixels.
+    """
 
     image: Path
     depth_image: Path | None = None
     depth_unit: float | None = None
     sensor: DepthCamera | None = None
+    awaits_background: bool = False
 
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the photo as ``Frame.read`` does."""
         source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
         found = Frame.read(
             self.image, source, depth=self.depth_image, depth_unit=self.depth_unit, sensor=self.sensor,
-            background=background, largest=side,
+            background=None if self.awaits_background else background, largest=side,
         )  # fmt: skip
         return found.replace(name=self.name)
 
