@@ -14,7 +14,7 @@ from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import UsageError, amount
 
 if TYPE_CHECKING:
-    from bidnerf_core.datasets import Dataset
+    from bidnerf_core.datasets import Capture
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Extend:
         if stated and not datasets:
             raise UsageError(f"{stated[0]} is for a dataset, but {self.new} is none; leave it out")
         options = replace(images, background=info.bounds.background)
-        opened: dict[Path, Path | Dataset] = {path: options.open(path) for path in datasets}
+        opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
         data = None if self.data is None else opened.get(self.data, self.data)
         with working():
             scene = extend(

@@ -46,7 +46,6 @@ class Render:
     )
 
     def run(self) -> None:
-        from bidnerf_core.datasets import with_all
         from bidnerf_core.io import output_folder
         from bidnerf_core.maps import load_map
 
@@ -54,7 +53,6 @@ class Render:
         with output_folder(self.out, self.overwrite), displayed():
             scene = load_map(self.map)
             dataset = replace(self.images, background=scene.bounds.background).open(self.data)
-            dataset = with_all(dataset, self.images.split)
             names = list(self.frame) or dataset.frame_names(self.images.split)
             if not names:
                 raise InputError(f"split {self.images.split!r} has no frames", where=self.data)

@@ -150,7 +150,6 @@ class Track:
 
     def _track(self, localizer: Localizer, start: Any, path: Answers, video: TrackingVideo | None) -> None:
         """Track the frames of a recording."""
-        from bidnerf_core.datasets import FileSequence
         from bidnerf_core.localization import Tracker, landmark_cameras
         from bidnerf_core.results import track
 
@@ -159,9 +158,7 @@ class Track:
         images = replace(self.images, camera=camera, background=scene.bounds.background)
         frames = images.open_sequence(self.sequence)
         if self.split is not None:
-            if not isinstance(frames, FileSequence):
-                raise InputError(f"a video has no splits, leave out --split {self.split}", where=frames.path)
-            frames = frames.of_split(self.split)
+            frames = frames.split(self.split)
         track(
             Tracker(localizer, self.config, start), frames, every=self.every, depth=self.depth, answers=path,
             each=None if video is None else video.add,

@@ -133,19 +133,24 @@ class DatasetOptions:
             return self.masks
         return MaskFolder(self.masks, self.mask_hides)
 
+    @property
+    def registration(self) -> DepthRegistration | None:
+        """``register_depth``, which is False if depth is used as it is."""
+        return False if self.register_depth == UNREGISTERED else self.register_depth
+
     def sensor(self, where: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
         """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the format's.
 
         Raises ``InputError``, whose message begins with ``where``, for True if the format has no sensor, and
         as ``DepthCamera.read`` does.
         """
-        register = self.register_depth
+        register = self.registration
         if register is None or register is True:
             if register and own is None:
                 expected = "the file of one (register_depth=)"
                 raise InputError("its depth sensor is not known", where=where, expected=expected)
             return own
-        if register is False or register == UNREGISTERED:
+        if register is False:
             return None
         return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
 
@@ -158,7 +163,7 @@ class DatasetOptions:
             raise InputError("is a dataset with its own cameras; leave out the camera", where=path)
         if source.is_given and source.camera is None and "focal" not in reader.accepts:
             raise InputError("is a dataset", where=path, expected="a camera with all intrinsics (camera=)")
-        if self.register_depth not in (None, False, UNREGISTERED) and "register_depth" not in reader.accepts:
+        if self.registration not in (None, False) and "register_depth" not in reader.accepts:
             raise InputError(
                 "has no depth, or its depth is already registered to its images; leave out register_depth",
                 where=path,

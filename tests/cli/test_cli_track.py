@@ -128,7 +128,7 @@ def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None
     status, _, err = bidnerf(*track, "test")
     assert status == 0, err
     assert len(json.loads((tmp_path / "path.json").read_text())) == 2
-    assert_refused(bidnerf(*track, "val"), 1, tmp_path / "data", "'val'", "test, train", after_remarks=True)
+    assert_refused(bidnerf(*track, "val"), 1, tmp_path / "data", "'val'", "train, test", after_remarks=True)
 
 
 def test_a_sequence_is_given_up_if_the_first_frames_cannot_be_read(

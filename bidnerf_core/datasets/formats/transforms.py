@@ -26,7 +26,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera import PanoramaFace, same_aspect
+from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
 from bidnerf_core.datasets.capture import SPLITS, Capture, DepthFile, MaskFile, Shot, present, remark
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.formats.transforms_json import FrameRecord, file_of, read_splits
@@ -57,11 +57,11 @@ class TransformsReader(Reader):
         masks = _files(names, path, {f: f.mask_path for f in images if f.mask_path}, "mask")
         _remark_names(path, images)
         steps, units = {frame.depth_unit for frame in frames}, {frame.unit for frame in frames}
-        read_depth, (width, height) = DepthReader(), _usual_size(images)
+        read_depth, size = DepthReader(), _first_size(images)
         shots = list[Shot]()
         for frame, splits in ((frame, splits) for frame, splits in listed if frame in images):
             image, depth, mask = images[frame], depths.get(frame), masks.get(frame)
-            camera = frame.camera.intrinsics(frame.camera.width or width, frame.camera.height or height)
+            camera = _camera(frame, size)
             if isinstance(camera, PanoramaFace) and frame.depth_path is not None:
                 expected = "none, or pinhole images with depth"
                 raise frame.record.error("an equirectangular image has depth", expected=expected)
@@ -121,27 +121,28 @@ def _files(
     return found
 
 
-def _usual_size(images: dict[FrameRecord, Path]) -> tuple[int, int]:
-    """Return the size that cameras without one describe: that of the first such image, since all have the same lens.
+def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
+    """Return the camera of a frame; one without a size describes the first image, since all have the same lens."""
+    width, height = frame.camera.width or (size and size[0]), frame.camera.height or (size and size[1])
+    if width is None or height is None:  # no image is readable, which is an error when one is read
+        return CameraSource()
+    return frame.camera.intrinsics(width, height)
 
-    A remark says that cameras are scaled if the first image has another size than its camera. Raises ``InputError`` if no
-    such image is readable.
-    """
-    error: InputError | None = None
+
+def _first_size(images: dict[FrameRecord, Path]) -> tuple[int, int] | None:
+    """Return the size of the first readable image. A remark says that cameras are scaled if its camera has another size."""
     for frame, image in images.items():
-        camera = frame.camera
         try:
             header = read_header(image)
-        except InputError as unreadable:  # raised again when that frame is read
-            error = error or unreadable
+        except InputError:  # raised again when that frame is read
             continue
         size = header.width, header.height
-        given = camera.width or size[0], camera.height or size[1]
+        given = frame.camera.width or size[0], frame.camera.height or size[1]
         if given != size and same_aspect(given, size):
             expected = f"w and h are {given[0]}x{given[1]}; cameras are scaled to the images"
             remark(frame.record.where, f"{image.name} is {size[0]}x{size[1]}, but {expected}")
         return size
-    raise error or InputError("no image")  # unreachable without images
+    return None
 
 
 def _has_alpha(image: Path) -> bool:
