@@ -9,7 +9,6 @@ from .adam import AdamSteps as AdamSteps
 from .adam import captured as captured
 from .advice import ADVICE as ADVICE
 from .auto import localization_of as localization_of
-from .by_rays import RayStage as RayStage
 from .by_rays import RayTerms as RayTerms
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
@@ -63,13 +62,9 @@ from .settings import ReachSettings as ReachSettings
 from .settings import TrackerConfig as TrackerConfig
 from .settings import objective_of as objective_of
 from .support import DISPLACEMENT as DISPLACEMENT
-from .support import DISTINGUISHED as DISTINGUISHED
-from .support import LEAST_EXPLAINED as LEAST_EXPLAINED
 from .support import NO_RIVAL as NO_RIVAL
-from .support import DescentDiagnostics as DescentDiagnostics
+from .support import SUPPORT_BOUNDS as SUPPORT_BOUNDS
 from .support import Support as Support
-from .support import SurfaceDiagnostics as SurfaceDiagnostics
-from .support import SurfaceThresholds as SurfaceThresholds
 from .support import odds as odds
 from .terms.images import Images as Images
 from .terms.images import surface_renderer as surface_renderer

@@ -55,11 +55,16 @@ class Bound(NamedTuple):
     limit: float
     is_least: bool
     outcome: Outcome
-    reason: str  # with the value as ``{0}``
+    reason: str  # with the value as ``{0}``, and the limit as ``{1}``
+
+    def keeps(self, value: float, limit: float | None = None) -> bool:
+        """Return whether a value keeps the bound, or another ``limit``; what is not a number does not."""
+        limit = self.limit if limit is None else limit
+        return value >= limit if self.is_least else value <= limit
 
 
 BOUNDS = (
-    Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "{0:.0e} poses as good are expected by chance"),
+    Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "10^{0:.0f} poses as good are expected by chance"),
     Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers"),
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
@@ -68,7 +73,7 @@ BOUNDS = (
     Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
     Bound("mass", 0.8, True, Outcome.UNCERTAIN, "the pose is within the tolerance with a probability of {0:.0%}"),
 )  # fmt: skip
-"""The bounds of a pose by landmarks, the most serious reason first."""
+"""The bounds of a pose by landmarks, the most serious reason first; the first does not apply to one that was found by other means."""
 
 
 def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
@@ -77,16 +82,10 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     ``log_odds`` are those of the pose before its image was seen, relative to an image that may have been taken anywhere.
     """
     confidence = model().probability(features(evidence), log_odds)
-    for bound in BOUNDS:
+    for bound in BOUNDS if evidence.searched else BOUNDS[1:]:
         value = getattr(evidence, bound.measure)
-        if bound.measure == "log10_nfa":
-            if not evidence.searched:
-                continue
-            shown = 10.0 ** min(max(value, -300), 300)
-        else:
-            shown = value
-        if not (value >= bound.limit if bound.is_least else value <= bound.limit):
-            return Verdict(bound.outcome, bound.reason.format(shown), confidence)
+        if not bound.keeps(value):
+            return Verdict(bound.outcome, bound.reason.format(value), confidence)
     share = f"{evidence.inliers} landmark inliers"
     if confidence < ACCEPTED:
         why = f"{share}, but only {math.floor(100 * confidence)}% likely to be right"

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from threading import Lock
 
 import torch
@@ -21,7 +20,7 @@ from torch import Generator, Tensor
 from bidnerf_core.devices import constant, moved, noted, without_waiting
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.localization.settings import AdamSettings, AnswerName
+from bidnerf_core.localization.settings import AdamSettings
 from bidnerf_core.progress import check_cancelled
 
 WINDOW = 20
@@ -35,15 +34,6 @@ RATE = 0.0125
 """Usual learning rate: of translations as a fraction of the distance to the pivot, of rotations in radians."""
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 """Decay rates of the moments, and the constant added to the root of the second (Kingma and Ba 2015, Alg. 1)."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Replay:
-    graph: torch.cuda.CUDAGraph
-    constants: list[Tensor]  # kept alive here, as the graph reads them
-
-    def __call__(self) -> None:
-        self.graph.replay()
 
 
 def captured(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
@@ -75,7 +65,10 @@ def captured(step: Callable[[], None], device: torch.device, generator: Generato
             )
             return step
 
-    return _Replay(graph, constants)
+    def replay(read: list[Tensor] = constants) -> None:  # keeps alive what the graph reads
+        graph.replay()
+
+    return replay
 
 
 class AdamSteps:
@@ -143,65 +136,19 @@ class AdamSteps:
         return -self._rate * fade / bias * (self._mean / root)
 
 
-@dataclass(eq=False)
-class History:
-    """Poses from the start on, and the loss at each but the last."""
-
-    poses: list[SE3]
-    losses: list[float] = field(default_factory=list)
-
-    @property
-    def T(self) -> SE3:
-        """The current pose."""
-        return self.poses[-1]
-
-    def recent_loss(self) -> float:
-        """Return the mean of the last ``WINDOW`` losses; NaN if there are none."""
-        last = self.losses[-WINDOW:]
-        return sum(last) / len(last) if last else math.nan
-
-    def recent_step(self) -> float:
-        """Return the mean length of the last ``WINDOW`` steps' tangent vectors, metres and radians alike."""
-        if len(self.poses) < 2:
-            return math.inf
-        way = SE3.stack(self.poses[-WINDOW - 1 :])
-        return float((way[:-1].inverse() @ way[1:]).log().norm(dim=-1).mean())
-
-    def stop(self, loss_below: float, step_below: float) -> str | None:
-        """Return the reason to stop, or None; a threshold of 0 is never met."""
-        if len(self.losses) < WINDOW:
-            return None
-        if self.recent_loss() < loss_below:
-            return f"mean loss of {WINDOW} steps fell below {loss_below:g}"
-        if step_below > 0 and self.recent_step() < step_below:
-            return f"mean length of {WINDOW} steps fell below {step_below:g}"
-        return None
-
-    def answer(self, name: AnswerName) -> tuple[SE3, float]:
-        """Return a pose and the mean loss of the steps up to it.
-
-        ``last`` is the last pose. ``best`` is the pose at the end of the ``WINDOW`` steps with the smallest mean loss, since the
-        loss of a single step is noisy; in a shorter history, it is the last pose.
-        """
-        if name == "last" or len(self.losses) < WINDOW:
-            return self.T, self.recent_loss()
-        means = torch.tensor(self.losses, dtype=torch.float64).unfold(0, WINDOW, 1).mean(-1)
-        least = int(means.argmin())
-        return self.poses[least + WINDOW - 1], float(means[least])
-
-
 def follow_gradient(
-    loss: Loss, pivot: Pivot, config: AdamSettings, history: History, device: torch.device,
+    loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3, device: torch.device,
     generator: Generator | None = None,
-) -> tuple[bool, str]:  # fmt: skip
-    """Take steps from ``history.T``, record them, and return whether they stayed finite and the reason why they ended.
+) -> tuple[list[SE3], list[float], bool, str]:  # fmt: skip
+    """Return the poses from ``start`` on, the losses before each step, whether all were finite, and the reason why steps ended.
 
     Steps are taken on ``device``, ``WINDOW`` at a time; the host reads them after each block. If a stopping criterion was met
     within a block, the steps after it are discarded. Pass the ``generator`` from which the loss draws if all calls do the same
     computation apart from random numbers: on a GPU, a step is then captured once and replayed.
     """
-    steps = AdamSteps(loss, pivot, config, history.T.to(device))
+    steps = AdamSteps(loss, pivot, config, start.to(device))
     take: Callable[[], None] = steps
+    poses, losses = [start], list[float]()
     for first in range(0, config.max_steps, WINDOW):
         check_cancelled()
         count = min(WINDOW, config.max_steps - first)
@@ -210,26 +157,22 @@ def follow_gradient(
                 if generator is not None and first + step == WARM_UP:
                     take = captured(steps, device, generator)
                 take()
-        poses, losses, finite = steps.block()
-        reason = _recorded(history, config, poses[:count], losses[:count], finite[:count])
-        if reason is not None:
-            return reason
-    return True, f"reached {config.max_steps} steps"
+        T, values, finite = steps.block()
+        for number in range(count):
+            value, step = float(values[number]), len(losses) + 1
+            if not math.isfinite(value):
+                return poses, losses, False, f"the loss was {value} at step {step}"
+            losses.append(value)
+            if not finite[number]:
+                return poses, losses, False, f"the step was not finite at step {step}"
+            poses.append(T[number].normalized())
+            if step >= WINDOW and recent_loss(losses) < config.stop_loss:
+                why = f"mean loss of {WINDOW} steps fell below {config.stop_loss:g}"
+                return poses, losses, True, why
+    return poses, losses, True, f"reached {config.max_steps} steps"
 
 
-def _recorded(
-    history: History, config: AdamSettings, poses: SE3, losses: Tensor, finite: Tensor
-) -> tuple[bool, str] | None:
-    """Add a block of steps to the history up to the stopping one; return whether all are finite, and the reason to stop."""
-    for number, (value, is_finite) in enumerate(zip(losses.tolist(), finite.tolist(), strict=True)):
-        step = len(history.losses) + 1
-        if not math.isfinite(value):
-            return False, f"the loss was {value} at step {step}"
-        history.losses.append(value)
-        if not is_finite:
-            return False, f"the step was not finite at step {step}"
-        history.poses.append(poses[number].normalized())
-        enough = history.stop(config.stop_loss, config.stop_step)
-        if enough is not None:
-            return True, enough
-    return None
+def recent_loss(losses: list[float]) -> float:
+    """Return the mean of the last ``WINDOW`` losses; NaN if there are none."""
+    last = losses[-WINDOW:]
+    return sum(last) / len(last) if last else math.nan

@@ -4,114 +4,263 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import chain
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from torch import Generator, Tensor
+from torch.nn.functional import normalize
 
+from bidnerf_core.devices import moved
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.by_rays import COLOUR_SIGMA, RayStage, RayTerms, localization_by_rays
+from bidnerf_core.localization.by_rays import (
+    COLOUR_SIGMA,
+    SHAPE_SIGMA,
+    RayTerms,
+    colour_stages,
+    localization_by_rays,
+)
+from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search import Proposals, by_depth, by_images, halve, judge, states_at
+from bidnerf_core.localization.search import Proposals, Stage, halve, image_stages, states_at
 from bidnerf_core.localization.settings import AutoConfig, ColourSettings, DepthLossSettings
-from bidnerf_core.localization.support import SurfaceDiagnostics, support
+from bidnerf_core.localization.support import Support, support
+from bidnerf_core.localization.terms.images import ColourScales, Thumbnail, surface_renderer
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import States, SurfaceMap, descend, trace
+from bidnerf_core.mapping import States, SurfaceMap, cast, descend, trace
 
-WORSE = 0.05
-"""Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict each other."""
-WELL_BEFORE = 0.04
-"""Fraction of the extent by which a line of sight must hit the surface too early to count as a violation."""
+ON_SURFACE = 0.02
+"""Distance at which a point's inlier weight is one half when poses are compared, as a fraction of the scene's extent."""
+COMPARED_POINTS = 200
+"""Minimum number of points on which poses are compared."""
 SIGHT_LINES = 300
 """Maximum number of lines of sight that are traced."""
+WORSE = 0.05
+"""Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict each other."""
+POINT_STAGES = (
+    # points, steps, poses kept, distance as a fraction of the scene's extent (0: the finest), weight of colours
+    (48, 0, 96, 0.3, 0.0),
+    # Colour has no weight at first: its derivatives are valid only within a surfel, and would only slow down distant poses.
+    (48, 8, 24, 0.3, 0.0),
+    (100, 10, 6, 0.2, 0.0),
+    (400, 6, 2, 0.05, 0.1),
+    (2000, 4, 1, 0.0, 1.0),
+)
+OPEN = 0.2
+"""Fraction of the keyframes' rays that hit nothing above which the map counts as having a background."""
+IMAGE_STAGES = ((16, 0, 48), (16, 8, 12), (24, 8, 4), (48, 8, 2), (96, 5, 2))
+"""Pixels of the longer side, steps, poses kept."""
+DETAILED_STAGES = ((32, 0, 64), (32, 6, 16), (48, 8, 6), (96, 6, 2), (192, 4, 1))
+"""Stages for partly hidden images: in smaller thumbnails, nearly every pixel would contain part of the occluders."""
 FLAT = 0.02
 """Standard deviation of an image's colours, in [0, 1], below which a gain and an offset can fit any view to it."""
-BY_DEPTH = RayTerms(ColourSettings(), DepthLossSettings(depth_weight=1.0))
-FIELD_SIGMA = 0.003
-"""Uncertainty of a field's surfaces in second-order steps from a nearly correct pose, relative to the scene's mean side."""
-MANY_RAYS = 4
-"""Factor by which more rays are rendered if part of the scene may be hidden."""
 
 
+@torch.no_grad()
 def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
-    """Align measured points with the surface, in rounds until a pose is acceptable, then refine it on rendered rays as well."""
+    """Align measured points with the surface, in rounds until a pose is acceptable, then refine it on rendered rays as well.
+
+    Scores of poses are mean costs of points, from 0 to 2.
+    """
     began = time.perf_counter()
     points = Surface.of(problem.views, problem.depth_rays, surface, seed, config.points)
-    if points is None:
-        raise ValueError("too few points were measured")
+    assert points is not None, "too few points were measured"
     middle = points.points.median(0).values.cpu()
-    with torch.no_grad():
-        found: Proposals | None = None
-        for number in range(config.rounds):
-            again = by_depth(problem, points, config.hypotheses, seed + number)
-            found = again if found is None or again.scores[0] < found.scores[0] else found
-            best, exposed = _exposed(points, found.states[:1], middle)
-            diagnostics = _diagnostics(exposed, best, found.margin)
-            if diagnostics.rejection() is None:
-                break
+    found: Proposals | None = None
+    for number in range(config.rounds):
+        again = by_depth(problem, points, config.hypotheses, seed + number)
+        found = again if found is None or again.scores[0] < found.scores[0] else found
+        best, exposed = _exposed(points, found.states[:1], middle)
+        evidence = _evidence(exposed, best, found.margin)
+        if evidence.verdict("").accepted:
+            break
     assert found is not None
+    score = _score(exposed)
     finest = replace(exposed, noise=surface.cell, colour_weight=1.0)
-    path, losses = found.path, found.losses
-    refined = finest.fitted_noise(best)
+    refined, path, losses = finest.fitted_noise(best), found.path, found.losses
     if config.refine_steps:
-        stage = RayStage(config.refine_steps, config.refine_rays, sigma=FIELD_SIGMA)
-        term = BY_DEPTH.term(problem, stage, seed)
+        terms = RayTerms(ColourSettings(), DepthLossSettings(depth_weight=1.0))
+        # The pose is nearly right, hence a small uncertainty of the field's surfaces.
+        term = terms.term(problem, config.refine_rays, seed, sigma=SHAPE_SIGMA / 4)
         rays = replace(term, noise=problem.colour_noise or term.noise)
         steps: list[tuple[SE3, Tensor]] = []
         there, _ = descend(best, [refined, rays], config.refine_steps, middle, steps)
         inliers = 0.0
-        if float(_score(exposed, there)) <= float(_score(exposed, best)) + WORSE:
+        if float(score(there)) <= float(score(best)) + WORSE:
             path = SE3.cat([path, *(T for T, _ in steps[1:]), there.T])
             losses = torch.cat([losses, *(cost for _, cost in steps)])
             best, inliers = there, float(term.agreement(there)[0])
-        diagnostics = replace(_diagnostics(exposed, best, found.margin), rendered_inliers=inliers)
-    with torch.no_grad():
-        T = best.T[0].normalized()
-        compared = support(lambda T: finest.costs(states_at(T)), T, middle)
-        diagnostics = replace(diagnostics, support=compared)
-        verdict = diagnostics.verdict()
-        covariance = _covariance(problem, refined, best, middle)
-    if problem.start is not None:
-        path = SE3.cat([problem.start[None], path[1:]])
-    return Localization(
-        T_world_camera=T,
-        outcome=verdict.outcome,
-        reason=verdict.reason,
-        steps=len(path.translation) - 1,
-        seconds=time.perf_counter() - began,
-        loss=float(_score(exposed, best)),
-        method="auto",
-        poses=path,
-        losses=losses[: len(path.translation) - 1],
-        covariance=covariance,
-        confidence=verdict.confidence,
-        diagnostics=diagnostics,
+        evidence = replace(_evidence(exposed, best, found.margin), rendered_inliers=inliers)
+    T = best.T[0].normalized()
+    rivals = support(lambda T: finest.costs(states_at(T)), T, middle)
+    evidence = replace(evidence, displaced=rivals.displaced)
+    verdict = evidence.verdict(
+        f"{evidence.colour_inliers:.0%} of the measured points match the surface in position and colour"
     )
+    first = path[:1] if problem.start is None else problem.start[None]
+    path = SE3.cat([first, path[1:-1], T[None]])
+    covariance = _covariance(problem, refined, best, middle)
+    return Localization.of(verdict, path, losses, "auto", began, float(score(best)), covariance, evidence)
 
 
-def _score(points: Surface, states: States) -> Float[Tensor, ""]:
-    return judge(points).costs(states).mean(-1)[0]
+def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
+    """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer.
+
+    The first round is fast. The others assume that part of the scene is hidden. If no answer is accepted, the one with the
+    smallest loss is returned.
+    """
+    began, steps, answers = time.perf_counter(), config.by_colour, list[Localization]()
+    problem, count = problem.without_depth(), config.hypotheses
+    if all(is_blank(view.frame) for view in problem.views):
+        found, _ = by_images(problem, surface, count, seed)
+        why = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
+        return Localization.of(why, found.path, found.losses, "auto", began, float(found.scores[0]))
+    for number in range(config.rounds):
+        terms = RayTerms(steps.colour, None)
+        stages = colour_stages(problem, terms, steps, seed)
+        if number > 0:
+            # If half of the rays are outliers, refinement on few rays or at a coarse level drifts away from the true pose.
+            robust = RayTerms(replace(steps.colour, colour_loss="geman-mcclure"), None)
+            rays = robust.term(problem, 4 * steps.fine_rays, seed, wide=0.5, sigma=COLOUR_SIGMA / 2)
+            stages = iter([Stage([rays], steps.fine_steps, 1)])
+        found, middle = by_images(problem, surface, count, seed + number, number > 0, stages)
+        fresh = terms.term(problem, steps.fine_rays, seed + 2, sigma=COLOUR_SIGMA / 2)
+        least = steps.converged_inliers
+        answers.append(localization_by_rays(problem, found, fresh, middle, least, "auto", began))
+        if answers[-1].converged:
+            return answers[-1]
+    return min(answers, key=lambda answer: answer.loss)
+
+
+def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Proposals:
+    """Align measured points with the surface from ``count`` hypotheses all over the scene, best first.
+
+    Scores are mean costs of points, from 0 to 2.
+    """
+    surface, middle, stages = points.surface, points.points.median(0).values, list[Stage]()
+    for n, steps, keep, distance, colour in POINT_STAGES:
+        noise = distance * surface.extent / 2 or surface.cell
+        score = _score(points.first(max(n, COMPARED_POINTS))) if steps else None
+        stages.append(
+            Stage([replace(points.first(n), noise=noise, colour_weight=colour)], steps, keep, score)
+        )
+    start = hypotheses(surface, problem.start, middle, count, True, seed)
+    return halve(states_at(start), stages, middle, surface.device)
+
+
+def by_images(
+    problem: Problem, surface: SurfaceMap, count: int, seed: int, detailed: bool = False, later: Iterable[Stage] = ()
+) -> tuple[Proposals, Float[Tensor, "3"]]:  # fmt: skip
+    """Compare the images with renderings of the surface from ``count`` hypotheses all over the scene, then run ``later`` stages.
+
+    Returns the best poses and the middle of the visible scene (metres, last camera's frame): rays cast from the keyframes give its
+    typical distance, and whether it has a background. ``detailed``: for images that something partly hides. Scales are narrow then, as
+    wider ones favour poses that partly explain the occluders' colours, and the exposure is about that of the map.
+    """
+    small = moved(Thumbnail.of(problem.views[-1], 16), surface.device)
+    keyframes = SE3.from_matrix(surface.keyframes[:: max(1, len(surface.keyframes) // 16)]).to(small.flat)
+    directions = normalize(small.flat, dim=-1) @ keyframes.rotation.mT
+    origins = keyframes.translation[:, None].expand_as(directions)
+    seen = cast(surface, origins.reshape(-1, 3), directions.reshape(-1, 3))
+    away = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
+    has_background = float(seen.met.float().mean()) < 1 - OPEN
+    middle = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
+    renderer = surface_renderer(surface, problem.bounds.background if has_background else None)
+    # Wide scales find images that were exposed twice or half as long.
+    scales = ColourScales(colour=0.07) if detailed else ColourScales(gain=1.0, rounds=5)
+    sizes = DETAILED_STAGES if detailed else IMAGE_STAGES
+    start = states_at(hypotheses(surface, problem.start, middle, count, False, seed))
+    stages = chain(image_stages(problem, renderer, surface.device, scales, sizes), later)
+    return halve(start, stages, middle, surface.device), middle
+
+
+def hypotheses(
+    surface: SurfaceMap, start: SE3 | None, middle: Float[Tensor, "3"], count: int, by_points: bool, seed: int
+) -> SE3:
+    """Return ``count`` poses from which a query may have been taken; on the CPU, so that a seed gives the same on any device.
+
+    Half are poses of keyframes, slightly displaced where they repeat. For points, the others place their ``middle`` at that of the
+    scene, which suits cameras around an object, with orientations near those of keyframes or, for a quarter, random. For
+    images, they are keyframes displaced about the middle of their view, every fourth of them rolled. If there is a start, a
+    quarter of all poses are the start and poses near it.
+    """
+    generator, extent = Generator().manual_seed(seed), surface.extent
+    keyframes = SE3.from_matrix(surface.keyframes).to("cpu", torch.float64)
+    about = Pivot.at_point(middle.cpu())
+
+    def noise(many: int, translation: float, rotation: float) -> Float[Tensor, "h 6"]:
+        size = torch.tensor([translation * extent] * 3 + [rotation] * 3, dtype=torch.float64)
+        return torch.randn((many, 6), generator=generator, dtype=torch.float64) * size
+
+    def displaced(T: SE3, translation: float, rotation: float) -> SE3:
+        return about.moved(T, noise(len(T.translation), translation, rotation))
+
+    def drawn(many: int) -> SE3:
+        """Draw keyframes, none repeated before all have been drawn."""
+        total = len(keyframes.translation)
+        order = [torch.randperm(total, generator=generator) for _ in range(max(1, -(-many // total)))]
+        return keyframes[torch.cat(order)[:many]]
+
+    parts = list[SE3]()
+    if start is not None:
+        many = max(1, count // 4)
+        own = SE3(start.rotation.expand(many, 3, 3), start.translation.expand(many, 3))
+        turned = own[: many // 2].retract(noise(many // 2, 0.05, 0.25))
+        near = displaced(own[many // 2 + 1 :], 0.1 if by_points else 0.05, 0.25)
+        parts += [own[:1], turned, near]
+        count -= many
+    plain = drawn(count - count // 2)
+    if len(plain.translation) > len(keyframes.translation) or by_points:
+        plain = displaced(plain, 0.02, 0.05)
+    parts.append(plain)
+    if by_points:
+        rest = count // 2
+        quaternions = torch.randn((rest // 4, 4), generator=generator, dtype=torch.float64)
+        turns = quaternion_to_rotation_matrix(normalize(quaternions, dim=-1))
+        rotations = torch.cat([displaced(drawn(rest - len(turns)), 0.02, 0.05).rotation, turns])
+        centre = surface.surfels.positions.median(0).values.cpu().double()
+        parts.append(SE3(rotations, centre - rotations @ middle.cpu().double()))
+    else:
+        others = displaced(drawn(count // 2), 0.05, 0.15)
+        roll = torch.zeros((len(others.translation), 6), dtype=torch.float64)
+        turn = torch.rand(len(roll[::4]), generator=generator, dtype=torch.float64)
+        roll[::4, 5] = math.pi * (2 * turn - 1)
+        parts.append(others.retract(roll))
+    return SE3.cat(parts)
+
+
+def _score(points: Surface) -> Callable[[States], Float[Tensor, "h"]]:
+    """Return the mean cost of points at the fixed scale at which poses are compared."""
+    compared = compared_at(points)
+    return lambda states: compared.costs(states).mean(-1)
+
+
+def compared_at(points: Surface) -> Surface:
+    """Return the term at the fixed scale at which poses are compared."""
+    return replace(points, noise=ON_SURFACE / 2 * points.surface.extent, colour_weight=1.0)
 
 
 def _exposed(points: Surface, best: States, middle: Float[Tensor, "3"]) -> tuple[States, Surface]:
     """Align a pose again with the points' colours converted to the map's exposure; return it and the points."""
-    exposed = judge(points).exposed(best)
-    found = replace(points, rgb=exposed.rgb)
-    if exposed.rgb is points.rgb:
+    rgb = compared_at(points).exposed(best).rgb
+    if rgb is points.rgb:
         return best, points
+    found = replace(points, rgb=rgb)
     finest = replace(found, noise=points.surface.cell, colour_weight=1.0)
     return descend(best, [finest], 4, middle)[0], found
 
 
-def _diagnostics(points: Surface, best: States, margin: float) -> SurfaceDiagnostics:
+def _evidence(points: Surface, best: States, margin: float) -> Support:
     """Measure how well the points, seen from one pose, fit the surface; each counts by its inlier weight.
 
     Points without a colour do not count for the colour inliers, unless no point has a colour.
     """
-    near, alike = judge(points).inliers(best)
+    near, alike = compared_at(points).inliers(best)
     coloured = (points.coloured > 0).to(near.device)
     both = (near * alike)[:, coloured] if bool(coloured.any()) else near
     some, surface = points.points[:SIGHT_LINES], points.surface
@@ -119,10 +268,13 @@ def _diagnostics(points: Surface, best: States, margin: float) -> SurfaceDiagnos
     ends, origin = T.apply(some), T.apply(points.origins[:SIGHT_LINES])
     length = (ends - origin).norm(dim=-1).float()
     met = trace(surface, origin.float(), ((ends - origin).float() / length.clamp(min=1e-9)[:, None]))
-    # Grazing rays hit coarse cells early.
-    slack = max(WELL_BEFORE * surface.extent, 4 * surface.cell)
+    # Well before the point, as grazing rays hit coarse cells early.
+    slack = max(2 * ON_SURFACE * surface.extent, 4 * surface.cell)
     violations = float((met < length - slack).double().mean())
-    return SurfaceDiagnostics(float(near.mean()), float(both.mean()), violations, margin)
+    return Support(
+        on_surface=float(near.mean()), colour_inliers=float(both.mean()), free_space_violations=violations,
+        runner_up_margin=margin,
+    )  # fmt: skip
 
 
 def _covariance(
@@ -138,52 +290,12 @@ def _covariance(
     about[:3, 3:] = torch.linalg.cross(middle.expand(3, 3), about[:3, :3]).mT
     hessian = about.mT @ points(best).hessian[0, :6, :6] @ about
     found = torch.linalg.inv(hessian + torch.diag(prior**-2))
-    sight = torch.nn.functional.normalize((points.points - points.origins).cpu(), dim=-1).mean(0)
+    sight = normalize((points.points - points.origins).cpu(), dim=-1).mean(0)
     for change in (problem.sensor.scale * middle, problem.sensor.offset * sight):
         shared = torch.cat([-change, torch.zeros(3, dtype=torch.float64)])
         found = found + shared[:, None] * shared
     found = about @ found @ about.mT
     return (found + found.mT) / 2
-
-
-def localize_by_images(
-    problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int, hopeless: Verdict | None = None
-) -> Localization:
-    """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer.
-
-    The first round is fast. The others assume that part of the scene is hidden. If no answer is accepted, the one with the
-    smallest loss is returned. With a reason why it is ``hopeless``, the best pose of one search is rejected without
-    refinement, which would take many seconds.
-    """
-    began, c = time.perf_counter(), config.by_colour
-    problem = problem.without_depth()
-    if all(is_blank(view.frame) for view in problem.views):
-        hopeless = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
-    coarse = RayStage(c.steps.coarse_steps, c.steps.coarse_rays, 2, 0, 2, sigma=COLOUR_SIGMA)
-    fine = RayStage(c.steps.fine_steps, c.steps.fine_rays, 1, sigma=COLOUR_SIGMA / 2)
-    answers = list[tuple[float, Localization]]()
-    for number in range(config.rounds):
-        detailed = number > 0
-        with torch.no_grad():
-            found = by_images(problem, surface, config.hypotheses, seed + number, detailed)
-        if hopeless is not None:
-            return Localization(
-                found.states.T[0].normalized(), hopeless.outcome, hopeless.reason, len(found.losses),
-                time.perf_counter() - began, float(found.scores[0]), "auto", found.path, found.losses,
-            )  # fmt: skip
-        # If half of the rays are outliers, refinement on few rays or at a coarse level drifts away from the true pose.
-        stages = [replace(fine, rays=MANY_RAYS * fine.rays, wide=0.5)] if detailed else [coarse, fine]
-        colour = replace(c.colour, colour_loss="geman-mcclure") if detailed else c.colour
-        middle = found.middle
-        terms = RayTerms(colour, None)
-        start = found.states[:1] if detailed else found.states
-        refined = found.then(halve(start, terms.stages(problem, stages, seed), middle))
-        fresh = RayTerms(c.colour, None).term(problem, fine, seed + len(stages))
-        answer = localization_by_rays(problem, refined, fresh, middle, c.thresholds, "auto", began)
-        if answer.converged:
-            return answer
-        answers.append((answer.loss, answer))
-    return min(answers, key=lambda answer: answer[0])[1]
 
 
 def is_blank(frame: Frame) -> bool:

@@ -16,8 +16,9 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from torch import Generator
@@ -25,13 +26,13 @@ from torch import Generator
 from bidnerf_core.depth import UNKNOWN_SENSOR
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.adam import History, follow_gradient
+from bidnerf_core.localization.adam import follow_gradient, recent_loss
 from bidnerf_core.localization.by_rays import (
     COLOUR_SIGMA,
     SHAPE_SIGMA,
-    RayStage,
     RayTerms,
     centred,
+    colour_stages,
     localization_by_rays,
 )
 from bidnerf_core.localization.pivots import middle_of_view, pivot
@@ -40,22 +41,22 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import Stage, halve, image_stages, neighbours, states_at
 from bidnerf_core.localization.settings import (
     AdamSettings,
-    ColourRefinementSettings,
     ColourSettings,
     DepthLossSettings,
     DepthSettings,
     DescentSettings,
     ReachSettings,
-    RenderedThresholds,
+    RefinementSettings,
     SpreadSettings,
     objective_of,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.support import DescentDiagnostics, support
+from bidnerf_core.localization.support import support
 from bidnerf_core.localization.terms.images import ColourScales, field_renderer
+from bidnerf_core.localization.terms.rays import RAYS
 from bidnerf_core.localization.terms.sampled import SampledLoss
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
-from bidnerf_core.settings import EXPERT, Range, Settings, from_flat
+from bidnerf_core.settings import Settings, from_flat
 
 
 @dataclass(frozen=True)
@@ -150,11 +151,8 @@ def settings_of(method: str, values: dict[str, Any], where: str = "config", pres
 
 # First-order methods.
 
-SUPPORTING_RAYS = 1024
-"""Number of rays, not used in the fit, on which a pose is compared with its rivals."""
 PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
 """The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is provisional."""
-PAPER_DEPTH = DepthSettings(depth_scale=0.1)
 
 
 @dataclass(frozen=True)
@@ -198,65 +196,44 @@ def descended(
 
     Low-contrast images have a small loss even at a wrong pose, so it must also be supported by other rays.
     """
-    began, start, adam = time.perf_counter(), problem.start_for(method), config.adam
+    began, start, device = time.perf_counter(), problem.start_for(method), problem.device
     if depth is not None and depth.depth_scale is None:
         depth = replace(depth, depth_scale=rendered_depth_scale(problem.bounds))
-    objective = objective_of(config.colour, depth)
-    there, generator = problem.on_device(), Generator(problem.device).manual_seed(seed)
+    objective, generator = objective_of(config.colour, depth), Generator(device).manual_seed(seed)
     own = 0 if depth is None else depth.depth_rays
-    loss = SampledLoss(there, objective, own, config.descent, reach, generator)
-    history = History([start])
+    loss = SampledLoss(problem.on_device(), objective, own, config.descent, reach, generator)
     about = pivot(config.descent.pivot, problem)
-    finite, reason = follow_gradient(loss, about, adam, history, problem.device, generator)
-    T, mean = history.answer(adam.answer)
+    poses, losses, finite, ending = follow_gradient(loss, about, config.adam, start, device, generator)
+    T, mean = poses[-1], recent_loss(losses)
     # How well rays that were not used distinguish the pose from its rivals.
-    terms = RayTerms(
-        config.colour,
-        None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale),
-        False,
+    by_depth = (
+        None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale)
     )
-    rays = terms.term(problem, RayStage(0, SUPPORTING_RAYS, level=config.descent.level), seed)
-    is_pose = bool(T.matrix().isfinite().all())
-    middle = middle_of_view(problem, T if is_pose else None)
+    rays = RayTerms(config.colour, by_depth, False).term(problem, RAYS, seed, config.descent.level)
+    middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     found = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
-    why = f"{reason}; mean loss {mean:.3g}, must be below {adam.converged_loss:.3g}"
+    most = config.adam.converged_loss
+    found = replace(found, mean_loss=mean, limits={"mean_loss": most})
+    verdict = found.verdict(f"mean loss {mean:.3g}, must be below {most:.3g}")
+    verdict = replace(verdict, reason=f"{ending}; {verdict.reason}")
     if not finite or not math.isfinite(mean):
-        verdict = Verdict(Outcome.DIVERGED, reason)
-    elif mean >= adam.converged_loss:
-        verdict = Verdict(Outcome.HIGH_LOSS, why)
-    else:
-        verdict = Verdict(Outcome.CONVERGED, why, found.confidence)
-        rejection = found.rejection(1 - adam.plain_share)
-        verdict = (
-            verdict if rejection is None else replace(rejection, reason=f"{why}, but {rejection.reason}")
-        )
-    return Localization(
-        T_world_camera=T,
-        outcome=verdict.outcome,
-        reason=verdict.reason,
-        steps=len(history.poses) - 1,
-        seconds=time.perf_counter() - began,
-        loss=mean,
-        method=method,
-        poses=SE3.stack(history.poses),
-        losses=torch.tensor(history.losses, dtype=torch.float64),
-        confidence=verdict.confidence,
-        diagnostics=DescentDiagnostics(mean, adam.converged_loss, found),
+        verdict = Verdict(Outcome.DIVERGED, ending)
+    return Localization.of(
+        verdict, SE3.stack(poses), torch.tensor(losses, dtype=torch.float64), method, began, mean, None, found
     )
 
 
+PAPER = BidConfig(
+    DescentSettings(level=0, pivot="camera"), PAPER_STEPS, depth=DepthSettings(depth_scale=0.1), reach=ReachSettings()
+)  # fmt: skip
+"""The paper's settings, with updates in the camera's frame as in its Alg. 1."""
 BID = Method(
     bid,
     BidConfig,
     needs_start=True,
-    # The paper's settings, with updates in the camera's frame as in its Alg. 1, and about the middle of the scene as by default.
     presets={
-        "paper": BidConfig(
-            DescentSettings(level=0, pivot="camera"), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
-        ),
-        "paper-scene": BidConfig(
-            DescentSettings(level=0, pivot="scene"), PAPER_STEPS, depth=PAPER_DEPTH, reach=ReachSettings()
-        ),
+        "paper": PAPER,
+        "paper-scene": replace(PAPER, descent=DescentSettings(level=0, pivot="scene")),
     },
     summary="Adam on colour and depth at the coarse level (BID-NeRF)",
 )
@@ -273,62 +250,10 @@ INERF = Method(
 
 # Second-order methods.
 
-Steps = Annotated[int, Range(1, 10**5)]
-ExpertCount = Annotated[int, Range(1, 10**5), EXPERT]
-RayCount = Annotated[int, Range(7, 10**7)]
-ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
-
-
-@dataclass(frozen=True)
-class BidLmStages(Settings):
-    """Settings of the stages, from many poses on few rays at the coarsest level to one pose on many rays."""
-
-    search_rays: ExpertRays = 128  # number of rays by which each of the poses around the start is ranked
-    coarse_poses: ExpertCount = 6  # number of best poses that take steps at the coarsest level
-    coarse_steps: ExpertCount = 4  # steps of each of the coarse poses
-    coarse_rays: ExpertRays = 128  # number of rays for each of the coarse poses
-    middle_poses: ExpertCount = 2  # number of best coarse poses that take further steps
-    middle_steps: ExpertCount = 4  # steps of each of the middle poses
-    middle_rays: ExpertRays = 256  # number of rays for each of the middle poses
-    fine_steps: Steps = 6  # steps of the best pose, in full detail
-    fine_rays: RayCount = 1024  # number of rays rendered for each of the fine steps
-    # width, in pixels, of the squares over which colours are averaged in coarse steps
-    blur: Annotated[int, Range(1, 10**4), EXPERT] = 8
-
-    def stages(self) -> list[RayStage]:
-        return [
-            RayStage(0, self.search_rays, self.coarse_poses, 0, self.blur, 3.0),
-            RayStage(self.coarse_steps, self.coarse_rays, self.middle_poses, 0, self.blur, sigma=SHAPE_SIGMA),
-            RayStage(self.middle_steps, self.middle_rays, 1, 0, self.blur, sigma=SHAPE_SIGMA),
-            RayStage(self.fine_steps, self.fine_rays, sigma=SHAPE_SIGMA / 3),
-        ]
-
-
-@dataclass(frozen=True)
-class ImageSearchSettings(Settings):
-    """Settings of the search with small renderings, which grow as the number of poses decreases."""
-
-    search_poses: ExpertCount = 24  # number of best poses that take steps on small renderings
-    search_steps: ExpertCount = 8  # steps of each of the search poses
-    middle_poses: ExpertCount = 6  # number of best search poses that take steps on larger renderings
-    middle_steps: ExpertCount = 6  # steps of each of the middle poses
-    last_steps: ExpertCount = 4  # steps of the best two poses, on the largest renderings
-    # longer side of the first renderings, pixels; the last ones are 3 times as large
-    width: Annotated[int, Range(4, 1000)] = 16
-
-    def stages(self) -> list[tuple[int, int, int]]:
-        return [
-            (self.width, 0, self.search_poses),
-            (self.width, self.search_steps, self.middle_poses),
-            (self.width * 3 // 2, self.middle_steps, 2),
-            (self.width * 3, self.last_steps, 2),
-        ]
-
-
-def _small_images(problem: Problem, search: ImageSearchSettings) -> Iterable[Stage]:
-    """Yield the stages of a comparison with small renderings of the field's coarsest level."""
-    renderer = field_renderer(problem.level(0), problem.bounds)
-    return image_stages(problem, renderer, problem.device, ColourScales(), search.stages())
+IMAGE_STAGES = ((16, 0, 24), (16, 8, 6), (24, 6, 2), (48, 4, 2))
+"""Of a search with small renderings: pixels of the longer side, steps, poses kept."""
+COARSE_BLUR = 8
+"""Width, in pixels, of the squares over which colours are averaged in coarse steps with depth."""
 
 
 @dataclass(frozen=True)
@@ -336,37 +261,63 @@ class BidLmConfig(Settings):
     """Settings of method ``bid-lm``."""
 
     spread: SpreadSettings = SpreadSettings()
-    stages: BidLmStages = BidLmStages()
-    colour: ColourSettings = ColourSettings()
+    steps: RefinementSettings = RefinementSettings(fine_steps=6)
     depth: DepthLossSettings = DepthLossSettings()
     exposure: bool = False  # estimate a gain and an offset for each colour channel
-    thresholds: RenderedThresholds = RenderedThresholds()
+
+
+@dataclass(frozen=True)
+class InerfLmConfig(Settings):
+    """Settings of method ``inerf-lm``."""
+
+    spread: SpreadSettings = SpreadSettings(256, spread_rotation=0.25)
+    steps: RefinementSettings = RefinementSettings()
+    exposure: bool = False  # estimate a gain and an offset for each colour channel
 
 
 def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
+    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``."""
+    return _halved(problem, config, config.depth, 0.1, seed, "bid-lm")
+
+
+def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
     """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``.
+
+    It needs only the field, and uses neither measured depth nor a baked surface.
+    """
+    return _halved(problem.without_depth(), config, None, 0.04, seed, "inerf-lm")
+
+
+def _halved(
+    problem: Problem, config: BidLmConfig | InerfLmConfig, depth: DepthLossSettings | None, share: float, seed: int, method: str
+) -> Localization:  # fmt: skip
+    """Refine poses around the start; ``share`` is their usual displacement relative to the distance of the scene.
 
     Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.
     """
-    began, start = time.perf_counter(), problem.start_for("bid-lm")
-    middle = middle_of_view(problem, start)
-    poses = _around(start, config.spread, 0.1, middle, seed)
-    terms, stages = RayTerms(config.colour, config.depth, config.exposure), config.stages.stages()
-    first: Iterable[Stage] = ()
-    if problem.has_depth:
-        poses = SE3.cat([poses, centred(problem, poses, middle)])
-    else:
-        first, stages = _small_images(problem, ImageSearchSettings()), stages[2:]
-    found = halve(states_at(poses), chain(first, terms.stages(problem, stages, seed)), middle, problem.device)
-    fresh = terms.term(problem, stages[-1], seed + len(stages))
-    return localization_by_rays(problem, found, fresh, middle, config.thresholds, "bid-lm", began)
-
-
-def _around(start: SE3, spread: SpreadSettings, share: float, middle: torch.Tensor, seed: int) -> SE3:
-    """Return poses around the start; ``share`` is the usual displacement relative to the distance of the scene."""
+    began, start = time.perf_counter(), problem.start_for(method)
+    middle, spread, steps = middle_of_view(problem, start), config.spread, config.steps
     along = spread.spread_translation
     along = share * float(middle.norm()) if along is None else along
-    return neighbours(start, spread.poses, along, spread.spread_rotation, seed)
+    poses = neighbours(start, spread.poses, along, spread.spread_rotation, seed)
+    terms, rays = RayTerms(steps.colour, depth, config.exposure), steps.fine_rays
+    if depth is not None and problem.has_depth:
+        poses = SE3.cat([poses, centred(problem, poses, middle)])
+        coarse = partial(terms.term, problem, level=0, blur=COARSE_BLUR)
+        stages: Iterable[Stage] = (
+            Stage([coarse(rays // 8, seed, wide=3.0)], 0, 6),
+            Stage([coarse(rays // 8, seed + 1, sigma=SHAPE_SIGMA)], 4, 2),
+            Stage([coarse(rays // 4, seed + 2, sigma=SHAPE_SIGMA)], 4, 1),
+            Stage([terms.term(problem, rays, seed + 3, sigma=SHAPE_SIGMA / 3)], steps.fine_steps, 1),
+        )
+        fresh = terms.term(problem, rays, seed + 4, sigma=SHAPE_SIGMA / 3)
+    else:
+        renderer = field_renderer(problem.level(0), problem.bounds)
+        images = image_stages(problem, renderer, problem.device, ColourScales(), IMAGE_STAGES)
+        stages = chain(images, colour_stages(problem, terms, steps, seed))
+        fresh = terms.term(problem, rays, seed + 2, sigma=COLOUR_SIGMA / 2)
+    found = halve(states_at(poses), stages, middle, problem.device)
+    return localization_by_rays(problem, found, fresh, middle, steps.converged_inliers, method, began)
 
 
 BID_LM = Method(
@@ -375,40 +326,6 @@ BID_LM = Method(
     needs_start=True,
     summary="second-order steps on colour and depth, from coarse to fine",
 )
-
-
-@dataclass(frozen=True)
-class InerfLmConfig(Settings):
-    """Settings of method ``inerf-lm``."""
-
-    spread: SpreadSettings = SpreadSettings(256, spread_rotation=0.25)
-    search: ImageSearchSettings = ImageSearchSettings()
-    steps: ColourRefinementSettings = ColourRefinementSettings()
-    colour: ColourSettings = ColourSettings()
-    exposure: bool = False  # estimate a gain and an offset for each colour channel
-    thresholds: RenderedThresholds = RenderedThresholds()
-
-
-def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
-    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``.
-
-    It needs only the field, and uses neither measured depth nor a baked surface.
-    """
-    began, start, steps = time.perf_counter(), problem.start_for("inerf-lm"), config.steps
-    problem = problem.without_depth()
-    middle = middle_of_view(problem, start)
-    stages = [
-        RayStage(steps.coarse_steps, steps.coarse_rays, 2, 0, 2, sigma=COLOUR_SIGMA),
-        RayStage(steps.fine_steps, steps.fine_rays, sigma=COLOUR_SIGMA / 2),
-    ]
-    terms = RayTerms(config.colour, None, config.exposure)
-    poses = states_at(_around(start, config.spread, 0.04, middle, seed))
-    first = _small_images(problem, config.search)
-    found = halve(poses, chain(first, terms.stages(problem, stages, seed)), middle, problem.device)
-    fresh = terms.term(problem, stages[-1], seed + len(stages))
-    return localization_by_rays(problem, found, fresh, middle, config.thresholds, "inerf-lm", began)
-
-
 INERF_LM = Method(
     inerf_lm,
     InerfLmConfig,

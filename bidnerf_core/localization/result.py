@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -96,6 +97,18 @@ class Localization:
         sure = "" if self.confidence is None else f", confidence {self.confidence:.3g}"
         where = f"at ({x:.4g}, {y:.4g}, {z:.4g}) {symbol(self.unit)}"
         return f"<Localization {self.outcome.value} {where}{sure}: {self.reason}>"
+
+    @staticmethod
+    def of(
+        verdict: Verdict, poses: SE3, losses: Float[Tensor, "s"], method: str, began: float, loss: float,
+        covariance: Float[Tensor, "6 6"] | None = None, diagnostics: Diagnostics | None = None,
+    ) -> Localization:  # fmt: skip
+        """Return the answer whose pose is the last of ``poses``; ``began`` is the time when the search did (``time.perf_counter``)."""
+        count, seconds = len(poses.translation) - 1, time.perf_counter() - began
+        return Localization(
+            poses[-1], verdict.outcome, verdict.reason, count, seconds, loss, method, poses, losses, covariance,
+            confidence=verdict.confidence, diagnostics=diagnostics,
+        )  # fmt: skip
 
     def covariance_in(self, convention: CovarianceConvention) -> Float[Tensor, "6 6"] | None:
         """Return the covariance in another convention, see ``CovarianceConvention``; None if unknown.

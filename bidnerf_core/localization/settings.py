@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from bidnerf_core.depth import DEPTH_SENSORS
 from bidnerf_core.fields import (
@@ -26,9 +26,6 @@ RENDERED_DEPTH_SHARE = 0.038
 """Depth difference at which outliers begin in rendered rays, as a fraction of the scene's mean side."""
 LEAST_POINTS = 50
 """Minimum number of measured depths from which the shape of the scene can be recognised."""
-
-
-AnswerName = Literal["last", "best"]
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,6 @@ class DescentSettings(Settings):
     pivot: PivotName = "camera"  # what an update rotates about: camera, world, or the middle of the scene
     # length of the sampled interval, in units of [near, far]; the paper's "wide" is 2
     wide: Annotated[float, Above(0.0, 100.0)] = 1.0
-    renew: Annotated[bool, EXPERT] = True  # draw new pixels at each step instead of once
 
 
 @dataclass(frozen=True)
@@ -116,13 +112,7 @@ class AdamSettings(Settings):
     decay_steps: Count = 100  # number of steps in which the learning rate falls by decay
     # stop once the mean loss of 20 steps is below this (epsilon of Alg. 1); 0: never
     stop_loss: NotNegative = 0.0
-    # stop once the mean length of 20 steps is below this (metres, radians); 0: never
-    stop_step: Annotated[float, Range(0.0), EXPERT] = 0.0
-    # pose to return: the last, or the one after the 20 steps with the smallest mean loss
-    answer: Annotated[AnswerName, EXPERT] = "last"
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
-    # maximum cost of an accepted pose as a fraction of the cost of the image's mean colour, if only colours are compared
-    plain_share: Annotated[float, Range(0.0), EXPERT] = 0.5
 
 
 @dataclass(frozen=True)
@@ -138,13 +128,15 @@ class SpreadSettings(Settings):
 
 
 @dataclass(frozen=True)
-class RenderedThresholds(Settings):
-    """Thresholds for accepting a pose, applied to newly drawn rendered rays."""
+class RefinementSettings(Settings):
+    """Settings of second-order steps on rendered rays from coarse to fine, and of their acceptance by newly drawn rays."""
 
-    # minimum inlier fraction of the rays for an accepted pose
-    converged_inliers: NotNegative = 0.93
-    # maximum length of a further step on those rays: of the scene relative to its distance, and in radians
-    converged_step: NotNegative = 0.01
+    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
+    # number of rays rendered for each of the fine steps, and of fractions of it before; in ``auto``, four times as many if part of
+    # the scene may be hidden
+    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
+    colour: ColourSettings = ColourSettings()
+    converged_inliers: NotNegative = 0.93  # minimum inlier fraction of the rays for an accepted pose
 
 
 def mean_side(bounds: SceneBounds) -> float:
@@ -159,28 +151,6 @@ def rendered_depth_scale(bounds: SceneBounds) -> float:
     matter: it may come from measured depth, which is more accurate than the field's renderings.
     """
     return RENDERED_DEPTH_SHARE * mean_side(bounds)
-
-
-@dataclass(frozen=True)
-class ColourRefinementSettings(Settings):
-    """Settings of the last steps on colour alone."""
-
-    # steps of each pose from the search, at the coarsest level
-    coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
-    # number of rays rendered for each of the coarse steps
-    coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256
-    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
-    # number of rays rendered for each of the fine steps; four times as many if part of the scene may be hidden
-    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
-
-
-@dataclass(frozen=True)
-class ByColourConfig(Settings):
-    """Settings of the steps on rendered rays and of their acceptance."""
-
-    steps: ColourRefinementSettings = ColourRefinementSettings()
-    colour: ColourSettings = ColourSettings()
-    thresholds: RenderedThresholds = RenderedThresholds()
 
 
 @dataclass(frozen=True)
@@ -202,7 +172,7 @@ class AutoConfig(Settings):
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
     # tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance
     risk: float | None = None
-    by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
+    by_colour: Annotated[RefinementSettings, EXPERT] = RefinementSettings()
 
     def __post_init__(self) -> None:
         super().__post_init__()

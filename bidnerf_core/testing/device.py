@@ -22,7 +22,6 @@ from bidnerf_core.localization import (
     DepthSettings,
     DescentSettings,
     Problem,
-    RayStage,
     RayTerms,
     SampledLoss,
     objective_of,
@@ -115,7 +114,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
     terms = RayTerms(ColourSettings(), DepthLossSettings())
-    rays = terms.term(problem, RayStage(2, CHECKED_RAYS, level=level), 0)
+    rays = terms.term(problem, CHECKED_RAYS, 0, level)
     start = moved(states_at(problem.start_for("bid-lm")[None]), DEVICE)
     with without_waiting():
         descend(start, [rays], 1)

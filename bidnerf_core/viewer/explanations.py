@@ -11,11 +11,9 @@ from bidnerf_core.localization import (
     MOVING,
     NO_RIVAL,
     Answer,
-    DescentDiagnostics,
     Localization,
     SearchRecord,
     Support,
-    SurfaceDiagnostics,
     odds,
 )
 from bidnerf_core.results import pose_error
@@ -68,11 +66,11 @@ def last_answer(record: SearchRecord | None) -> Answer | None:
 
 def contests(found: Localization, record: SearchRecord | None) -> tuple[Contest, ...]:
     """Return all comparisons: the pose with those of other places and of the mirror image, with its rivals, and of cameras."""
-    shown, answer, support = list[Contest](), last_answer(record), support_of(found)
+    shown, answer, support = list[Contest](), last_answer(record), found.diagnostics
     if answer is not None and len(answer.modes) > 1:
         shown.append(_of_modes(found, answer))
-    if support is not None:
-        shown.append(_of_support(support))
+    if isinstance(support, Support) and support.displaced is not None:
+        shown.append(_of_support(support, support.displaced))
     if answer is not None:
         shown.append(_of_cameras(found, answer))
     return tuple(shown)
@@ -83,14 +81,6 @@ def earlier(found: Localization, answer: Answer) -> str:
     off = pose_error(answer.T_world_rig.to("cpu"), found.T_world_camera.to("cpu"))
     near = float(off.translation) <= APART * answer.distance and float(off.rotation_deg) <= TURNED_DEG
     return "" if near else EARLIER
-
-
-def support_of(found: Localization) -> Support | None:
-    """Return how well measurements distinguish a pose from its rivals; None if it was not compared with any."""
-    measured = found.diagnostics
-    if isinstance(measured, SurfaceDiagnostics | DescentDiagnostics):
-        return measured.support
-    return measured if isinstance(measured, Support) else None
 
 
 def probable_poses(answer: Answer) -> list[tuple[int, SE3, float]]:
@@ -135,15 +125,15 @@ def _of_cameras(found: Localization, answer: Answer) -> Contest:
     )
 
 
-def _of_support(support: Support) -> Contest:
+def _of_support(support: Support, displaced: float) -> Contest:
     rivals = [
-        (f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene", support.displaced),
+        (f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene", displaced),
         ("another pose of the search", support.other),
         ("an image of a single colour", support.plain),
     ]
     weights = [(name, odds(-against)) for name, against in rivals if against < NO_RIVAL]
     total = 1 + sum(weight for _, weight in weights)
     answers = (ShownExplanation(HERE, 1 / total), *(ShownExplanation(name, w / total) for name, w in weights))
-    moved = support.displaced < min(0.0, support.other, support.plain)
+    moved = displaced < min(0.0, support.other, support.plain)
     remark = "The image fits better when the pose is moved: it is not even a local optimum." if moved else ""
     return Contest("What fits the image best?", answers, remark)

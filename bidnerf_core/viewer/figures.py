@@ -9,17 +9,13 @@ from dataclasses import dataclass, replace
 from bidnerf_core.localization import (
     ACCEPTED,
     BOUNDS,
-    DISTINGUISHED,
-    LEAST_EXPLAINED,
-    DescentDiagnostics,
+    SUPPORT_BOUNDS,
     Evidence,
     Localization,
     SearchRecord,
     Support,
-    SurfaceDiagnostics,
-    SurfaceThresholds,
 )
-from bidnerf_core.viewer.explanations import earlier, last_answer, support_of
+from bidnerf_core.viewer.explanations import earlier, last_answer
 
 MEASURES = {
     "log10_nfa": ("poses as good by chance", ".0e", "number expected of wrong poses; the bar compares exponents"),
@@ -37,16 +33,25 @@ MEASURES = {
     "colour_inliers": ("points with the surface's colour", ".0%", "share that lies there and has its colour; not tested by itself"),
 }  # fmt: skip
 """The name, format and meaning of each measure of a pose by landmarks, those with a bound first."""
-OF_SURFACE = {
+WITHOUT_LANDMARKS = {
+    "mean_loss": ("mean loss", ".3g", "of the last steps of the descent"),
     "on_surface": ("measured points on the surface", ".0%", "share of the measured depth that lies on the map's surface"),
     "colour_inliers": ("points with the surface's colour", ".0%", "share that lies there and has its colour"),
-    "rendered_inliers": ("rendered rays that agree", ".0%", "share of fresh rays whose rendering agrees with what was measured"),
-    "runner_up_margin": ("lead over the runner-up", ".2f", "by how much the best different pose of the search is worse"),
     "free_space_violations": (
         "lines of sight through the surface", ".0%", "share that meets the surface well before the point that was measured"
     ),
+    "runner_up_margin": ("lead over the runner-up", ".2f", "by how much the best different pose of the search is worse"),
+    "rendered_inliers": ("rendered rays that agree", ".0%", "share of the rays whose rendering agrees with what was measured"),
+    "new_inliers": ("new rays that agree", ".0%", "share of newly drawn rays whose rendering agrees with what was measured"),
+    "confidence": (
+        "distinguished from rivals", ".0%",
+        "its probability among poses moved a little, the best different pose of the search and a plain image",
+    ),
+    "explained": ("contrast explained", ".0%", "share of the image's contrast that the rendering explains"),
+    "further_step": ("further step", ".2g", "that newly drawn rays ask for, relative to the distance of the scene, and radians"),
+    "colour_ratio": ("differences of colour", ".1f", "relative to those of the map's own images"),
 }  # fmt: skip
-"""Label, format and meaning of each measure of a pose on the surface."""
+"""Label, format and meaning of each measure of a pose that landmarks did not find."""
 
 
 @dataclass(frozen=True)
@@ -91,23 +96,15 @@ class Figure:
 
 def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
     """Return the measures of an answer and, if recorded, those of a pose by landmarks that was rejected on the way to it."""
-    measured, support, answer = found.diagnostics, support_of(found), last_answer(record)
+    measured, answer = found.diagnostics, last_answer(record)
     figures = list[Figure]()
-    if found.confidence is not None and (support is None or support.confidence != found.confidence):
+    if found.confidence is not None and not isinstance(measured, Support):
         meaning = "probability that the pose is right, from all figures together"
         figures.append(Figure.of(("confidence", ".1%", meaning), found.confidence, ACCEPTED))
     if isinstance(measured, Evidence):
         figures += _of_landmarks(measured)
-    elif isinstance(measured, SurfaceDiagnostics):
-        bounds = SurfaceThresholds()
-        for key, text in OF_SURFACE.items():
-            is_least = key != "free_space_violations"
-            figures.append(Figure.of(text, getattr(measured, key), getattr(bounds, key), is_least))
-    elif isinstance(measured, DescentDiagnostics):
-        text = ("mean loss", ".3g", "of the last steps of the descent")
-        figures.append(Figure.of(text, measured.mean_loss, measured.converged_loss, is_least=False))
-    if support is not None:
-        figures += _of_support(support)
+    elif isinstance(measured, Support):
+        figures += _without_landmarks(measured)
     if answer is not None and not isinstance(measured, Evidence):
         pose = earlier(found, answer)
         figures += [replace(figure, pose=pose) for figure in _of_landmarks(answer.evidence)]
@@ -130,10 +127,8 @@ def _of_landmarks(evidence: Evidence) -> Iterator[Figure]:
             yield Figure.of(text, value, bound.limit, bound.is_least)
 
 
-def _of_support(support: Support) -> Iterator[Figure]:
-    meaning = "share of the image's contrast that the rendering explains"
-    yield Figure.of(("contrast explained", ".0%", meaning), support.explained, LEAST_EXPLAINED)
-    meaning = (
-        "its probability among poses moved a little, the best different pose of the search and a plain image"
-    )
-    yield Figure.of(("distinguished from rivals", ".0%", meaning), support.confidence, DISTINGUISHED)
+def _without_landmarks(measured: Support) -> Iterator[Figure]:
+    for bound in SUPPORT_BOUNDS:
+        value, limit = getattr(measured, bound.measure), measured.limits.get(bound.measure, bound.limit)
+        if value is not None and bound.measure in WITHOUT_LANDMARKS:
+            yield Figure.of(WITHOUT_LANDMARKS[bound.measure], value, limit, bound.is_least)

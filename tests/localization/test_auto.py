@@ -183,7 +183,7 @@ def test_a_few_depth_rays_are_too_little_to_search_by() -> None:
     view = baked.unseen()[0]
     few = in_camera(view)[:49]
     problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, few)
-    quick = {"hypotheses": 8, "rounds": 1, "coarse_steps": 1, "fine_steps": 1, "fine_rays": 64}
+    quick = {"hypotheses": 8, "rounds": 1, "fine_steps": 1, "fine_rays": 64}
     found = localize(problem, "auto", quick)
     alone = localize(problem.without_depth(), "auto", quick)
     assert torch.equal(found.T_world_camera.matrix(), alone.T_world_camera.matrix())

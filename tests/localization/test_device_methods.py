@@ -31,8 +31,6 @@ SETTINGS = {
 BY_COLOUR = {
     "hypotheses": 8,
     "rounds": 1,
-    "coarse_steps": 1,
-    "coarse_rays": 32,
     "fine_steps": 2,
     "fine_rays": 64,
 }

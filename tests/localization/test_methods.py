@@ -26,18 +26,17 @@ FEW: dict[str, dict[str, Any]] = {
     "auto": {"points": 500, "hypotheses": 24, "rounds": 1, "refine_steps": 2, "fine_rays": 128},
     "bid": {"rays": 256, "max_steps": 60, "learning_rate": 0.08, "decay": 0.5, "decay_steps": 20,
             "depth_weight": 0.3, "level": None},
-    "bid-lm": {"poses": 8, "search_rays": 64, "coarse_poses": 3, "coarse_rays": 64, "middle_rays": 128,
-               "fine_rays": 512, "blur": 2},
+    "bid-lm": {"poses": 8, "fine_rays": 512},
     "inerf": {"rays": 128, "max_steps": 60, "learning_rate": 0.04, "decay": 0.5, "decay_steps": 20},
-    "inerf-lm": {"poses": 8, "search_poses": 2, "middle_poses": 2, "coarse_rays": 64, "fine_rays": 256},
+    "inerf-lm": {"poses": 8, "fine_rays": 256},
 }  # fmt: skip
 """Settings for small images, by method."""
 FEWEST: dict[str, dict[str, Any]] = {
     "auto": {"points": 200, "hypotheses": 8},
     "bid": {"rays": 64, "max_steps": 3},
-    "bid-lm": {"poses": 2, "middle_rays": 32, "fine_rays": 64},
+    "bid-lm": {"poses": 2, "fine_rays": 64},
     "inerf": {"rays": 64, "max_steps": 3},
-    "inerf-lm": {"poses": 2, "search_poses": 1, "middle_poses": 1, "coarse_rays": 32, "fine_rays": 64},
+    "inerf-lm": {"poses": 2, "fine_rays": 64},
 }
 """Settings of these that differ where the pose does not matter."""
 REMAINING = {"auto": 0.25, "bid": 0.35, "bid-lm": 0.15, "inerf": 0.4, "inerf-lm": 0.15}
@@ -156,8 +155,7 @@ def test_second_order_steps_come_to_the_truth_in_few_steps_of_which_adam_needs_m
 def test_colour_alone_finds_a_place_that_is_far() -> None:
     """A camera that was turned by 30 degrees sees next to nothing of what it saw."""
     start = TRUTH @ SE3.exp(torch.tensor([0.1, -0.1, 0.1, 0.0, 0.5, 0.1], dtype=torch.float64))
-    more = {"poses": 96, "search_poses": 8, "middle_poses": 3}
-    found = found_by("inerf-lm", photograph(depth=False), start, **more)
+    found = found_by("inerf-lm", photograph(depth=False), start, poses=96)
     assert off(found.T_world_camera) < 0.03
     assert found.converged, found.reason
 
@@ -172,15 +170,10 @@ def test_an_image_of_another_exposure() -> None:
 
 SENSELESS = {
     "auto": {"points": 10, "hypotheses": 0, "rounds": 1000},
-    "bid": {"stop_step": -1.0, "stop_loss": math.nan, "colour_scale": 0.0, "rays": 0},
-    "inerf": {"stop_step": math.inf, "stop_loss": -1.0, "colour_scale": 0.0, "rays": 0},
-    "bid-lm": {
-        "poses": 0, "fine_rays": 6, "coarse_steps": 0, "blur": 0, "colour_scale": 0.0, "depth_scale": 0.0,
-    },
-    "inerf-lm": {
-        "poses": 0, "search_poses": 0, "middle_steps": 0, "width": 3, "spread_rotation": -1.0, "fine_rays": 6,
-        "coarse_steps": 0, "colour_scale": 0.0,
-    },
+    "bid": {"stop_loss": math.nan, "colour_scale": 0.0, "rays": 0},
+    "inerf": {"stop_loss": -1.0, "converged_loss": math.inf, "colour_scale": 0.0, "rays": 0},
+    "bid-lm": {"poses": 0, "fine_rays": 6, "colour_scale": 0.0, "depth_scale": 0.0},
+    "inerf-lm": {"poses": 0, "spread_rotation": -1.0, "fine_rays": 6, "fine_steps": 0, "colour_scale": 0.0},
 }  # fmt: skip
 
 

@@ -14,8 +14,9 @@ from bidnerf_core.localization import states_at
 
 # Inside: the distribution of proposals and the margin over other poses, of which an answer keeps one
 from bidnerf_core.localization.by_rays import centred
+from bidnerf_core.localization.by_surface import by_depth, by_images, hypotheses
 from bidnerf_core.localization.pivots import middle_of_view
-from bidnerf_core.localization.search import Stage, by_depth, by_images, halve, hypotheses, neighbours
+from bidnerf_core.localization.search import Stage, halve, neighbours
 from bidnerf_core.mapping import Normal, P, States
 from bidnerf_core.results import pose_error
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH
@@ -122,7 +123,7 @@ def test_points_find_the_pose_anywhere_in_the_scene() -> None:
 @pytest.mark.parametrize("number", [1, 2])
 def test_images_find_the_pose_without_depth(number: int) -> None:
     view = baked.unseen()[number]
-    found = by_images(baked.problem(view).without_depth(), baked.toy(), 64, 0)
+    found, _ = by_images(baked.problem(view).without_depth(), baked.toy(), 64, 0)
     error = pose_error(found.states.T[0], view.T_ref_camera)
     # Of 3.5 m and with pixels and surfels that are 4 cm wide: what is left is the field's to take.
     assert float(error.translation) < 0.2
@@ -139,5 +140,5 @@ def test_what_looks_the_same_from_two_sides_has_no_margin(depth: bool) -> None:
         found = by_depth(problem, baked.points(view, surface=surface), 128, 0)
         assert found.margin < 0.15
     else:
-        found = by_images(problem.without_depth(), surface, 64, 0)
+        found, _ = by_images(problem.without_depth(), surface, 64, 0)
         assert found.margin < 0.15 * float(found.scores[0])

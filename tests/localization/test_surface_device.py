@@ -23,7 +23,6 @@ from bidnerf_core.localization import (
     ColourSettings,
     DepthLossSettings,
     Images,
-    RayStage,
     RayTerms,
     rig,
     states_at,
@@ -97,7 +96,7 @@ def align_points_and_render(place: Place) -> list[Tensor]:
     there = place.surface(module_fields.surface().to(place.device))
     problem = rig(FieldMap(field, baked.BOUNDS, there), [view], None)
     points = baked.points(view, count=400, surface=there)
-    rays = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, RayStage(2, 64), 0)
+    rays = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, 64, 0)
     return place.descended([points, rays], near(view, 1))
 
 

@@ -30,7 +30,6 @@ from bidnerf_core.localization import (
     DepthLossSettings,
     Images,
     Problem,
-    RayStage,
     RayTerms,
     rig,
     states_at,
@@ -114,7 +113,7 @@ def test_the_gradient_by_rays_is_the_numerical_one(
     terms = RayTerms(
         ColourSettings("cauchy"), DepthLossSettings(depth_loss="cauchy") if depth else None, exposure
     )
-    rays = terms.term(problem(field), RayStage(1, 300), 0)
+    rays = terms.term(problem(field), 300, 0)
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
     torch.testing.assert_close(
@@ -147,7 +146,7 @@ def test_derivatives_of_rays_are_those_of_autograd_ray_by_ray(
 
 def test_rays_that_hit_nothing_have_no_derivative() -> None:
     away = states_at(T0.retract(torch.tensor([0, 0, 0, 3.14, 0, 0], dtype=torch.float64))[None])
-    rays = RayTerms(ColourSettings(), None, False).term(problem(BLOBS), RayStage(1, 50), 0)
+    rays = RayTerms(ColourSettings(), None, False).term(problem(BLOBS), 50, 0)
     normal = rays(away)
     assert not bool(normal.gradient.any())
     assert float(normal.cost) > 0
@@ -159,7 +158,7 @@ def test_measured_rays_of_another_sensor_join_pixels(monkeypatch: pytest.MonkeyP
     lidar = depth_rays_of([observed(BLOBS)])
     blank = View(Frame("blank", torch.zeros((40, 48, 3)), CAMERA, has_colour=False), SE3.identity())
     given = rig(FieldMap(BLOBS, BOUNDS), [blank], T0, lidar)
-    rays = RayTerms(ColourSettings(), DepthLossSettings()).term(given, RayStage(1, 200), 0)
+    rays = RayTerms(ColourSettings(), DepthLossSettings()).term(given, 200, 0)
     assert float(rays.coloured.sum()) == 0
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
@@ -174,7 +173,7 @@ def test_an_image_of_other_exposure_costs_the_same_once_it_is_eliminated() -> No
     view = observed(BLOBS)
     darker = replace(view, frame=replace(view.frame, rgb=0.7 * view.frame.rgb + 0.1))
     terms = RayTerms(ColourSettings("geman-mcclure"), None)
-    plain, other = (terms.term(problem(BLOBS, v), RayStage(1, 300), 0) for v in (view, darker))
+    plain, other = (terms.term(problem(BLOBS, v), 300, 0) for v in (view, darker))
     truth = states_at(T0[None])
     assert float(other(truth).cost) < 0.02 * float(other(near()).cost.min())
     assert float(plain(truth).cost) < 0.02 * float(plain(near()).cost.min())

@@ -114,7 +114,6 @@ def inside(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def quick_auto(monkeypatch: pytest.MonkeyPatch, no_processes: None) -> None:
     """Method ``auto`` with few hypotheses and one round: that it finds poses is tested elsewhere."""
     auto, by_colour = METHODS["auto"], AutoConfig().by_colour
-    steps = dataclasses.replace(by_colour.steps, coarse_steps=1, coarse_rays=32, fine_steps=1, fine_rays=64)
 
     def quick(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         few = dataclasses.replace(
@@ -123,7 +122,7 @@ def quick_auto(monkeypatch: pytest.MonkeyPatch, no_processes: None) -> None:
             hypotheses=8,
             rounds=1,
             refine_rays=64,
-            by_colour=dataclasses.replace(by_colour, steps=steps),
+            by_colour=dataclasses.replace(by_colour, fine_steps=1, fine_rays=64),
         )
         return auto.solve(problem, few, seed)
 

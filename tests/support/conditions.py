@@ -25,7 +25,7 @@ COPY = SE3.exp(torch.tensor([30.0, 5.0, -20.0, 0.2, -0.9, 0.4], dtype=torch.floa
 QUICK = settings_of(
     "auto",
     {"points": 500, "hypotheses": 32, "rounds": 1, "refine_steps": 0, "fused_rays": 128}
-    | {"coarse_steps": 1, "coarse_rays": 64, "fine_steps": 1, "fine_rays": 64},
+    | {"fine_steps": 1, "fine_rays": 64},
 )
 NOT_RENDERED = replace(QUICK, fused_rays=0)
 

@@ -28,9 +28,7 @@ from bidnerf_core.testing import (
 )
 
 QUICK = AutoConfig(points=1000, hypotheses=64, rounds=1, refine_steps=0, fused_rays=128)
-FEW = {
-    "poses": 8, "search_rays": 64, "coarse_poses": 3, "coarse_rays": 64, "middle_rays": 128, "fine_rays": 512,
-}  # fmt: skip
+FEW = {"poses": 8, "fine_rays": 512}
 
 
 class TestSift(FeaturesContract):

@@ -23,7 +23,6 @@ from bidnerf_core.localization import (
     BOUNDS,
     METHODS,
     Bound,
-    DescentDiagnostics,
     Evidence,
     Outcome,
     SearchRecord,
@@ -230,8 +229,8 @@ def test_poses_are_shown_relative_to_the_origin_of_the_map(
 
 
 def test_the_loss_of_a_descent_is_the_first_figure(answer: Localization) -> None:
-    said = Support(0.9, 5.0, -3.0, 9.0)
-    lost = replace(answer, confidence=said.confidence, diagnostics=DescentDiagnostics(0.036, 0.02, said))
+    said = Support(0.9, 5.0, -3.0, 9.0, mean_loss=0.036)
+    lost = replace(answer, confidence=said.confidence, diagnostics=said)
     first = acceptance_figures(lost, None)[0]
     assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "at most 0.02", False)  # fmt: skip
     assert "not even a local optimum" in contests(lost, None)[0].remark

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -23,7 +23,7 @@ LITTLE_BACKGROUND = 0.02
 
 @dataclass(eq=False)
 class SampledLoss:
-    """The loss of a pose on pixels that are drawn at each call or only once."""
+    """The loss of a pose on pixels that are drawn at each call."""
 
     problem: Problem
     objective: Objective
@@ -31,65 +31,53 @@ class SampledLoss:
     rays: DescentSettings
     reach: ReachSettings
     generator: Generator
-    _batches: list[Observations] | None = field(default=None, init=False)
-    _candidates: int = field(default=1, init=False)
 
     def __post_init__(self) -> None:
-        if self.reach.candidates > 1 and _shows_background(self.problem):
-            self._candidates = self.reach.candidates
+        problem = self.problem
+        self._field, self._bounds = problem.level(self.rays.level), problem.bounds
+        # Preferring other pixels pays only if more than a few show the background.
+        shown = self.reach.candidates > 1 and any(
+            _share_of_background(view.frame, problem.bounds) > LITTLE_BACKGROUND for view in problem.views
+        )
+        self._candidates = self.reach.candidates if shown else 1
 
     def __call__(self, T_world_last: SE3) -> Float[Tensor, ""]:
         """Return the loss; differentiable in the pose of the last view's camera."""
-        if self._batches is None or self.rays.renew:
-            self._batches = self._drawn(T_world_last.detach())
-        first, *others = (self._loss(batch, T_world_last) for batch in self._batches)
-        return sum(others, start=first)
-
-    def _loss(self, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
-        scene, rays = self.problem.level(self.rays.level), self._rays(observed, T_world_last)
-        bounds, weight = self.problem.bounds, self.reach.box_weight
-        loss = self.objective.loss(render(scene, rays, bounds.background), observed)
-        boxed = weight > 0 and self.objective.uses_depth and not bounds.contracted
-        return loss + weight * self._outside(rays, observed) if boxed else loss
-
-    def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:
-        rays = observed.rays(T_world_last, self.problem.bounds)
-        return rays if self.rays.wide == 1 else widened(rays, self.rays.wide)
-
-    def _outside(self, rays: Rays, observed: Observations) -> Float[Tensor, ""]:
-        """Return the mean robust loss of the distances (metres) between measured points and the box of the scene."""
-        bounds = self.problem.bounds
-        points = rays.origins + observed.distance[..., None] * rays.directions
-        half = constant(bounds.size, points) / 2
-        off = ((points - constant(bounds.centre, points)).abs() - half).clamp(min=0)
-        robust = Robust("huber", rendered_depth_scale(bounds))
-        return masked_mean(robust(torch.linalg.vector_norm(off, dim=-1)), observed.measured).mean()
-
-    def _drawn(self, T_world_last: SE3) -> list[Observations]:
-        """Draw pixels (views, pixels per view) and any depth rays (1, rays)."""
-        problem, device = self.problem, self.problem.device
-        many = self.rays.rays * self._candidates
-        pixels = draw(problem.views, many, DRAWERS[self.rays.pixels], self.generator, device=device)
+        problem, generator, here = self.problem, self.generator, T_world_last.detach()
+        many, device = self.rays.rays * self._candidates, problem.device
+        pixels = draw(problem.views, many, DRAWERS[self.rays.pixels], generator, device=device)
         if self._candidates > 1:
             count = max(1, self.rays.rays // len(problem.views))
-            order = self._rank(pixels, T_world_last).sort(dim=-1, descending=True, stable=True).indices
+            order = self._rank(pixels, here).sort(dim=-1, descending=True, stable=True).indices
             pixels = pixels.gathered(order[:, :count])
-        batches = [pixels]
+        found = self._loss(pixels, T_world_last)
         if problem.depth_rays is not None and self.objective.uses_depth and self.depth_rays > 0:
-            batches.append(problem.depth_rays.drawn(self.depth_rays, self.generator, device=device)[None])
-        return batches
+            others = problem.depth_rays.drawn(self.depth_rays, generator, device=device)[None]
+            found = found + self._loss(others, T_world_last)
+        return found
+
+    def _loss(self, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
+        """Return the objective's loss and the mean robust distance (metres) between measured points and the box of the scene."""
+        bounds, weight, rays = self._bounds, self.reach.box_weight, self._rays(observed, T_world_last)
+        loss = self.objective.loss(render(self._field, rays, bounds.background), observed)
+        if weight == 0 or not self.objective.uses_depth or bounds.contracted:
+            return loss
+        points = rays.origins + observed.distance[..., None] * rays.directions
+        off = (points - constant(bounds.centre, points)).abs() - constant(bounds.size, points) / 2
+        robust = Robust("huber", rendered_depth_scale(bounds))
+        outside = robust(torch.linalg.vector_norm(off.clamp(min=0), dim=-1))
+        return loss + weight * masked_mean(outside, observed.measured).mean()
+
+    def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:
+        rays = observed.rays(T_world_last, self._bounds)
+        return rays if self.rays.wide == 1 else widened(rays, self.rays.wide)
 
     def _rank(self, pixels: Observations, T_world_last: SE3) -> Int[Tensor, "k p"]:
         """Return 2 or more for pixels that show matter in the image, and 1 for others whose rays may hit it in the map."""
-        background = constant(self.problem.bounds.background, pixels.rgb)
+        background = constant(self._bounds.background, pixels.rgb)
         shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
-        sampler = self.problem.level(self.rays.level).sampler
-        return 2 * shows.int() + sampler(self._rays(pixels, T_world_last)).valid.any(-1).int()
-
-
-def _shows_background(problem: Problem) -> bool:
-    """Return whether more than a few pixels of any image have the background's colour and no measured depth."""
-    return any(_share_of_background(view.frame, problem.bounds) > LITTLE_BACKGROUND for view in problem.views)
+        valid = self._field.sampler(self._rays(pixels, T_world_last)).valid
+        return 2 * shows.int() + valid.any(-1).int()
 
 
 def _share_of_background(frame: Frame, bounds: SceneBounds) -> float:

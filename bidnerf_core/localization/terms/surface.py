@@ -14,6 +14,7 @@ from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import inlier_weight
+from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.terms.exposure import fit_exposure
 from bidnerf_core.mapping import (
     DEPTH,
@@ -33,8 +34,6 @@ INDEPENDENT = 10.0
 """Largest number of independent measurements among depths against the surface."""
 DENSE = 20
 """Ratio of measured to compared points above which they are drawn with replacement, which takes far less time."""
-LEAST = 50
-"""Least number of measured points from which a shape can be recognized."""
 DISC = 1.5
 """Radius of a surfel in cells: beyond it, a point does not lie on the surface."""
 COLOUR = 0.15
@@ -111,7 +110,7 @@ class Surface:
                 )
             )
         total = sum(len(part[0]) for part in parts)
-        if total < LEAST:
+        if total < LEAST_POINTS:
             return None
         order = torch.randperm(total, generator=generator)
         image, times, R, t, z, fixed, rgb, coloured = (
