@@ -24,7 +24,7 @@ from bidnerf_core.localization.occluders import nearest_piece
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
+from bidnerf_core.localization.settings import AutoConfig
 from bidnerf_core.mapping import true_intrinsics
 
 TEXTURED = 150
@@ -57,29 +57,25 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
 
 def _on_surface(
-    problem: Problem,
-    config: AutoConfig,
-    seed: int,
-    loop: Loop | None,
-    by_landmarks: Localization | None,
-    began: float,
-) -> Localization:
-    """Return the answer by measured depth or images on the surface, or else that by landmarks."""
-    textured = loop is not None and loop.landmarks.usual_matches >= TEXTURED
+    problem: Problem, config: AutoConfig, seed: int, loop: Loop | None, best: Localization | None, began: float
+) -> Localization:  # fmt: skip
+    """Return the answer by measured depth or images on the surface, or else the ``best`` so far, which is by landmarks."""
     surface = problem.surface
     if loop is None and surface is None:
-        return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
-    if surface is None or textured:
-        return by_landmarks or unrecognized(problem)
-    has_points = measured_points(problem) >= LEAST_POINTS
-    if not has_points:
-        if loop is not None:
-            return by_landmarks or unrecognized(problem)
-        return _uncertain_camera(localize_by_images(problem, surface, config, seed), problem)
-    best = by_landmarks
+        why = "the map has no surface ('bidnerf bake' makes one)"
+        if problem.start is None:
+            raise InputError("method 'auto' then needs a start; give one", where=why)
+        found = bid(problem, BidConfig(), seed)
+        return replace(found, reason=f"{why}; {found.reason}")
+    if surface is None or (loop is not None and loop.landmarks.usual_matches >= TEXTURED):
+        return best or unrecognized(problem)
+    config = config if loop is None else replace(config, rounds=1)
     occluder = nearest_piece(problem)
     for given in (problem, *(() if occluder is None else (occluder.rest,))):
-        found = localize_by_depth(given, surface, config if loop is None else replace(config, rounds=1), seed)
+        by_depth = localize_by_depth(given, surface, config, seed)
+        if by_depth is None:
+            break
+        found = by_depth
         if occluder is not None and given is not problem:
             if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < IN_FRONT:
                 continue
@@ -99,8 +95,9 @@ def _on_surface(
             return found
         if best is None or best.outcome is Outcome.TOO_FEW_MATCHES:  # a pose by chance
             best = found
-    assert best is not None
-    return best
+    if best is None and loop is None:
+        return _uncertain_camera(localize_by_images(problem, surface, config, seed), problem)
+    return best or unrecognized(problem)
 
 
 def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
@@ -115,7 +112,6 @@ def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
 def localization_of(problem: Problem, answer: Answer, began: float) -> Localization:
     """Convert an answer of the loop."""
     T, noise = answer.T_world_rig, float(answer.posterior.states.noise[answer.posterior.best])
-    poses = [T] if problem.start is None else [problem.start, T]
     stated, camera = problem.views[-1].frame.intrinsics, answer.camera
     corrected = None if camera is None else true_intrinsics(stated, camera[:6])
     reason = answer.verdict.reason
@@ -125,49 +121,23 @@ def localization_of(problem: Problem, answer: Answer, began: float) -> Localizat
         reason += f", with another camera than the stated one ({answer.explanation})"
     elif answer.explanation.endswith(" moving"):
         reason += ", with the motion of a rolling shutter"
-    record = current_record()
-    if record is not None:
+    if (record := current_record()) is not None:
         record.answers.append(answer)
-    return Localization(
-        T_world_camera=T,
-        outcome=answer.verdict.outcome,
-        reason=reason,
-        steps=len(poses),
-        seconds=time.perf_counter() - began,
-        loss=noise,
-        method="auto",
-        poses=SE3.stack([*poses, T]),
-        losses=torch.full((len(poses),), noise, dtype=torch.float64),
-        covariance=answer.covariance,
-        focal_factor=1.0 if camera is None else float(camera[0].exp()),
-        intrinsics=corrected,
-        confidence=answer.verdict.confidence,
-        diagnostics=answer.evidence,
-    )
+    losses = torch.full((1 if problem.start is None else 2,), noise, dtype=torch.float64)
+    path = SE3.stack([T, T] if problem.start is None else [problem.start, T, T])
+    found = Localization.of(
+        replace(answer.verdict, reason=reason), path, losses, "auto", began, noise, answer.covariance, answer.evidence
+    )  # fmt: skip
+    factor = 1.0 if camera is None else float(camera[0].exp())
+    return replace(found, intrinsics=corrected, focal_factor=factor)
 
 
 def unrecognized(problem: Problem) -> Localization:
     """Return the answer to images in which no landmarks were recognised."""
-    T = problem.start or SE3.identity()
     causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
-    return Localization(
-        T, Outcome.TOO_FEW_MATCHES, f"too few landmarks were recognised: {causes}", 0, 0.0, float("nan"), "auto",
-        SE3.stack([T]), torch.zeros(0, dtype=torch.float64),
-    )  # fmt: skip
-
-
-def measured_points(problem: Problem) -> int:
-    """Return the number of measured depths."""
-    images = [view.frame.depth for view in problem.views if view.frame.depth is not None]
-    pixels = sum(int(((depth > 0) & depth.isfinite()).sum()) for depth in images)
-    return pixels + (0 if problem.depth_rays is None else len(problem.depth_rays))
-
-
-def _descended(problem: Problem, seed: int, why: str) -> Localization:
-    if problem.start is None:
-        raise InputError("method 'auto' then needs a start; give one", where=why)
-    found = bid(problem, BidConfig(), seed)
-    return replace(found, reason=f"{why}; {found.reason}")
+    why = Verdict(Outcome.TOO_FEW_MATCHES, f"too few landmarks were recognised: {causes}")
+    path, none = (problem.start or SE3.identity())[None], torch.zeros(0, dtype=torch.float64)
+    return replace(Localization.of(why, path, none, "auto", 0.0, float("nan")), seconds=0.0)
 
 
 def within_risk(found: Localization, risk: float) -> Localization:

@@ -62,14 +62,17 @@ FLAT = 0.02
 
 
 @torch.no_grad()
-def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
+def localize_by_depth(
+    problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int
+) -> Localization | None:
     """Align measured points with the surface, in rounds until a pose is acceptable, then refine it on rendered rays as well.
 
-    Scores of poses are mean costs of points, from 0 to 2.
+    None if too few points were measured.
     """
     began = time.perf_counter()
     points = Surface.of(problem.views, problem.depth_rays, surface, seed, config.points)
-    assert points is not None, "too few points were measured"
+    if points is None:
+        return None
     middle = points.points.median(0).values.cpu()
     found: Proposals | None = None
     for number in range(config.rounds):

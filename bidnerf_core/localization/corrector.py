@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import threading
+from collections import deque
+from contextlib import suppress
+from queue import Empty, Full, Queue
+from threading import Thread
 from types import TracebackType
 
 from bidnerf_core.errors import InputError
@@ -24,29 +27,17 @@ class Corrector:
 
     def __init__(self, localizer: Localizer) -> None:
         """Start the thread."""
-        self._localizer = localizer
-        self._changed = threading.Condition()
-        self._waiting: tuple[Frame, SE3] | None = None
-        self._closed = False
-        self._error: BaseException | None = None
-        self._found: Localization | None = None
-        self._T_world_odom: SE3 | None = None
-        self._thread = threading.Thread(target=self._run, name="bidnerf-corrector", daemon=True)
+        self.T_world_odom: SE3 | None = None  # the correction from the last accepted answer
+        self.found: Localization | None = None  # the last answer, accepted or not
+        self._localizer, self._closed = localizer, False
+        self._waiting: Queue[tuple[Frame, SE3] | None] = Queue(1)  # None ends the thread
+        self._errors = deque[BaseException](maxlen=1)
+        self._thread = Thread(target=self._run, name="bidnerf-corrector", daemon=True)
         self._thread.start()
-
-    @property
-    def T_world_odom(self) -> SE3 | None:
-        """The correction from the last accepted answer; None until there is one."""
-        return self._T_world_odom
-
-    @property
-    def found(self) -> Localization | None:
-        """The last answer, accepted or not; None until there is one."""
-        return self._found
 
     def corrected(self, T_odom_camera: SE3) -> SE3 | None:
         """Return T_world_camera for a pose in the odometry's frame; None until an answer has been accepted."""
-        T_world_odom = self._T_world_odom
+        T_world_odom = self.T_world_odom
         return None if T_world_odom is None else T_world_odom @ T_odom_camera
 
     def give(self, frame: Frame, T_odom_camera: SE3) -> bool:
@@ -54,27 +45,26 @@ class Corrector:
 
         Raises the error of an earlier frame's localization, and ``InputError`` after ``close``.
         """
-        with self._changed:
-            self._raise_error()
-            if self._closed:
-                raise InputError("the corrector is closed and takes no more frames")
-            if self._waiting is not None:
-                return False
-            self._waiting = frame, T_odom_camera
-            self._changed.notify_all()
-            return True
+        self._raise_error()
+        if self._closed:
+            raise InputError("the corrector is closed and takes no more frames")
+        try:
+            self._waiting.put_nowait((frame, T_odom_camera))
+        except Full:
+            return False
+        return True
 
     def close(self) -> None:
         """End the thread after the current localization, whose answer still counts; a waiting frame is dropped.
 
         Raises the error of a localization that has not been raised yet.
         """
-        with self._changed:
-            self._closed, self._waiting = True, None
-            self._changed.notify_all()
+        self._closed = True
+        with suppress(Empty):
+            self._waiting.get_nowait()
+        self._waiting.put(None)
         self._thread.join()
-        with self._changed:
-            self._raise_error()
+        self._raise_error()
 
     def __enter__(self) -> Corrector:
         return self
@@ -85,26 +75,19 @@ class Corrector:
         self.close()
 
     def _raise_error(self) -> None:
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
+        try:
+            error = self._errors.pop()
+        except IndexError:
+            return
+        raise error
 
     def _run(self) -> None:
-        while (taken := self._next()) is not None:
+        while (taken := self._waiting.get()) is not None:
             frame, T_odom_camera = taken
             try:
-                found = self._localizer(frame, start=self.corrected(T_odom_camera))
+                self.found = found = self._localizer(frame, start=self.corrected(T_odom_camera))
             except BaseException as error:  # raised in the caller's thread
-                with self._changed:
-                    self._error = error
+                self._errors.append(error)
                 continue
-            self._found = found
             if found.converged:
-                self._T_world_odom = found.T_world_camera @ T_odom_camera.inverse()
-
-    def _next(self) -> tuple[Frame, SE3] | None:
-        """Wait for a frame; return None once the corrector is closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._waiting is not None)
-            taken, self._waiting = self._waiting, None
-            return taken
+                self.T_world_odom = found.T_world_camera @ T_odom_camera.inverse()

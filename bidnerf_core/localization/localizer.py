@@ -39,8 +39,6 @@ from bidnerf_core.localization.problem import (
 )
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 
-WARM_UP_RAYS = 64
-
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
 
@@ -143,9 +141,7 @@ class Localizer:
     def _warm_up(self) -> None:
         """Render some rays and fill the caches of the surface, so that lazy initialisation does not delay the first call."""
         bounds, field = self.scene.bounds, self.scene.field
-        directions = torch.nn.functional.normalize(
-            torch.randn((WARM_UP_RAYS, 3), generator=torch.Generator().manual_seed(0)), dim=-1
-        ).to(device_of(field))
+        directions = torch.eye(3, device=device_of(field))
         middle = constant(bounds.centre, directions)
         render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
         if self.scene.surface is not None:
@@ -171,10 +167,8 @@ def checked_map(given: object, where: str) -> SceneMap:
 
 
 def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:
-    if config is None:
-        return method.settings(preset)
-    if isinstance(config, Mapping):
-        return settings_of(name, dict(config), preset=preset)
+    if config is None or isinstance(config, Mapping):
+        return settings_of(name, dict(config or {}), preset=preset)
     expected, found = method.config_type.__name__, type(config).__name__
     if not isinstance(config, method.config_type):
         raise InputError(f"method {name!r} takes a {expected} or a dictionary, got a {found}")

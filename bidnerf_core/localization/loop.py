@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
@@ -222,27 +223,17 @@ class Loop:
 
     def _term(self, modes: Sequence[Mode], best: States) -> Landmarks:
         """Return the reprojection errors of the modes' matches, padded; ``best`` (g) are the modes' states."""
-        m = max(1, *(len(mode.matches) for mode in modes))
         parts = []
-        for number, (query, found) in enumerate((mode.query, mode.matches) for mode in modes):
-            k, sights = found.keypoint, query.sights[found.keypoint]
-            here = best[number : number + 1]
-            variance = point_variance(self.landmarks, found.landmark, here, query.focal[k])
+        for number, mode in enumerate(modes):
+            query, found, here = mode.query, mode.matches, best[number : number + 1]
+            focal, sights = query.focal[found.keypoint], query.sights[found.keypoint]
             points = self.landmarks.positions[found.landmark].double()
-            valid = torch.ones(len(found), dtype=torch.float64)
-            values = (
-                points,
-                sights.image,
-                sights.times,
-                sights.rotation,
-                sights.translation,
-                valid,
-                variance,
-                query.focal[k],
-            )
-            fillers: list[float | tuple[float, ...]] = [(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]
-            parts.append([_padded(value, m, fill) for value, fill in zip(values, fillers, strict=True)])
-        points, *seen, valid, variance, focal = (torch.stack(part) for part in zip(*parts, strict=True))
+            variance = point_variance(self.landmarks, found.landmark, here, focal)
+            seen = (sights.image, sights.times, sights.rotation, sights.translation)
+            parts.append((points, *seen, torch.ones_like(focal), variance, focal))
+        fillers = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+        columns = zip(zip(*parts, strict=True), fillers, strict=True)
+        points, *seen, valid, variance, focal = (pad_sequence(list(x), True, fill) for x, fill in columns)
         counts = [self.landmarks.correlation_of(len(mode.matches)) for mode in modes]
         correlation, query = torch.tensor(counts, dtype=torch.float64), modes[0].query
         return Landmarks(
@@ -478,8 +469,3 @@ class Loop:
 def _is_better(one: Answer, other: Answer) -> bool:
     """Return whether an answer should replace another one."""
     return one.verdict.accepted or (one.evidence.log10_nfa < other.evidence.log10_nfa)
-
-
-def _padded(values: Tensor, count: int, fill: float | tuple[float, ...] = 0.0) -> Tensor:
-    filler = torch.as_tensor(fill, dtype=values.dtype).expand(count - len(values), *values.shape[1:])
-    return torch.cat([values, filler])

@@ -21,8 +21,6 @@ LADDER = (-0.35, 0.35, -0.7, 0.7)
 """Logarithms of the focal lengths, relative to the stated one, that are tried if it gives no consensus."""
 CONVINCING = -20.0
 """Log10 of the number of false alarms below which no other camera is tried."""
-SUCCESS = 0.9999
-"""RANSAC stops once a sample without outliers has been drawn with this probability."""
 LEAST_DRAWS, MOST_DRAWS = 50, 5_000
 LEAST_AGREEING = 6
 """Least number of matches that agree on a pose."""
@@ -73,7 +71,7 @@ def consensus(
         part for part in ((view == v).nonzero()[:, 0] for v in range(len(query.images))) if len(part) >= 4
     ]
     options = {
-        "max_reproj_error": query.threshold, "seed": 0, "success_prob": SUCCESS, "progressive_sampling": True,
+        "max_reproj_error": query.threshold, "seed": 0,  "progressive_sampling": True,
         "min_iterations": LEAST_DRAWS, "max_iterations": MOST_DRAWS, "max_prosac_iterations": MOST_DRAWS,
     }  # fmt: skip
     found: list[SE3] = []

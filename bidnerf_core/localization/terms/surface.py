@@ -166,10 +166,6 @@ class Surface:
         found = Normal(cost, gradient, hessian + (rows * weight[..., None]).mT @ rows)
         return moved(found, states.z.device)
 
-    def near(self, states: States) -> Float[Tensor, "h n"]:
-        """Return how far each point is on the surface: its inlier weight."""
-        return inlier_weight(self._offsets(states)[1], 3 * self.noise)
-
     def inliers(self, states: States) -> tuple[Float[Tensor, "h n"], Float[Tensor, "h n"]]:
         """Return each point's inlier weights by distance and by colour."""
         here = moved(states, self.surface.device)
