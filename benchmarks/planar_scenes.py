@@ -28,11 +28,11 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import texture
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.results import success_rate
-from bidnerf_core.scenes import HomogeneousBall, look_at
+from bidnerf_core.scenes import HomogeneousBall
 
 CAMERA = Intrinsics(400.0, 400.0, 240.0, 180.0, 480, 360)
 SUPERSAMPLED = 2

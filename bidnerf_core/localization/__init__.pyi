@@ -1,5 +1,5 @@
 from .accept import ACCEPTED as ACCEPTED
-from .accept import BOUNDS as BOUNDS
+from .accept import LANDMARK_BOUNDS as LANDMARK_BOUNDS
 from .accept import Bound as Bound
 from .accept import Evidence as Evidence
 from .accept import LogisticModel as LogisticModel

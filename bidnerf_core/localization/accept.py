@@ -63,7 +63,7 @@ class Bound(NamedTuple):
         return value >= limit if self.is_least else value <= limit
 
 
-BOUNDS = (
+LANDMARK_BOUNDS = (
     Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "10^{0:.0f} poses as good are expected by chance"),
     Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers"),
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
@@ -82,7 +82,7 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     ``log_odds`` are those of the pose before its image was seen, relative to an image that may have been taken anywhere.
     """
     confidence = model().probability(features(evidence), log_odds)
-    for bound in BOUNDS if evidence.searched else BOUNDS[1:]:
+    for bound in LANDMARK_BOUNDS if evidence.searched else LANDMARK_BOUNDS[1:]:
         value = getattr(evidence, bound.measure)
         if not bound.keeps(value):
             return Verdict(bound.outcome, bound.reason.format(value), confidence)

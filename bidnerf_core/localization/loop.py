@@ -229,8 +229,8 @@ class Loop:
             focal, sights = query.focal[found.keypoint], query.sights[found.keypoint]
             points = self.landmarks.positions[found.landmark].double()
             variance = point_variance(self.landmarks, found.landmark, here, focal)
-            seen = (sights.image, sights.times, sights.rotation, sights.translation)
-            parts.append((points, *seen, torch.ones_like(focal), variance, focal))
+            of_sights = sights.image, sights.times, sights.rotation, sights.translation
+            parts.append((points, *of_sights, torch.ones_like(focal), variance, focal))
         fillers = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
         columns = zip(zip(*parts, strict=True), fillers, strict=True)
         points, *seen, valid, variance, focal = (pad_sequence(list(x), True, fill) for x, fill in columns)

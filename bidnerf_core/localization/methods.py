@@ -213,7 +213,8 @@ def descended(
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     found = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
     most = config.adam.converged_loss
-    found = replace(found, mean_loss=mean, limits={"mean_loss": most})
+    limits = {"mean_loss": most, "explained": 1 - config.adam.plain_share}
+    found = replace(found, mean_loss=mean, limits=limits)
     verdict = found.verdict(f"mean loss {mean:.3g}, must be below {most:.3g}")
     verdict = replace(verdict, reason=f"{ending}; {verdict.reason}")
     if not finite or not math.isfinite(mean):

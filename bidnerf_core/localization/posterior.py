@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import CAMERA, Landmarks, Normal, P, Quadratic, States, log_evidence, unit_of
+from bidnerf_core.mapping import CAMERA, Landmarks, Normal, P, Quadratic, States, log_evidence
 
 BY_SHARE = 10.0
 """Log odds per factor e between the evidence for two places: it is not proportional to the number of matches, since the right
@@ -146,7 +146,7 @@ def robust_covariance(
     systematic: Float[Tensor, "g P P"] | float,
 ) -> Float[Tensor, "h P P"]:
     """Return the covariance of the unknowns: that of an M-estimator for landmarks, and of a Gaussian likelihood for all else."""
-    unit, scale, g = unit_of(terms.here), 1 / unit_of(states), states.mode
+    unit, scale, g = terms.here.unit, 1 / states.unit, states.mode
     parts = [unit[:, :, None] * part * unit[:, None] for part in landmarks.sandwich(terms.here)]
     parts = [parts[0], parts[1], parts[2] + systematic]
     hessian, curvature, scatter = (scale[:, :, None] * part[g] * scale[:, None] for part in parts)

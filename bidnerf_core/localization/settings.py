@@ -113,6 +113,8 @@ class AdamSettings(Settings):
     # stop once the mean loss of 20 steps is below this (epsilon of Alg. 1); 0: never
     stop_loss: NotNegative = 0.0
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
+    # maximum cost of an accepted pose as a fraction of the cost of the image's mean colour, if only colours are compared
+    plain_share: Annotated[float, Range(0.0), EXPERT] = 0.5
 
 
 @dataclass(frozen=True)

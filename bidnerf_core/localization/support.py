@@ -96,19 +96,20 @@ class Support:
 
     def verdict(self, accepted: str) -> Verdict:
         """Return the first bound that is not kept, or else acceptance for the reason ``accepted``."""
-        rivals = {
-            "a single-colour image": (self.plain, Outcome.UNDETERMINED),
-            f"a pose displaced by {DISPLACEMENT:.0%} of the distance to the scene": (self.displaced, Outcome.UNDETERMINED),
-            "another pose": (self.other, Outcome.AMBIGUOUS),
-        }  # fmt: skip
+        displaced = NO_RIVAL if self.displaced is None else self.displaced
+        rivals = (
+            (self.plain, Outcome.UNDETERMINED, "a single-colour image"),
+            (displaced, Outcome.UNDETERMINED, f"a pose displaced by {DISPLACEMENT:.0%} of the distance to the scene"),
+            (self.other, Outcome.AMBIGUOUS, "another pose"),
+        )  # fmt: skip
         for bound in SUPPORT_BOUNDS:
             value, limit = getattr(self, bound.measure), self.limits.get(bound.measure, bound.limit)
             if value is None or bound.keeps(value, limit):
                 continue
             if bound.measure != "confidence":
                 return Verdict(bound.outcome, bound.reason.format(value, limit))
-            rival = min(rivals, key=lambda name: rivals[name][0])
-            return Verdict(rivals[rival][1], bound.reason.format(value, limit, rival), value)
+            _, outcome, rival = min(rivals, key=lambda rival: rival[0])
+            return Verdict(outcome, bound.reason.format(value, limit, rival), value)
         return Verdict(Outcome.CONVERGED, accepted, self.confidence)
 
 

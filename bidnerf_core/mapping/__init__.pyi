@@ -57,7 +57,6 @@ from .resection.descend import log_det as log_det
 from .resection.descend import log_evidence as log_evidence
 from .resection.descend import prior as prior
 from .resection.descend import total as total
-from .resection.descend import unit_of as unit_of
 from .resection.reprojection import LEAST_NOISE as LEAST_NOISE
 from .resection.reprojection import MAD as MAD
 from .resection.reprojection import Landmarks as Landmarks

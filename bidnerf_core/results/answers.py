@@ -22,7 +22,7 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, symbol
 from bidnerf_core.io import write_file
 from bidnerf_core.localization import (
-    BOUNDS,
+    LANDMARK_BOUNDS,
     Evidence,
     Localization,
     Localizer,
@@ -365,7 +365,9 @@ def _shows_scene(found: Localization) -> bool:
     """
     evidence = found.diagnostics
     if found.outcome is Outcome.AMBIGUOUS and isinstance(evidence, Evidence):
-        return all(evidence.above_chance >= each.limit for each in BOUNDS if each.measure == "above_chance")
+        return all(
+            evidence.above_chance >= each.limit for each in LANDMARK_BOUNDS if each.measure == "above_chance"
+        )
     return found.outcome in RECOGNISED
 
 

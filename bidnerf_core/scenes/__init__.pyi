@@ -15,5 +15,4 @@ from .primitives import Sphere as Sphere
 from .textures import Texture as Texture
 from .textures import blotches as blotches
 from .trajectories import look_around as look_around
-from .trajectories import look_at as look_at
 from .trajectories import orbit as orbit

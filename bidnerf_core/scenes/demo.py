@@ -16,7 +16,7 @@ from bidnerf_core.scenes.closed_form import ClosedFormScene, Hits, views
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.scenes.primitives import Box, Cylinder, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import Colour, Faces, Texture, blotches, checker, stripes
-from bidnerf_core.scenes.trajectories import look_around, look_at, orbit
+from bidnerf_core.scenes.trajectories import look_around, orbit
 
 __all__ = [
     "ClosedFormScene",
@@ -26,7 +26,6 @@ __all__ = [
     "demo_object",
     "demo_room",
     "look_around",
-    "look_at",
     "orbit",
     "views",
 ]

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from bidnerf_core.fields import SceneBounds
-from bidnerf_core.geometry import SE3
-from bidnerf_core.geometry import look_at as look_at
+from bidnerf_core.geometry import SE3, look_at
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 """Angle (rad) whose successive multiples fill a circle evenly, however many there are."""

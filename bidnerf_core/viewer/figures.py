@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from bidnerf_core.localization import (
     ACCEPTED,
-    BOUNDS,
+    LANDMARK_BOUNDS,
     SUPPORT_BOUNDS,
     Evidence,
     Localization,
@@ -112,7 +112,7 @@ def acceptance_figures(found: Localization, record: SearchRecord | None) -> tupl
 
 
 def _of_landmarks(evidence: Evidence) -> Iterator[Figure]:
-    bounds = {bound.measure: bound for bound in BOUNDS}
+    bounds = {bound.measure: bound for bound in LANDMARK_BOUNDS}
     for measure, text in MEASURES.items():
         value, bound = getattr(evidence, measure), bounds.get(measure)
         if value is None or (measure == "log10_nfa" and not evidence.searched):

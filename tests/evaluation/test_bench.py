@@ -36,11 +36,11 @@ from bidnerf_core.evaluation.arcs import arc, mean_up, seen_middle
 from bidnerf_core.evaluation.bench import shard_of
 from bidnerf_core.evaluation.json_lines import as_line
 from bidnerf_core.evaluation.workers import InThisProcess
-from bidnerf_core.geometry import turned_about
+from bidnerf_core.geometry import look_at, turned_about
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import METHODS
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import closed_form_data, closed_form_map, look_at, orbit
+from bidnerf_core.scenes import closed_form_data, closed_form_map, orbit
 from bidnerf_core.settings import to_flat
 from refusals import refused
 

@@ -22,8 +22,8 @@ from bidnerf_core.evaluation import (
     rolling_shutter,
 )
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import demo_object, demo_room, look_at, orbit
+from bidnerf_core.geometry import SE3, look_at
+from bidnerf_core.scenes import demo_object, demo_room, orbit
 from bidnerf_core.scenes import views as seen_from
 from refusals import refused
 

@@ -14,7 +14,7 @@ import pytest
 
 from bidnerf_core.localization import (
     ACCEPTED,
-    BOUNDS,
+    LANDMARK_BOUNDS,
     AutoConfig,
     Bound,
     Evidence,
@@ -57,7 +57,7 @@ def test_what_keeps_all_bounds_is_accepted() -> None:
     assert found.reason == "200 landmark inliers"
 
 
-@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.measure)
+@pytest.mark.parametrize("bound", LANDMARK_BOUNDS, ids=lambda bound: bound.measure)
 def test_each_bound_alone_rejects_with_its_outcome_and_reason(bound: Bound) -> None:
     step = 1 if bound.measure == "inliers" else 1e-3 * abs(bound.limit)
     within, out = judge(beyond(bound, -step)), judge(beyond(bound, step))
@@ -68,7 +68,7 @@ def test_each_bound_alone_rejects_with_its_outcome_and_reason(bound: Bound) -> N
     assert out.reason.endswith(last)
 
 
-@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.measure)
+@pytest.mark.parametrize("bound", LANDMARK_BOUNDS, ids=lambda bound: bound.measure)
 def test_what_is_not_a_number_is_not_accepted(bound: Bound) -> None:
     if bound.measure != "inliers":
         name = "by_chance" if bound.measure == "above_chance" else bound.measure
@@ -76,7 +76,7 @@ def test_what_is_not_a_number_is_not_accepted(bound: Bound) -> None:
 
 
 def test_of_several_reasons_the_most_serious_is_stated() -> None:
-    for one, other in pairwise(BOUNDS):
+    for one, other in pairwise(LANDMARK_BOUNDS):
         both = {
             field.name: getattr(part, field.name)
             for part in (beyond(other, 1e-3), beyond(one, 1 if one.measure == "inliers" else 1e-3))

@@ -17,7 +17,7 @@ from torch import Generator, Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.localization import (
     NO_RIVAL,
     AutoConfig,
@@ -32,7 +32,6 @@ from bidnerf_core.localization import (
 # Inside: the odds themselves, far from the values at which they decide
 from bidnerf_core.localization.support import log_odds, same_pose, support
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
-from bidnerf_core.scenes import look_at
 from problems import FieldMap, localize
 
 CAMERA = Intrinsics(70.0, 70.0, 40.0, 30.0, 80, 60)

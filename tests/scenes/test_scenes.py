@@ -12,8 +12,8 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
-from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import ClosedFormScene, demo_object, demo_room, look_around, look_at, orbit, views
+from bidnerf_core.geometry import SE3, look_at
+from bidnerf_core.scenes import ClosedFormScene, demo_object, demo_room, look_around, orbit, views
 
 CAMERA = Intrinsics(70.0, 75.0, 31.0, 24.5, 64, 48)
 SCENES = [demo_object(), demo_room()]

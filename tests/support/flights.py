@@ -9,9 +9,9 @@ from dataclasses import replace
 import torch
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
+from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import look_at
 from bidnerf_core.testing import textured_map, view
 from localizations import without_depth as without_depth
 

@@ -20,7 +20,7 @@ from bidnerf_core.errors import Cancelled
 from bidnerf_core.fields import render_image
 from bidnerf_core.localization import (
     ADVICE,
-    BOUNDS,
+    LANDMARK_BOUNDS,
     METHODS,
     Bound,
     Evidence,
@@ -137,10 +137,10 @@ def test_every_part_of_the_evidence_is_a_figure() -> None:
     """The number of matches by chance and the way in which a pose was found are in others."""
     parts = {part.name for part in fields(Evidence)} - {"by_chance", "searched"} | {"above_chance"}
     assert set(MEASURES) == parts
-    assert {bound.measure for bound in BOUNDS} <= parts
+    assert {bound.measure for bound in LANDMARK_BOUNDS} <= parts
 
 
-@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.measure)
+@pytest.mark.parametrize("bound", LANDMARK_BOUNDS, ids=lambda bound: bound.measure)
 def test_each_bound_that_is_not_kept_is_the_first_figure(answer: Localization, bound: Bound) -> None:
     evidence = answer.diagnostics
     assert isinstance(evidence, Evidence)

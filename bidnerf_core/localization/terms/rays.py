@@ -9,15 +9,15 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, normalize
+from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
-from bidnerf_core.camera import exposure_times
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations, RadianceField, Rendering, SceneBounds, device_of, render
 from bidnerf_core.frames import Frame, View, continued
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
 from bidnerf_core.localization.terms.rendering import Derivatives, differentiate
+from bidnerf_core.localization.terms.surface import sights_of
 from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
 RAYS = 1024
@@ -82,15 +82,13 @@ class Rays:
                 number = number[~frame.hidden.cpu().flatten()[number]]
             number = number[: -(-count // len(views))]
             column, row = number % camera.width, number // camera.width
-            pixels = torch.stack([column, row], -1).double() + 0.5
-            times = exposure_times(pixels, camera) if len(views) == 1 else torch.zeros(len(pixels)).double()
-            flat, T, n = camera.unproject(pixels), view.T_ref_camera.to("cpu", torch.float64), len(pixels)
-            depth = torch.zeros(n) if frame.depth is None else frame.depth.cpu()[row, column]
-            depth = torch.where(depth.isfinite(), depth.clamp(min=0), 0).double() * flat.norm(dim=-1)
+            sights = sights_of(view, row, column, len(views) == 1)
+            depth = torch.zeros(len(row)) if frame.depth is None else frame.depth.cpu()[row, column]
+            length = pad(sights[0], (0, 1), value=1.0).norm(dim=-1)
+            depth = torch.where(depth.isfinite(), depth.clamp(min=0), 0).double() * length
             rgb = frame.colours_at(row, column).cpu() if blur == 1 else averaged(frame, blur)[row, column]
-            R, t = T.rotation.expand(n, 3, 3), T.translation.expand(n, 3)
-            coloured = torch.full((n,), float(frame.has_colour)).double()
-            parts.append((flat[:, :2], times, R, t, rgb.double(), coloured, depth))
+            coloured = torch.full((len(row),), float(frame.has_colour)).double()
+            parts.append((*sights, rgb.double(), coloured, depth))
         if depth_rays is not None:
             # Such a ray is the central pixel of a camera of its own.
             some = depth_rays.drawn(count, generator, torch.float64, "cpu")

@@ -47,6 +47,19 @@ Blur also lowers contrast, but restoring that contrast only enlarges the differe
 """
 
 
+def sights_of(
+    view: View, row: Tensor, column: Tensor, may_move: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the parts of ``Sights`` of some pixels of a view, in which rotation and translation are T_rig_camera.
+
+    ``may_move`` is whether the camera may have moved during the readout: views of a rig may be from different times.
+    """
+    pixels, camera = torch.stack([column, row], -1).double() + 0.5, view.frame.intrinsics
+    times = exposure_times(pixels, camera) if may_move else torch.zeros_like(pixels[:, 0])
+    T, n = view.T_ref_camera.to("cpu", torch.float64), len(pixels)
+    return camera.unproject(pixels)[:, :2], times, T.rotation.expand(n, 3, 3), T.translation.expand(n, 3)
+
+
 @dataclass(frozen=True, eq=False)
 class Surface:
     """Distances of measured points from the planes of the nearest surfels, metres, and differences from their colours.
@@ -83,32 +96,17 @@ class Surface:
             else:
                 drawn = torch.randperm(len(row), generator=generator)[:most]
             row, column = row[drawn], column[drawn]
-            pixels = torch.stack([column, row], -1).double() + 0.5
-            camera, z, n = frame.intrinsics, depth[row, column].double(), len(row)
-            times = exposure_times(pixels, camera) if len(views) == 1 else torch.zeros_like(z)
-            T = view.T_ref_camera.to("cpu", torch.float64)
-            R, t = T.rotation.expand(n, 3, 3), T.translation.expand(n, 3)
+            sights = sights_of(view, row, column, len(views) == 1)
+            z, n = depth[row, column].double(), len(row)
             rgb = frame.colours_at(row, column).cpu().float()
             coloured = torch.full((n,), float(frame.has_colour))
-            flat = camera.unproject(pixels)[:, :2]
-            parts.append((flat, times, R, t, z, torch.zeros((n, 3)).double(), rgb, coloured))
+            parts.append((*sights, z, torch.zeros((n, 3)).double(), rgb, coloured))
         if rays is not None and len(rays):
             some = rays.drawn(count, generator, torch.float64, "cpu")
-            zero, n = torch.zeros_like(some.origins), len(some)
-            eye = torch.eye(3, dtype=torch.float64).expand(n, 3, 3)
-            points = some.points - some.origins
-            parts.append(
-                (
-                    zero[:, :2],
-                    zero[:, 0],
-                    eye,
-                    some.origins,
-                    zero[:, 0],
-                    points,
-                    zero.float(),
-                    zero[:, 0].float(),
-                )
-            )
+            zero, none = torch.zeros_like(some.origins), torch.zeros_like(some.distance)
+            eye = torch.eye(3, dtype=torch.float64).expand(len(some), 3, 3)
+            points, sights = some.points - some.origins, (zero[:, :2], none, eye, some.origins)
+            parts.append((*sights, none, points, zero.float(), none.float()))
         total = sum(len(part[0]) for part in parts)
         if total < LEAST_POINTS:
             return None

@@ -100,7 +100,7 @@ class Quadratic:
     @staticmethod
     def of(found: Normal, here: States) -> Quadratic:
         """Convert equations without priors at ``here`` (g), where no nuisance is fixed."""
-        unit = unit_of(here)
+        unit = here.unit
         return Quadratic(
             here, found.cost, found.gradient * unit, unit[:, :, None] * found.hessian * unit[:, None]
         )
@@ -109,7 +109,7 @@ class Quadratic:
         g = states.mode
         update = (self.here.T[g].inverse() @ states.T).log()
         off = torch.cat([update, states.nuisances - self.here.nuisances[g]], -1)
-        scale = 1 / unit_of(states)
+        scale = 1 / states.unit
         pull = self.gradient[g] + (self.hessian[g] @ off[..., None])[..., 0]
         cost = self.cost[g] + 0.5 * ((pull + self.gradient[g]) * off).sum(-1)
         return Normal(cost, pull * scale, scale[:, :, None] * self.hessian[g] * scale[:, None])
@@ -126,11 +126,6 @@ class Quadratic:
             normal = total(states, [self])
             states = states.retract(-damped_solution(normal, torch.zeros_like(normal.cost)))
         return states, total(states, [self])
-
-
-def unit_of(states: States) -> Float[Tensor, "h P"]:
-    """Return the factors from derivatives by whitened unknowns to derivatives by the unknowns themselves."""
-    return torch.cat([torch.ones_like(states.z[:, :6]), 1 / states.deviation.clamp(min=1e-9)], -1)
 
 
 def _about(pivot: Float[Tensor, "3"]) -> Float[Tensor, "P P"]:

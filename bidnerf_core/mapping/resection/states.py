@@ -61,6 +61,11 @@ class States:
     def nuisances(self) -> Float[Tensor, "h N"]:
         return self.mean + self.deviation * self.z
 
+    @property
+    def unit(self) -> Float[Tensor, "h P"]:
+        """The factors from derivatives by whitened unknowns to derivatives by the unknowns themselves."""
+        return torch.cat([torch.ones_like(self.z[:, :6]), 1 / self.deviation.clamp(min=1e-9)], -1)
+
     def retract(self, step: Float[Tensor, "h P"]) -> States:
         return replace(self, T=self.T.retract(step[:, :6]).polished(), z=self.z + step[:, 6:])
 
