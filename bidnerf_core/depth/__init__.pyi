@@ -9,7 +9,6 @@ from .noise import noise_remark as noise_remark
 from .registration import DepthCamera as DepthCamera
 from .registration import nearest_depth as nearest_depth
 from .sensors import DEPTH_SENSORS as DEPTH_SENSORS
-from .sensors import EXACT as EXACT
 from .sensors import UNKNOWN as UNKNOWN
 from .sensors import UNKNOWN_SENSOR as UNKNOWN_SENSOR
 from .sensors import DepthNoise as DepthNoise

@@ -91,9 +91,6 @@ Reports 11, 2021, found an accuracy of 1 cm on objects with sides of more than 1
 2 m, as the noise. The scale is that of an unknown sensor.
 """
 
-EXACT = DepthSensorModel(scale=0.0, noise=DepthNoise())
-"""A sensor without errors, which leaves out the systematic part of a covariance."""
-
 RENDERED = DepthSensorModel(scale=0.0, noise=DepthNoise(linear=0.001))
 """Depth computed from a model of the scene: exact up to rounding, such as to the whole millimetres of a PNG
 from 1 m on."""

@@ -18,7 +18,6 @@ from .photos import photos_in as photos_in
 from .photos import pinhole_of as pinhole_of
 from .pixels import DRAWERS as DRAWERS
 from .pixels import DrawerName as DrawerName
-from .pixels import PixelDrawer as PixelDrawer
 from .pixels import all_pixels as all_pixels
 from .pixels import continued as continued
 from .pixels import draw as draw

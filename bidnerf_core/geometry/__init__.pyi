@@ -9,9 +9,7 @@ from .robust import chi_squared_quantile as chi_squared_quantile
 from .robust import independent as independent
 from .robust import inlier_weight as inlier_weight
 from .robust import mad_deviation as mad_deviation
-from .rotations import cross_matrix as cross_matrix
 from .rotations import retracted as retracted
-from .rotations import rotation_matrix as rotation_matrix
 from .rotations import update_between as update_between
 from .se3 import SE3 as SE3
 from .se3 import pose_from_matrix as pose_from_matrix

@@ -82,15 +82,11 @@ from .surface.baking import bake as bake
 from .surface.baking import colour_noise as colour_noise
 from .surface.baking import rendered_views as rendered_views
 from .surface.baking import surface_of_points as surface_of_points
-from .surface.casting import Cast as Cast
 from .surface.casting import cast as cast
 from .surface.casting import trace as trace
 from .surface.surface_map import SurfaceMap as SurfaceMap
 from .surface.surface_map import Surfels as Surfels
 from .surface.surfel_index import SurfelIndex as SurfelIndex
-from .tensors import Kinds as Kinds
-from .tensors import check_kinds as check_kinds
-from .tensors import check_range as check_range
 from .tensors import landmark_tensors as landmark_tensors
 from .tensors import landmarks_from_tensors as landmarks_from_tensors
 from .tensors import surface_from_tensors as surface_from_tensors

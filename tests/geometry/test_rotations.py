@@ -9,10 +9,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.geometry import SE3, cross_matrix, rotation_matrix
+from bidnerf_core.geometry import SE3
 
 # Inside: the rotation vector and its Jacobian are compared with SciPy's
-from bidnerf_core.geometry.rotations import left_jacobian, rotation_vector
+from bidnerf_core.geometry.rotations import cross_matrix, left_jacobian, rotation_matrix, rotation_vector
 
 ANGLES = [0.0, 1e-9, 9e-5, 1.1e-4, 1e-2, 1.0, 2.49, 2.51, 3.1, math.pi - 1e-7]
 
