@@ -150,7 +150,8 @@ def explanations(
 
     Images of different cameras are only compared with their stated intrinsics.
     """
-    rows = []
+    # Of each: its name, the mean corrections of the camera and their deviations, its probability, and whether it is credible.
+    rows = list[tuple[str, list[float], tuple[float, ...], float, bool]]()
     if query.has_one_camera:
         known = cameras_of_map(query, landmarks)
         nearly = torch.tensor(NEARLY, dtype=torch.float64)
@@ -165,27 +166,25 @@ def explanations(
                 similar = bool((c.abs() <= torch.tensor(SIMILAR)).all())
                 odds = ODDS_OF_MAP if similar else ODDS_OF_OTHER
                 for name, focal, centre, k1, aspect, skew, share in OF_MAP:
-                    rows.append(
-                        (name, c.tolist(), (focal, centre, centre, k1, aspect, skew), share * odds, True)
-                    )
+                    deviations = (focal, centre, centre, k1, aspect, skew)
+                    rows.append((name, c.tolist(), deviations, share * odds, True))
     else:
         rows.append(("exact", [0.0] * 6, (0.0,) * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
     share_moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving) if single else 0.0
-    names, means, deviations, shares, right = list[str](), [], [], [], list[bool]()
-    for moves, share in ((False, 1 - share_moving), (True, share_moving))[: 2 if single else 1]:
-        motion = [MOVE * distance] * 3 + [TURN] * 3 if moves else [0.0] * 6
-        for name, corrections, freedoms, odds, counts in rows:
-            names.append(name + (MOVING if moves else ""))
-            means.append([*corrections, *[0.0] * 7])
-            deviations.append([*freedoms, *motion, depth_scale])
-            shares.append(odds * share)
-            right.append(counts)
-    mean, deviation, prior = (torch.tensor(x, dtype=torch.float64) for x in (means, deviations, shares))
+    still, motion = [0.0] * 6, [MOVE * distance] * 3 + [TURN] * 3
+    kinds = (("", still, 1 - share_moving), (MOVING, motion, share_moving))[: 2 if single else 1]
+    every = [(row, kind) for kind in kinds for row in rows]
+    names = tuple(name + ending for (name, *_), (ending, *_) in every)
+    mean = torch.tensor([[*row[1], *[0.0] * 7] for row, _ in every], dtype=torch.float64)
+    freedoms = [[*row[2], *kind[1], depth_scale] for row, kind in every]
+    deviation = torch.tensor(freedoms, dtype=torch.float64)
+    prior = torch.tensor([row[3] * kind[2] for row, kind in every], dtype=torch.float64)
+    right = torch.tensor([row[4] for row, _ in every])
     # Landmarks of this map suggest corrections of right intrinsics, too; see ``calibration_scatter``.
     if query.has_one_camera:
         deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
-    return Explanations(tuple(names), mean, deviation, prior.log(), torch.tensor(right))
+    return Explanations(names, mean, deviation, prior.log(), right)
 
 
 def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:

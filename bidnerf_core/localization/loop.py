@@ -167,10 +167,10 @@ class Loop:
         answer: Answer | None = None
         for seed, nearest, nfa in self._proposals():
             found = self.answer(seed, nearest, nfa)
-            if found is not None and (answer is None or _is_better(found, answer)):
+            if found is not None and found.verdict.accepted:
+                return found
+            if found is not None and (answer is None or found.evidence.log10_nfa < answer.evidence.log10_nfa):
                 answer = found
-            if answer is not None and answer.verdict.accepted:
-                break
         return answer
 
     @torch.no_grad()
@@ -464,8 +464,3 @@ class Loop:
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
         return Answer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)
-
-
-def _is_better(one: Answer, other: Answer) -> bool:
-    """Return whether an answer should replace another one."""
-    return one.verdict.accepted or (one.evidence.log10_nfa < other.evidence.log10_nfa)
