@@ -64,7 +64,7 @@ class Bound(NamedTuple):
 
 
 LANDMARK_BOUNDS = (
-    Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "10^{0:.0f} poses as good are expected by chance"),
+    Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "{0:.0e} poses as good are expected by chance"),
     Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers"),
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
@@ -85,7 +85,8 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     for bound in LANDMARK_BOUNDS if evidence.searched else LANDMARK_BOUNDS[1:]:
         value = getattr(evidence, bound.measure)
         if not bound.keeps(value):
-            return Verdict(bound.outcome, bound.reason.format(value), confidence)
+            shown = 10.0 ** min(max(value, -300), 300) if bound.measure == "log10_nfa" else value
+            return Verdict(bound.outcome, bound.reason.format(shown), confidence)
     share = f"{evidence.inliers} landmark inliers"
     if confidence < ACCEPTED:
         why = f"{share}, but only {math.floor(100 * confidence)}% likely to be right"
