@@ -90,10 +90,10 @@ class LandmarkMap:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def __getitem__(self, index: Tensor) -> LandmarkMap:
+    def __getitem__(self, index: Tensor | slice) -> LandmarkMap:
         tracks = self.tracks
         if tracks is not None:
-            chosen = torch.arange(len(self))[index.cpu()]
+            chosen = torch.arange(len(self))[index if isinstance(index, slice) else index.cpu()]
             numbers = torch.full((len(self),), -1)
             numbers[chosen] = torch.arange(len(chosen))
             tracks = tracks.renumbered(numbers.to(tracks.landmark.device))
