@@ -80,14 +80,11 @@ def check_cancelled(stage: str = "localization", cancel: Cancel | None = None) -
         raise Cancelled(f"cancelled during stage {stage!r}")
 
 
-def counter(
-    stage: str, unit: str, progress: ProgressCallback | None = None, cancel: Cancel | None = None
-) -> Callable[[int, int], None]:
+def counter(stage: str, unit: str) -> Callable[[int, int], None]:
     """Return a function of (done, total) that reports progress to the current job and raises ``Cancelled`` if it should stop."""
 
     def count(done: int, total: int) -> None:
-        with job_context(progress, cancel):
-            report_progress(Progress(stage, done, total, unit))
+        report_progress(Progress(stage, done, total, unit))
 
     return count
 

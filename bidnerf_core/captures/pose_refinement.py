@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -48,7 +47,6 @@ class AdjustedPoses:
 def adjusted_poses(
     tracked: TrackedViews,
     config: LandmarkConfig,
-    progress: Callable[[int, int], None] = lambda done, total: None,
     least: float = 0.0,
 ) -> AdjustedPoses | None:
     """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of
@@ -85,7 +83,7 @@ def adjusted_poses(
             found = _found(tracked, pixels, before, config)
             if found.consistency.inconsistency < least:
                 return found
-        tracked = tracked.matched_anew(config, progress)
+        tracked = tracked.matched_anew(config)
         if float(step.max()) <= SETTLED_PIXELS and not noticed:
             break
         seen, points = tracked.triangulated(config)

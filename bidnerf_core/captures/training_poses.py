@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -38,7 +38,6 @@ def training_poses(
     views: Sequence[View],
     least: float = INCONSISTENT,
     config: LandmarkConfig | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TrainingPoses:
     """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
 
@@ -53,11 +52,11 @@ def training_poses(
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         for number, found in wrong.items():
             updates[number] = found.update
-        tracked = tracked.at(given.retract(updates)).matched_anew(config, progress)
-    fit = adjusted_poses(tracked, config, progress, least)
+        tracked = tracked.at(given.retract(updates)).matched_anew(config)
+    fit = adjusted_poses(tracked, config, least)
     answer = _chosen(tracked, fit, list(wrong), least)
     if wrong and fit is not None and not answer.refined:
-        answer = replace(answer, tracked=answer.tracked.matched_anew(config, progress))
+        answer = replace(answer, tracked=answer.tracked.matched_anew(config))
     for number, found in wrong.items():
         answer.pixels[number] = found.pixels
     return answer

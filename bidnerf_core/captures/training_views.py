@@ -33,7 +33,6 @@ from bidnerf_core.mapping import (
     posed_keypoints,
     tracked_views,
 )
-from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
@@ -82,8 +81,7 @@ def prepared(
         )
     tracked = _tracked(views, features, trust_poses, depth_unit)
     least = 0.0 if refinement == "always" else INCONSISTENT
-    report = counter("poses", "image pairs")
-    found = training_poses(tracked, views, least, progress=report)
+    found = training_poses(tracked, views, least)
     poses, motion = found.tracked.T_world_camera, found.tracked.motion
     moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
     if bool(motion.any()):
@@ -141,7 +139,7 @@ def _tracked(
 
     The unit is checked last: under wrong poses, triangulated distances say nothing about it.
     """
-    tracked = tracked_views(views, features, progress=counter("landmarks", "steps"))
+    tracked = tracked_views(views, features)
     if not trust_poses:
         _check_poses(tracked.observations.images)
     check_depth_unit(tracked, depth_unit)

@@ -57,13 +57,12 @@ def build_tried_landmarks(
     views: Sequence[View],
     features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
-    progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
     """Build landmarks like ``mapping.landmarks.building.build_landmarks``, and validate them: see
     ``tried_landmarks``.
     """
-    return tried_landmarks(tracked_views(views, features, config, progress), views, config, report)
+    return tried_landmarks(tracked_views(views, features, config), views, config, report)
 
 
 def tried_landmarks(

@@ -34,7 +34,6 @@ from bidnerf_core.mapping import (
     update_scatter,
 )
 from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of
-from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
@@ -66,7 +65,7 @@ def bake_surface(
         cameras = []
     else:
         measured = []  # a few points do not make a surface
-    surface = bake(field, info.bounds, cameras, measured, config, counter("baking", "views"))
+    surface = bake(field, info.bounds, cameras, measured, config)
     source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
     log.info(
         f"{where}: surface of {len(surface.surfels)} surfels from {source} views, {time.monotonic() - began:.1f} s"
@@ -95,9 +94,9 @@ def bake_landmarks(
     source: LandmarkSource = "photos" if views else "rendered images"
     # Only photos show how well the field renders; it has no error against its own images.
     noise = colour_noise(field, info.bounds, views) if views else info.colour_noise
-    images = views or rendered_views(field, info.bounds, cameras_of(info), counter("rendering", "views"))
+    images = views or rendered_views(field, info.bounds, cameras_of(info))
     if tracked is None:
-        tracked = tracked_views(images, info.landmark_features, progress=counter("landmarks", "steps"))
+        tracked = tracked_views(images, info.landmark_features)
     if views and not info.distances:
         tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
     trial, landmarks = HeldOutTrial(), None

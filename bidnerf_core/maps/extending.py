@@ -244,7 +244,6 @@ def _extended(
     tracked = tracked_views(
         everything if complete else new,
         scene.info.landmark_features,
-        progress=counter("landmarks", "steps"),
     )
     seeing = _with_distances(everything if complete else new, tracked)
     new = seeing[len(old) :] if complete else seeing
@@ -350,7 +349,7 @@ def _surface(scene: Map, views: Sequence[View], config: BakeConfig) -> SurfaceMa
     names = {view.frame.name for view in measured}
     others = [(c.intrinsics, c.pose) for c in scene.info.cameras if c.name not in names]
     try:
-        return bake(scene.field, scene.bounds, others, measured, config, counter("baking", "views"))
+        return bake(scene.field, scene.bounds, others, measured, config)
     except InputError as error:
         log.info(f"the surface is unchanged: {error}")
         return None

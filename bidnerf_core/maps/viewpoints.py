@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import StoredCamera
+from bidnerf_core.captures import MatrixRows, StoredCamera, horizontal_axes
 from bidnerf_core.fields import RadianceField, Rays, SceneBounds, device_of, render
 from bidnerf_core.geometry import SE3, look_at
 
@@ -34,20 +33,12 @@ ROOMY = 0.2
 object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Tried:
-    """Places in a field and what rays from them hit."""
-
-    places: Float[Tensor, "p 3"]
-    share: Float[Tensor, "p"]  # of rays that hit matter
-    nearest: Float[Tensor, "p"]  # metres: exceeded by nine out of ten rays
-    distance: Float[Tensor, "p d"]  # metres; 0 where a ray hits nothing
-
-
 def viewpoints(
-    field: RadianceField, bounds: SceneBounds, up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    field: RadianceField,
+    bounds: SceneBounds,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     is_solid: bool = False,
-) -> tuple[StoredCamera, ...]:  # fmt: skip
+) -> tuple[StoredCamera, ...]:
     """Return cameras that see the matter of a field: from all around an object, or from free places within a
     room.
 
@@ -56,49 +47,50 @@ def viewpoints(
     """
     generator = torch.Generator().manual_seed(0)
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
-    tried = _try(field, bounds, lower + size * torch.rand((PLACES, 3), generator=generator))
-    free = (tried.nearest > CLEARANCE * bounds.side) & (tried.share > ENCLOSED)
-    is_room = not is_solid and float(free.float().mean()) > ROOMY
-    poses = _within(tried, free, up) if is_room else _around(bounds, up)
+    places = lower + size * torch.rand((PLACES, 3), generator=generator)
+    distance = _distances(field, bounds, places)
+    hit = distance > 0
+    nearest = torch.where(hit, distance, torch.inf).quantile(0.1, dim=1)  # exceeded by nine out of ten rays
+    free = (nearest > CLEARANCE * bounds.side) & (hit.float().mean(1) > ENCLOSED)
+    if not is_solid and float(free.float().mean()) > ROOMY:
+        poses = _within(places[free], distance[free], up)
+    else:  # from all around the box, at a distance from which it fills the images
+        centre = torch.tensor(bounds.centre, dtype=torch.float64)
+        radius = math.dist(bounds.lower, bounds.upper) / 2 / math.sin(math.radians(FIELD_OF_VIEW / 2)) * 0.8
+        poses = [look_at(centre + radius * direction, centre, up) for direction in sphere(VIEWS)]
     focal = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     camera = Intrinsics(focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
-    return tuple(
-        StoredCamera(f"viewpoint-{number:03d}", camera, _rows(pose)) for number, pose in enumerate(poses)
-    )
-
-
-def _rows(pose: SE3) -> tuple[tuple[float, float, float, float], ...]:
-    return tuple((r[0], r[1], r[2], r[3]) for r in pose.matrix().tolist())
+    rows: list[MatrixRows] = [(*((a, b, c, d) for a, b, c, d in pose.matrix().tolist()),) for pose in poses]
+    return tuple(StoredCamera(f"viewpoint-{n:03d}", camera, row) for n, row in enumerate(rows))
 
 
 @torch.no_grad()
-def _try(field: RadianceField, bounds: SceneBounds, places: Float[Tensor, "p 3"]) -> _Tried:
-    directions = sphere(DIRECTIONS).float()
+def _distances(
+    field: RadianceField, bounds: SceneBounds, places: Float[Tensor, "p 3"]
+) -> Float[Tensor, "p d"]:
+    """Return the distances of what rays from the places hit in the directions of a sphere; 0 where they hit nothing."""
     device = device_of(field)
     origins = places[:, None].expand(-1, DIRECTIONS, 3).reshape(-1, 3).to(device)
-    towards = directions.expand(len(places), -1, -1).reshape(-1, 3).to(device)
+    towards = sphere(DIRECTIONS).float().expand(len(places), -1, -1).reshape(-1, 3).to(device)
     near = torch.full_like(origins[:, 0], bounds.near)
     seen = render(field, Rays(origins, towards, near, torch.full_like(near, bounds.far)), bounds.background)
-    solid = seen.opacity > SOLID
-    distance = (
-        torch.where(solid, seen.distance / seen.opacity.clamp(min=SOLID), 0).cpu().reshape(len(places), -1)
-    )
-    met = torch.where(distance > 0, distance, torch.inf)
-    return _Tried(places, (distance > 0).float().mean(1), met.quantile(0.1, dim=1), distance)
+    found = torch.where(seen.opacity > SOLID, seen.distance / seen.opacity.clamp(min=SOLID), 0)
+    return found.cpu().reshape(len(places), -1)
 
 
-def _within(tried: _Tried, free: Tensor, up: tuple[float, float, float]) -> list[SE3]:
+def _within(
+    places: Float[Tensor, "p 3"], distance: Float[Tensor, "p d"], up: tuple[float, float, float]
+) -> list[SE3]:
     """Return views from free places far from each other, each in the directions in which there is most to see."""
-    places, distance = tried.places[free], tried.distance[free]
-    directions = sphere(DIRECTIONS)
-    level = (
-        directions @ torch.tensor(up, dtype=torch.float64)
-    ).abs() < 0.75  # neither the ceiling nor the floor
-    chosen = _spread(places, VIEWS // 4)
+    directions, vertical = sphere(DIRECTIONS), torch.tensor(up, dtype=torch.float64)
+    level = (directions @ vertical).abs() < 0.75  # neither the ceiling nor the floor
+    second, first = horizontal_axes(vertical)
+    a, b = directions @ first, -directions @ second
+    sectors = a > b.abs(), b >= a.abs(), -a > b.abs(), -b >= a.abs()
     poses = []
-    for number in chosen:
+    for number in _spread(places, VIEWS // 4):
         # In each of four sectors about the vertical, the direction with the farthest matter: it shows most.
-        for sector in _sectors(directions, up):
+        for sector in sectors:
             allowed = sector & level & (distance[number] > 0)
             if bool(allowed.any()):
                 ray = int(torch.where(allowed, distance[number], -1).argmax())
@@ -115,27 +107,6 @@ def _spread(places: Float[Tensor, "p 3"], count: int) -> list[int]:
         chosen.append(int(away.argmax()))
         away = torch.minimum(away, (places - places[chosen[-1]]).norm(dim=-1))
     return chosen
-
-
-def _sectors(directions: Float[Tensor, "d 3"], up: tuple[float, float, float]) -> list[Tensor]:
-    vertical = torch.tensor(up, dtype=torch.float64)
-    first = torch.linalg.cross(vertical, _not_along(vertical))
-    second = torch.linalg.cross(vertical, first)
-    a, b = directions @ first, directions @ second
-    return [(a > b.abs()), (b >= a.abs()), (-a > b.abs()), (-b >= a.abs())]
-
-
-def _not_along(vertical: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    unit = torch.zeros_like(vertical)
-    unit[int(vertical.abs().argmin())] = 1
-    return unit
-
-
-def _around(bounds: SceneBounds, up: tuple[float, float, float]) -> list[SE3]:
-    """Return views from all around the box, at a distance from which it fills them."""
-    centre = torch.tensor(bounds.centre, dtype=torch.float64)
-    radius = math.dist(bounds.lower, bounds.upper) / 2 / math.sin(math.radians(FIELD_OF_VIEW / 2)) * 0.8
-    return [look_at(centre + radius * direction, centre, up) for direction in sphere(VIEWS)]
 
 
 def sphere(count: int) -> Float[Tensor, "n 3"]:

@@ -187,7 +187,7 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         training_views,
         "tracked_views",
-        lambda given, features, progress: tracked_views(given, points, progress=progress),
+        lambda given, features: tracked_views(given, points),
     )
     found = training_views.prepared(views)
     moved = [view.motion is not None and bool(view.motion.any()) for view in found.views]

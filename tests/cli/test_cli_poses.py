@@ -132,7 +132,7 @@ def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch)
     """Prepare views of points for training, as the command does."""
     monkeypatch.setattr(
         "bidnerf_core.captures.training_views.tracked_views",
-        lambda given, features, progress: tracked_views(given, points, progress=progress),
+        lambda given, features: tracked_views(given, points),
     )
     prepared_for_training(views)
 

@@ -27,6 +27,7 @@ from bidnerf_core.mapping import (
 from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
 from bidnerf_core.mapping.landmarks.landmark_cells import MOST_IN_CELL, LandmarkCells
 from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks
+from bidnerf_core.progress import Progress, job_context
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 
@@ -127,10 +128,10 @@ def test_the_best_seen_are_kept_and_the_rest_is_reported() -> None:
 
 
 def test_progress_ends_at_its_total() -> None:
-    points = Points(count=50)
-    told: list[tuple[int, int]] = []
-    build_landmarks(ring(points, 4), points, progress=lambda done, total: told.append((done, total)))
-    assert [done for done, _ in told] == list(range(1, told[-1][1] + 1))
+    points, reports = Points(count=50), list[Progress]()
+    with job_context(reports.append):
+        build_landmarks(ring(points, 4), points)
+    assert [report.done for report in reports] == list(range(reports[-1].total + 1))
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

@@ -43,6 +43,7 @@ from bidnerf_core.mapping.landmarks.tracks import (
     seen_landmarks,
 )
 from bidnerf_core.mapping.resection.resection import resections
+from bidnerf_core.progress import counter
 from bidnerf_core.registry import PluginError
 from bidnerf_core.settings import Above, Range, Settings
 
@@ -130,15 +131,13 @@ def build_landmarks(
     views: Sequence[View],
     features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
-    progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
     """Build landmarks from ``views``, whose poses are T_world_camera, and from their measured depth where available.
 
-    ``progress`` is called with the number of images and image pairs done and the total, and ``report`` with a sentence if
-    landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
+    ``report`` is called with a sentence if landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
     """
-    return tracked_views(views, features, config, progress).landmarks(config, report)
+    return tracked_views(views, features, config).landmarks(config, report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,17 +214,12 @@ class TrackedViews:
         ]
         return replace(self, observations=replace(self.observations, images=images))
 
-    def matched_anew(
-        self, config: LandmarkConfig, progress: Callable[[int, int], None] = lambda done, total: None
-    ) -> TrackedViews:
-        """Return tracks of the same keypoints, matched again with the present poses.
-
-        ``progress`` is called with the number of image pairs done, starting at 0, and the total.
-        """
+    def matched_anew(self, config: LandmarkConfig) -> TrackedViews:
+        """Return tracks of the same keypoints, matched again with the present poses."""
         images = self.observations.images
         pairs = _pairs([image.T_ref_camera for image in images], config)
-        progress(0, len(pairs))
-        return replace(self, observations=_joined(images, pairs, _Counter(progress, len(pairs))))
+        steps = _Steps("poses", "image pairs", len(pairs))
+        return replace(self, observations=_joined(images, pairs, steps))
 
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of the given images."""
@@ -237,7 +231,6 @@ def tracked_views(
     views: Sequence[View],
     features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
-    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TrackedViews:
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
 
@@ -248,15 +241,15 @@ def tracked_views(
     if not views:
         raise InputError("nothing to build landmarks from:", expected="at least one view")
     pairs = _pairs([view.T_ref_camera for view in views], config)
-    counter = _Counter(progress, len(views) + len(pairs))
-    images = counter.over(_mapped(lambda view: image_keypoints(view, detector), views))
+    steps = _Steps("landmarks", "steps", len(views) + len(pairs))
+    images = steps.over(_mapped(lambda view: image_keypoints(view, detector), views))
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
         raise PluginError(
             f"descriptors have {enumeration([*map(str, lengths)])} channels in different images",
             expected="the same number",
         )
-    return TrackedViews(_joined(images, pairs, counter), features)
+    return TrackedViews(_joined(images, pairs, steps), features)
 
 
 def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
@@ -267,9 +260,9 @@ def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
     return pairs
 
 
-def _joined(images: Sequence[ImageKeypoints], pairs: list[list[int]], counter: _Counter) -> TrackedKeypoints:
+def _joined(images: Sequence[ImageKeypoints], pairs: list[list[int]], steps: _Steps) -> TrackedKeypoints:
     """Match the keypoints of the pairs of images, and join the matches into tracks."""
-    matches = counter.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
+    matches = steps.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
     found = [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)]
     label = joined_tracks(found, [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
@@ -344,16 +337,17 @@ def _mapped(work: Callable[[_Item], Result], items: Sequence[_Item]) -> Iterator
         yield from pool.map(work, items)
 
 
-class _Counter:
-    """A progress counter shared by several loops."""
+class _Steps:
+    """Steps of several loops, whose number is reported to the current job from 0 to the total."""
 
-    def __init__(self, progress: Callable[[int, int], None], total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
+    def __init__(self, stage: str, unit: str, total: int) -> None:
+        self._report, self._total, self._done = counter(stage, unit), total, 0
+        self._report(0, total)
 
     def over(self, results: Iterable[Result]) -> list[Result]:
         found = []
         for result in results:
             self._done += 1
-            self._progress(self._done, self._total)
+            self._report(self._done, self._total)
             found.append(result)
         return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -28,6 +28,7 @@ from bidnerf_core.mapping.surface.posed_depth import (
 )
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, fused_surfels, merged
 from bidnerf_core.mapping.surface.surfel_index import MOST_CELLS, SurfelIndex
+from bidnerf_core.progress import counter
 from bidnerf_core.settings import Above, Range, Settings
 
 Camera = tuple[Intrinsics, SE3]
@@ -43,15 +44,12 @@ NOISE_RAYS = 4096
 """Number of rays on which the colour noise is measured."""
 
 
-def rendered_views(
-    field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera],
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[View]:  # fmt: skip
+def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
     """Render images with depth of ``field`` from ``cameras``, for a map without photos."""
     chosen = cameras[:: max(1, math.ceil(len(cameras) / MOST))]
-    views = list[View]()
+    views, count = list[View](), counter("rendering", "views")
     for number, (intrinsics, T) in enumerate(chosen):
-        progress(number, len(chosen))
+        count(number, len(chosen))
         small = intrinsics.at_most(KEYFRAME_SIDE)
         image = render_image(field, small, T, bounds)
         views.append(View(Frame(f"{number:04d}", image.rgb, small, image.depth), T))
@@ -89,7 +87,6 @@ def bake(
     cameras: Sequence[tuple[Intrinsics, SE3]],
     views: Sequence[View] = (),
     config: BakeConfig = BakeConfig(),
-    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SurfaceMap:
     """Bake the surface on which measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree.
 
@@ -100,10 +97,13 @@ def bake(
     total = len(views) + len(cameras)
     if not total:
         raise InputError("no images to bake a surface from:", expected="at least one camera or view")
-    images = [measured_image(view, config.measured / total) for view in views]
+    images, count = (
+        [measured_image(view, config.measured / total) for view in views],
+        counter("baking", "views"),
+    )
     for number, (intrinsics, T) in enumerate(cameras, start=1):
         images.append(rendered_image(field, bounds, intrinsics, T, config.rays / total))
-        progress(len(views) + number, total)
+        count(len(views) + number, total)
     return surface_of(images, bounds, config)
 
 
