@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import Intrinsics, Orientation
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, multiplied
@@ -38,6 +38,7 @@ class StoredCamera:
     # of the camera from the first row to the last, if refinement estimated it
     motion: RowMotion | None = None
     file: str | None = None  # image file, relative to the folder of its dataset, if known
+    orientation: Orientation | None = None  # how the image in the file was turned upright; None: not at all
 
     @property
     def pose(self) -> SE3:

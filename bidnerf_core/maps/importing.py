@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from bidnerf_core.captures import stored_cameras
+from bidnerf_core.captures import StoredCamera, stored_cameras
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, InputWarning, amount
@@ -30,7 +30,7 @@ from bidnerf_core.maps.options import ImportOptions
 from bidnerf_core.maps.store import map_folder, write_parts
 from bidnerf_core.maps.training import bake_settings, baked_if_possible
 from bidnerf_core.maps.viewpoints import viewpoints
-from bidnerf_core.maps.views import Images, chosen_origin, read_views
+from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 from bidnerf_core.training import TrainingState
 
@@ -110,7 +110,7 @@ def import_map(
             gravity_up=None if read is None else read.gravity_up,
         )
         scene = Map(info, frozen_field(info, found.tensors, None)).to(device)
-        scene = replace(scene, info=replace(info, cameras=_cameras(scene.field, found, views, where)))
+        scene = replace(scene, info=replace(info, cameras=_cameras(scene.field, found, read, where)))
         if views:
             _check_photos(scene, views, where)
         if place is not None:
@@ -134,9 +134,11 @@ def _own_photos(found: ImportedField, where: str) -> Capture | None:
     return dataset
 
 
-def _cameras(field: RadianceField, found: ImportedField, views: Sequence[View], where: str) -> Any:
-    if views:
-        return stored_cameras(views)
+def _cameras(
+    field: RadianceField, found: ImportedField, read: ReadViews | None, where: str
+) -> tuple[StoredCamera, ...]:
+    if read is not None:
+        return read.with_files(stored_cameras(read.views))
     if found.cameras:
         log.info(f"{where}: {amount(len(found.cameras), 'camera')} of its training images found next to it")
         return found.cameras

@@ -117,7 +117,7 @@ def train(
             0,
             False,
             read.source,
-            cameras=taken.cameras,
+            cameras=read.with_files(taken.cameras),
             pose_refinement=taken.refinement,
             distances=taken.distances,
             sparse_depth=read.sparse_depth,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -14,7 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import checked_side
+from bidnerf_core.camera import UPRIGHT, checked_side
+from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -80,6 +83,9 @@ class ReadViews:
     )
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
     depth_unit: float | None = None  # metres per step of depth images, if their format accepts another
+    files: Mapping[str, str] = field(
+        default_factory=dict
+    )  # of images by name, relative to the dataset's folder
 
     def about(self, origin: Origin) -> ReadViews:
         """Return the views with poses relative to ``origin``, a point of their world."""
@@ -88,6 +94,24 @@ class ReadViews:
         offset = -torch.tensor(origin, dtype=torch.float64)
         views = [replace(view, T_ref_camera=view.T_ref_camera.translated(offset)) for view in self.views]
         return replace(self, views=views)
+
+    def with_files(self, cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
+        """Return the cameras of the views with the files of their images.
+
+        Those of which an image shows only a part (a face of a panorama, the pinhole image of another lens) or the mirror image
+        are left out: the camera would not be that of the file.
+        """
+        frames = {view.frame.name: view.frame for view in self.views}
+        found = []
+        for camera in cameras:
+            frame, file = frames.get(camera.name), self.files.get(camera.name)
+            if frame is not None and file is not None and frame.lens is None:
+                turned = frame.orientation
+                if (turned.mirrors_columns + turned.mirrors_rows + turned.transposes) % 2 == 0:
+                    orientation = None if turned == UPRIGHT else turned
+                    camera = replace(camera, file=file, orientation=orientation)
+            found.append(camera)
+        return tuple(found)
 
 
 def read_views(
@@ -176,7 +200,9 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
         log.info(f"{place}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
     if not views:
         raise InputError(f"masks hide every image in split {split!r} entirely; {INVERTED}", where=place)
-    source = data.path.resolve().name
+    source, folder = data.path.resolve().name, data.path if data.path.is_dir() else data.path.parent
+    files = {shot.name: shot.file for shot in shots if shot.file is not None}
+    once = Counter(files.values())
     return ReadViews(
         views,
         source,
@@ -186,6 +212,11 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
         data.unit or _unit_of(views),
         data.up,
         depth_unit=data.depth_unit,
+        files={
+            name: Path(os.path.relpath(file, folder)).as_posix()
+            for name, file in files.items()
+            if once[file] == 1
+        },
     )
 
 

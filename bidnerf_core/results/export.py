@@ -61,8 +61,8 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
 
     These use the world and unit of the map, which their headers state, in double precision where it has an origin of its own;
     installed exporters may write its own coordinates, see ``Map.origin``. Images are named by their files: relative to the folder
-    of the dataset or, for COLMAP, to the folder that contains all of them. Cameras are those of the images as the map uses
-    them, upright and perhaps downscaled. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
+    of the dataset or, for COLMAP, to the folder that contains all of them. Cameras are those of the images in the size that the
+    map uses, which may be smaller. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
     export, and for a folder that is not empty unless ``overwrite`` is set.
     """
     if to not in EXPORTERS:
@@ -107,7 +107,8 @@ def export_colmap(scene: Map, out: Path) -> list[Path]:
     images, landmarks = _needed_images(scene, "colmap"), scene.landmarks
     files = [image.name for image in images]
     folder = os.path.commonpath([os.path.dirname(name) for name in files])
-    images = [replace(image, name=os.path.relpath(image.name, folder or ".")) for image in images]
+    upright = [replace(image, name=os.path.relpath(image.name, folder or ".")) for image in images]
+    images = [image.as_stored for image in upright]
     points, keypoints = list[str](), list[list[str]]()
     if landmarks is not None:
         tracks = [list[str]() for _ in range(len(landmarks))]
@@ -115,7 +116,15 @@ def export_colmap(scene: Map, out: Path) -> list[Path]:
         errors, seen = np.full(len(landmarks), landmarks.noise), landmarks.tracks
         if seen is not None:
             errors = _reprojection_errors(scene, landmarks, seen)
-            rows = zip(seen.landmark.tolist(), seen.image.tolist(), seen.pixel.tolist(), strict=True)
+            pixels = seen.pixel.double()
+            for number, (before, after) in enumerate(zip(upright, images, strict=True)):
+                if after is not before:
+                    own = seen.image == number
+                    rays = (after.pose.inverse() @ before.pose).rotate(
+                        before.intrinsics.unproject(pixels[own])
+                    )
+                    pixels[own] = after.intrinsics.project(rays)
+            rows = zip(seen.landmark.tolist(), seen.image.tolist(), pixels.tolist(), strict=True)
             for landmark, image, (u, v) in rows:
                 tracks[landmark].append(f" {image + 1} {len(keypoints[image])}")
                 keypoints[image].append(f"{u:.6g} {v:.6g} {landmark + 1}")
@@ -164,6 +173,7 @@ def _images(scene: Map) -> list[PosedImage]:
             camera.intrinsics,
             camera.pose.translated(origin_of(scene)),
             unit=scene.unit,
+            orientation=camera.orientation,
         )
         for number, camera in enumerate(scene.info.cameras)
     ]

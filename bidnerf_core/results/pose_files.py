@@ -44,6 +44,7 @@ class PosedImage:
     # Of the tangent at the camera (translation in ``unit``, rotation in rad).
     covariance: Float[Tensor, "6 6"] | None = None
     unit: LengthUnit = "units"  # of the position
+    orientation: Orientation | None = None  # how the file's image was turned upright; None: as its EXIF says
 
     @property
     def pose(self) -> SE3:
@@ -61,7 +62,9 @@ class PosedImage:
 
         Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
         """
-        turned = UPRIGHT if self.file is None else read_exif(self.file).orientation
+        turned = self.orientation
+        if turned is None:
+            turned = UPRIGHT if self.file is None else read_exif(self.file).orientation
         if turned == UPRIGHT:
             return self
         # The columns are the stored image's axes in the upright camera's frame.

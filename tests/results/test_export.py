@@ -11,6 +11,8 @@ import pytest
 import torch
 
 import bidnerf_core as bn
+import tiny
+from bidnerf_core.camera import Orientation
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import read_frames
 from bidnerf_core.io import read_record
@@ -106,6 +108,35 @@ def test_names_that_would_break_a_row_are_escaped(scene: Map, tmp_path: Path) ->
     model = pycolmap.Reconstruction(str(tmp_path / "out"))
     assert len(model.images) == len(scene.info.cameras)
     assert model.images[1].name.endswith("a\\nb\\x1b.jpg")
+
+
+@pytest.mark.parametrize("code", [3, 6, 8])
+def test_photos_that_were_turned_upright_are_exported_as_their_files_store_them(
+    scene: Map, code: int, tmp_path: Path
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    first, *others = scene.info.cameras
+    turned = replace(first, orientation=Orientation.from_exif(code))
+    bn.export_map(
+        replace(scene, info=replace(scene.info, cameras=(turned, *others))), tmp_path / "out", "colmap"
+    )
+    model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    image = model.images[1]
+    size = (image.camera.width, image.camera.height)
+    assert size == Orientation.from_exif(code).upright_size(first.intrinsics.width, first.intrinsics.height)
+    keypoints = [point for point in image.points2D if point.has_point3D()]
+    assert len(keypoints) > 10
+    for keypoint in keypoints:
+        projected = image.project_point(model.points3D[keypoint.point3D_id].xyz)
+        assert np.linalg.norm(projected - keypoint.xy) < 10
+
+
+def test_images_of_a_dataset_keep_the_names_of_their_files(tmp_path: Path) -> None:
+    data = tiny.write_dataset(tmp_path / "data")
+    trained = bn.train(data, config=tiny.config(2), bake=False)
+    bn.export_map(trained, tmp_path / "out", "transforms.json")
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert all((data / frame["file_path"]).is_file() for frame in frames)
 
 
 def test_landmarks_without_tracks_are_points_alone(scene: Map, tmp_path: Path) -> None:
