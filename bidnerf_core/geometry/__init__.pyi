@@ -27,5 +27,3 @@ from .similarity import rigid_pose as rigid_pose
 from .similarity import spread as spread
 from .similarity import symbol as symbol
 from .similarity import turned_about as turned_about
-from .wgs84 import Geodetic as Geodetic
-from .wgs84 import geodetic as geodetic

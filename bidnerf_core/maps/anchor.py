@@ -14,23 +14,15 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, Geodetic, geodetic, pose_from_matrix
+from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import from_plain, read_json
 
 ANCHOR = "anchor.json"
+FARTHEST = 1e6
+"""Metres above or below the ellipsoid."""
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-
-
-@dataclass(frozen=True)
-class GeographicPose:
-    """A camera on the earth: its place, and its rotation in the east-north-up frame at that place."""
-
-    place: Geodetic
-    rotation: Float[Tensor, "3 3"]  # R_enu_camera, OpenCV camera axes
 
 
 @dataclass(frozen=True)
@@ -49,35 +41,22 @@ class Anchor:
         """Raise ``InputError`` for a place off the earth, a matrix that is not a pose, and numbers that are
         not positive.
         """
-        self._T_ecef_world  # noqa: B018 (it checks the place and the matrix)
+        for name, most in (("latitude", 90.0), ("longitude", 180.0), ("height", FARTHEST)):
+            if not abs(getattr(self, name)) <= most:
+                raise InputError(f"{name} is {getattr(self, name)}", expected=f"{-most:g} to {most:g}")
+        self.pose  # noqa: B018 (it checks the matrix)
         if not 0 < self.metres_per_unit < math.inf:
             raise InputError(f"metres_per_unit is {self.metres_per_unit}", expected="a positive number")
         if not (0 <= self.position_sigma < math.inf and 0 <= self.orientation_sigma < math.inf):
             raise InputError(where="position_sigma and orientation_sigma", expected="0 or more")
 
     @cached_property
-    def _T_ecef_world(self) -> SE3:
-        """The map's frame, in metres, in the earth-centred frame."""
+    def pose(self) -> SE3:
+        """T_enu_world: the map's frame, in metres, in the east-north-up frame at the anchor."""
         rows = [list(row) for row in self.T_enu_world]
         if [len(row) for row in rows] != [4] * 4:
             raise InputError(where="T_enu_world", expected="4 rows of 4 numbers")
-        T_enu_world = pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_enu_world")
-        return Geodetic(self.latitude, self.longitude, self.height).T_ecef_enu @ T_enu_world
-
-    def geographic(self, T_world_camera: SE3) -> GeographicPose:
-        """Return a camera's place, and its rotation relative to east, north and up there, not at the anchor."""
-        pose = T_world_camera.to("cpu", torch.float64)
-        T_ecef_camera = self._T_ecef_world @ SE3(pose.rotation, pose.translation * self.metres_per_unit)
-        place = geodetic(T_ecef_camera.translation)
-        return GeographicPose(place, place.T_ecef_enu.rotation.mT @ T_ecef_camera.rotation)
-
-    def T_world_camera(self, pose: GeographicPose) -> SE3:
-        """Convert the pose of a camera on the earth to the map's frame; the inverse of ``geographic``."""
-        local = pose.place.T_ecef_enu
-        inside = self._T_ecef_world.inverse() @ SE3(
-            local.rotation @ pose.rotation.double(), local.translation
-        )
-        return SE3(inside.rotation, inside.translation / self.metres_per_unit)
+        return pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_enu_world")
 
     def scaled(self, factor: float) -> Anchor:
         """Return the anchor of the map after its lengths were multiplied by ``factor``."""

@@ -22,13 +22,15 @@ from torch import Tensor
 
 from bidnerf_core.camera import MODELS
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, Geodetic
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import png_bytes
 from bidnerf_core.localization import Localization
-from bidnerf_core.maps import Anchor, GeographicPose
+from bidnerf_core.maps import Anchor
 from bidnerf_core.results import Answer
 from bidnerf_core.service import LONGEST_NAME, Refused, Upload
+from bidnerf_geopose.earth import GeographicPose
 from bidnerf_geopose.protocol import GeoPose, GeoPoseRequest, Reading
+from bidnerf_geopose.wgs84 import Geodetic
 
 R_CAMERA_BODY = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
 """Rotation from body axes (x forward, y left, z up) to OpenCV's camera axes."""
@@ -49,7 +51,7 @@ def answer(
     (reading,) = request.sensorReadings.cameraReadings
     parameters = {"name": (reading.sensorId or "camera")[:LONGEST_NAME], **_camera(reading)}
     if anchor is not None and request.priorPoses:
-        start = anchor.T_world_camera(_geographic_pose(request.priorPoses[-1].geopose))
+        start = _geographic_pose(request.priorPoses[-1].geopose).in_map(anchor)
         parameters["start"] = json.dumps({"T_world_camera": start.matrix().tolist()})
     found, plain = localize(Upload(parameters, {"photo": _image(reading)}))
     localization = found.found
@@ -68,7 +70,7 @@ def _pose(T_world_camera: SE3, anchor: Anchor | None) -> dict[str, Any]:
         position = dict(zip("xyz", pose.translation.tolist(), strict=True))
         local = {"position": position, "quaternion": _quaternion(pose.rotation)}
         return {"type": "localpose", "localpose": local}
-    geographic = anchor.geographic(T_world_camera)
+    geographic = GeographicPose.of(T_world_camera, anchor)
     place = geographic.place
     position = {"lon": place.longitude, "lat": place.latitude, "h": place.height}
     return {

@@ -15,13 +15,14 @@ import torch
 from PIL import Image
 
 from bidnerf_core import SE3, InputError, Intrinsics, Localization, Outcome
-from bidnerf_core.geometry import Geodetic
-from bidnerf_core.maps import Anchor, GeographicPose
+from bidnerf_core.maps import Anchor
 from bidnerf_core.registry import registered
 from bidnerf_core.results import Answer
 from bidnerf_core.service import Refused, checked, service_app
 from bidnerf_geopose import answers
+from bidnerf_geopose.earth import GeographicPose
 from bidnerf_geopose.protocol import GEOPOSE, GeoPoseRequest
+from bidnerf_geopose.wgs84 import Geodetic
 
 TURNED = SE3.exp(torch.tensor([3.0, -2.0, 1.0, 0.4, -0.5, 0.6], dtype=torch.float64))
 ROWS = tuple(tuple(row) for row in TURNED.matrix().tolist())
@@ -69,7 +70,7 @@ def pose_in(body: dict[str, Any]) -> GeographicPose:
 def test_a_geopose_is_the_pose_and_its_accuracy_the_covariance() -> None:
     body, upload = asked(BUDAPEST, localization())
     assert (body["type"], body["id"]) == ("geopose", "7")
-    assert torch.allclose(BUDAPEST.T_world_camera(pose_in(body)).matrix(), POSE.matrix(), atol=1e-6)
+    assert torch.allclose(pose_in(body).in_map(BUDAPEST).matrix(), POSE.matrix(), atol=1e-6)
     position, orientation = math.sqrt(2e-4), math.degrees(1e-3)
     assert body["accuracy"]["position"] == pytest.approx(math.hypot(2 * position, 0.3))
     assert body["accuracy"]["orientation"] == pytest.approx(math.hypot(orientation, 0.4))

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry import SE3
 
 SEMI_MAJOR = 6378137.0
 """Metres (NGA.STND.0036, table 3.1)."""
