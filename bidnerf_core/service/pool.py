@@ -177,7 +177,7 @@ class Pool:
             try:
                 with job.killed_by(worker.kill):
                     return worker.ask((job.task, folder))
-            except (OSError, EOFError):
+            except (OSError, EOFError, ValueError):  # it died, or what came is no answer
                 self._replace(number, worker, job.stopped or "died")
             finally:
                 shutil.rmtree(

@@ -41,7 +41,7 @@ from bidnerf_core import (
 )
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
-from bidnerf_core.service.models import PhotoParameters
+from bidnerf_core.service.models import Localization, MapFacts, PhotoParameters
 from bidnerf_core.service.pool import Pool
 from bidnerf_core.service.server import named
 from bidnerf_core.service.web import Gate
@@ -230,6 +230,7 @@ def test_answers_are_those_of_the_command_line(service: Service, place: Place, b
     reply = service.post("/maps/map/localize", body, FORM)
     assert reply.status == 200
     assert list(reply.json) == list(expected)
+    Localization.model_validate(reply.json)
     assert reply.json["loss"] == pytest.approx(expected["loss"], rel=1e-6)
     same = expected.keys() - {"seconds", "loss"}
     assert {key: reply.json[key] for key in same} == {key: expected[key] for key in same}
@@ -499,7 +500,10 @@ def test_every_path_is_described(service: Service) -> None:
     for path, status in (("/localize", 200), ("refused", 403)):
         assert f'bidnerf_requests_total{{path="{path}",status="{status}"}}' in text
     assert "bidnerf_workers 1" in text
-    assert set(service.get("/maps").json) == {"map", "hall"}
+    maps = service.get("/maps").json
+    assert set(maps) == {"map", "hall"}
+    for facts in maps.values():
+        MapFacts.model_validate(facts)
     assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
 
 
