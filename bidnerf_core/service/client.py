@@ -11,10 +11,23 @@ import urllib.request
 import uuid
 import zlib
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
+
+if TYPE_CHECKING:
+    from typing import Unpack
 
 File: TypeAlias = str | Path | bytes
 """A file, or its content as bytes."""
+
+
+class PhotoFacts(TypedDict, total=False):
+    """What may be known about a photo, beside its files."""
+
+    name: str | None  # of the frame, in the answer
+    focal: float | None  # pixels of the stored image
+    hfov: float | None  # degrees
+    depth_unit: float | None  # metres per step of the depth image
+    seed: int | None
 
 
 class ServiceError(Exception):
@@ -43,15 +56,15 @@ class ServiceClient:
         depth: File | Any = None,
         camera: File | None = None,
         start: Any = None,
-        **numbers: str | float | None,
+        **known: Unpack[PhotoFacts],
     ) -> dict[str, Any]:
         """Return the JSON of ``bidnerf localize`` for a photo: a file, its bytes, or an array of bytes (h, w) or (h, w, 3).
 
         ``map`` is by default the one that the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z,
-        ``camera`` a file with the camera, or its content, and ``start`` the 4x4 rows of T_world_camera. ``numbers`` are ``focal``
-        (pixels) or ``hfov`` (degrees), ``depth_unit`` (metres per step), ``seed`` and the ``name`` of the frame.
+        ``camera`` a file with the camera, or its content, and ``start`` the 4x4 rows of T_world_camera. What else is ``known`` is
+        given by name, see ``PhotoFacts``.
         """
-        fields = {**numbers, "map": map}
+        fields: dict[str, Any] = {**known, "map": map}
         edge = uuid.uuid4().hex
         rows = getattr(start, "tolist", lambda: start)()
         files = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import re
 import time
 from collections.abc import AsyncGenerator, Callable, Mapping
 from importlib.metadata import version
@@ -87,7 +86,7 @@ def new_app(
     """Return an application that answers errors in the format of RFC 9457 and describes itself, see ``refusal`` for its access."""
     app = FastAPI(
         title=title, description=description, version=version("bidnerf"), openapi_url=None, docs_url=None, redoc_url=None,
-        redirect_slashes=False, generate_unique_id_function=_operation, **more,
+        redirect_slashes=False, generate_unique_id_function=lambda route: f"{min(route.methods).lower()} {route.path}", **more,
     )  # fmt: skip
     app.add_middleware(Gate, token=token, cookie=cookie, report=report)
     for kind in (Refused, InputError, HTTPException):
@@ -100,20 +99,12 @@ def new_app(
 
     @app.get("/docs", summary="This description, as a page.", response_class=HTMLResponse)
     async def docs() -> HTMLResponse:
-        page = jinja2.Environment(autoescape=True).from_string(_template()).render(api=app.openapi())
+        template = files(__package__).joinpath("docs.html").read_text(encoding="utf-8")
+        page = jinja2.Environment(autoescape=True).from_string(template).render(api=app.openapi())
         policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
         return HTMLResponse(page, headers={"Content-Security-Policy": policy})
 
     return app
-
-
-def _operation(route: Any) -> str:
-    """Return the name of an operation in the description."""
-    return "_".join(re.findall(r"\w+", f"{min(route.methods).lower()} {route.path}"))
-
-
-def _template() -> str:
-    return files(__package__).joinpath("docs.html").read_text(encoding="utf-8")
 
 
 class Gate:
@@ -146,7 +137,8 @@ class Gate:
             if refused is None:
                 await self.app(scope, receive, answer)
             else:
-                await _closing(*refused)(scope, receive, answer)
+                more = {"Connection": "close"} | ({"WWW-Authenticate": "Bearer"} if refused[0] == 401 else {})
+                await problem(*refused, more)(scope, receive, answer)
         except Exception as error:  # an internal error: the operator has to see where it happened
             log.exception("%s", json.dumps({"fault": f"{type(error).__name__}: {error}"}))
             if not status:
@@ -169,12 +161,6 @@ async def _failure(request: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException):
         return problem(error.status_code, error.detail, error.headers)
     return problem(400, str(error))
-
-
-def _closing(status: int, detail: str) -> Response:
-    """Return the response to a request that is not allowed, whose body is not read."""
-    more = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
-    return problem(status, detail, {"Connection": "close", **more})
 
 
 # Requests.
