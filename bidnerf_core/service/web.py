@@ -86,7 +86,7 @@ def new_app(
     """Return an application that answers errors in the format of RFC 9457 and describes itself, see ``refusal`` for its access."""
     app = FastAPI(
         title=title, description=description, version=version("bidnerf"), openapi_url=None, docs_url=None, redoc_url=None,
-        redirect_slashes=False, generate_unique_id_function=lambda route: f"{min(route.methods).lower()} {route.path}", **more,
+        redirect_slashes=False, generate_unique_id_function=lambda route: f"{min(route.methods or ()).lower()} {route.path}", **more,
     )  # fmt: skip
     app.add_middleware(Gate, token=token, cookie=cookie, report=report)
     for kind in (Refused, InputError, HTTPException):
