@@ -57,7 +57,5 @@ from .tensors import read_archive as read_archive
 from .tensors import read_array as read_array
 from .tensors import read_tensors as read_tensors
 from .tensors import read_tensors_and_metadata as read_tensors_and_metadata
-from .torch_files import check_sizes as check_sizes
-from .torch_files import outline_of as outline_of
 from .torch_files import read_saved as read_saved
 from .yaml import parse_yaml as parse_yaml

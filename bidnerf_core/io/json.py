@@ -53,16 +53,12 @@ def parse_json(content: bytes | str, where: str, expected: str) -> Any:
         found = json.loads(text)
         if "\\ud" in text.lower():  # half of a surrogate pair, which no file or terminal can represent
             json.dumps(found, ensure_ascii=False).encode()
-    except json.JSONDecodeError as error:
-        reason = f"{error.msg} at line {error.lineno}, column {error.colno}"
-        raise _not_json(where, reason, expected) from error
     except (ValueError, RecursionError) as error:
-        raise _not_json(where, str(error), expected) from error
+        reason = str(error)
+        if isinstance(error, json.JSONDecodeError):
+            reason = f"{error.msg} at line {error.lineno}, column {error.colno}"
+        raise InputError(f"not JSON ({reason})", where=where, expected=expected) from error
     return found
-
-
-def _not_json(where: str, reason: str, expected: str) -> InputError:
-    return InputError(f"not JSON ({reason})", where=where, expected=expected)
 
 
 @dataclass(frozen=True)
@@ -103,19 +99,19 @@ class Record:
     def text(self, key: str) -> str | None:
         found = self.value(key)
         if found is not None and not isinstance(found, str):
-            raise self.error(f"{key} is {_short(found)}", expected="text")
+            raise self.error(f"{key} is {_shown(found, as_json=True)}", expected="text")
         return found
 
     def items(self, key: str) -> list[Any] | None:
         found = self.value(key)
         if found is not None and not isinstance(found, list):
-            raise self.error(f"{key} is {_short(found)}", expected="a list")
+            raise self.error(f"{key} is {_shown(found, as_json=True)}", expected="a list")
         return found
 
     def checked_number(self, found: Any, what: str) -> float:
         is_number = isinstance(found, int | float) and not isinstance(found, bool)
         if not is_number or not abs(found) < LARGEST_NUMBER:
-            raise self.error(f"{what} is {_short(found)}", expected="a finite number")
+            raise self.error(f"{what} is {_shown(found, as_json=True)}", expected="a finite number")
         return float(found)
 
     def homogeneous(self, key: str, rows: list[Any] | None) -> tuple[list[list[float]], float]:
@@ -150,14 +146,16 @@ def parse_record(where: str, content: bytes | str, expected: str = "a JSON objec
     """Parse a JSON object. Malformed text raises ``InputError``, whose message begins with ``where``."""
     values = parse_json(content, where, expected)
     if not isinstance(values, dict):
-        raise InputError(f"holds {_short(values)}", where=where, expected=expected)
+        raise InputError(f"holds {_shown(values, as_json=True)}", where=where, expected=expected)
     return Record(where, values)
 
 
-def _short(value: Any) -> str:
-    """Return a value as JSON on one line, truncated if it is long."""
-    text = json.dumps(value)
-    return text if len(text) <= 40 else text[:37] + "..."
+def _shown(value: Any, as_json: bool = False) -> str:
+    """Return a value as text on one line, truncated if it is long."""
+    text = json.dumps(value) if as_json else repr(value)
+    if _is_tensor(value):
+        text = f"{value.dtype} {list(value.shape)}"
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _is_tensor(value: Any) -> TypeGuard[Tensor]:
@@ -175,9 +173,12 @@ def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = No
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [f.name for f in dataclasses.fields(value) if f.init]
-        return {name: to_plain(getattr(value, name), _inside(where, name), tensors) for name in fields}
+        value = {name: getattr(value, name) for name in fields}
     if isinstance(value, dict):
-        return {_key(key, where): to_plain(item, _inside(where, key), tensors) for key, item in value.items()}
+        if odd := [key for key in value if not isinstance(key, str)]:
+            raise InputError(f"{where or 'value'} has the key {odd[0]!r}", expected="text")
+        inside = f"{where}." if where else ""
+        return {key: to_plain(item, f"{inside}{key}", tensors) for key, item in value.items()}
     if isinstance(value, tuple | list):
         return [to_plain(item, f"{where}[{place}]", tensors) for place, item in enumerate(value)]
     if _is_tensor(value) and tensors is not None:
@@ -251,6 +252,8 @@ def _strict(node: Any) -> Any:
             found |= {"strict": True, "allow_inf_nan": False}
         case "int":
             found |= {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER}
+        case "list" | "tuple":
+            found["fail_fast"] = True
         case "union":
             found["choices"] = [(choice, MEMBER) for choice in found["choices"]]
         case "literal":
@@ -300,19 +303,3 @@ def _first_error(errors: Sequence[Any], where: str) -> InputError:
     texts = {e["type"]: e["msg"].removeprefix("Input should be ") for e in errors if e["loc"] == first["loc"]}
     expected = dict.fromkeys(EXPECTED.get(kind, text) for kind, text in texts.items())
     return InputError(f"found {_shown(first['input'])}", where=place, expected=" or ".join(expected))
-
-
-def _shown(value: Any) -> str:
-    """Return a value as text on one line, truncated if it is long."""
-    text = f"{value.dtype} {list(value.shape)}" if _is_tensor(value) else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _inside(where: str, name: Any) -> str:
-    return f"{where}.{name}" if where else str(name)
-
-
-def _key(key: Any, where: str) -> str:
-    if not isinstance(key, str):
-        raise InputError(f"{where or 'value'} has the key {key!r}", expected="text")
-    return key

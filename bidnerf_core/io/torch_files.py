@@ -36,67 +36,44 @@ STAND_INS = (
 """Names in pickles that are replaced by ``_Ignored``."""
 
 
-def read_saved(path: Path, expected: str) -> Any:
+def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
     """Read a file written by ``torch.save``: tensors and numbers in dicts and lists. NumPy numbers come back
     as placeholders.
 
-    ``expected`` briefly describes what the file should be. Raises a one-line ``InputError`` if there is no
-    such file, it is damaged, or it would run code. A tensor may be larger than its stored data, see
-    ``check_sizes``.
+    ``expected`` briefly describes what the file should be. With ``mapped``, tensors stay in the file until they are used, so that
+    one of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
+    cannot be mapped and are read. Raises a one-line ``InputError`` if there is no such file, it is damaged, it would
+    run code, or it unpacks to more than its size or holds a tensor that does, such as an expanded one (stride 0).
     """
-    return _read(path, expected, mapped=False)
-
-
-def outline_of(path: Path, expected: str) -> Any:
-    """Read a file as ``read_saved`` does, but memory-map its tensors, so that a file of any size is recognised quickly.
-
-    Files in the format of torch before version 1.6, which are not zip archives, cannot be mapped and are read.
-    """
-    return _read(path, expected, mapped=True)
-
-
-def _read(path: Path, expected: str, mapped: bool) -> Any:
     if not path.is_file():
         raise InputError("no such file", where=path, expected=expected)
     path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
+    size = path.stat().st_size
     archive = Archive(path, expected) if zipfile.is_zipfile(path) else None
-    if archive is not None and archive.unpacked_size > path.stat().st_size:
+    if archive is not None and archive.unpacked_size > size:
         found = f"unpacks to {archive.unpacked_size / 2**20:,.0f} MiB"
         raise InputError(
             found, where=path, expected=f"{expected} that is not compressed, as torch.save writes it"
         )
     try:
         with torch.serialization.safe_globals([(_Ignored, name) for name in STAND_INS]):
-            found = torch.load(
+            content = torch.load(
                 path, map_location="cpu", weights_only=True, mmap=mapped and archive is not None
             )
     except Exception as error:  # each kind of damage raises a different exception
         code = CODE.search(str(error))
         if isinstance(error, pickle.UnpicklingError) and code:
-            raise InputError(
-                f"would run code ({code[1]}) and was not read", where=path, expected=expected
-            ) from error
-        raise InputError(
-            f"not written by torch.save, or damaged ({type(error).__name__});", where=path, expected=expected
-        ) from error
-    return found
-
-
-def check_sizes(path: Path, found: Any, expected: str) -> None:
-    """Raise ``InputError`` for a tensor that needs more memory than the file holds, such as an expanded one (stride 0).
-
-    Call this before copying the tensor.
-    """
-    size = path.stat().st_size
-    for tensor in _tensors(found):
+            found = f"would run code ({code[1]}) and was not read"
+        else:
+            found = f"not written by torch.save, or damaged ({type(error).__name__});"
+        raise InputError(found, where=path, expected=expected) from error
+    for tensor in _tensors(content):
         needed = tensor.numel() * tensor.element_size()
-        held = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
-        if needed > min(held, size):
-            raise InputError(
-                f"a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only {size:,};",
-                where=path,
-                expected=expected,
-            )
+        stored = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
+        if needed > min(stored, size):
+            found = f"a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only {size:,};"
+            raise InputError(found, where=path, expected=expected)
+    return content
 
 
 def _tensors(found: Any) -> Iterator[Tensor]:

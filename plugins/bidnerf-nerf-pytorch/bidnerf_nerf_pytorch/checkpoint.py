@@ -12,7 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import check_sizes, outline_of, read_saved
+from bidnerf_core.io import read_saved
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 
 EXPECTED = "a nerf-pytorch checkpoint"
@@ -31,7 +31,7 @@ class Checkpoint:
 
 def is_checkpoint(path: Path) -> bool:
     """Return whether a file that ``torch.save`` wrote holds both networks. Raises ``InputError`` for another kind of file."""
-    found = outline_of(path, EXPECTED)
+    found = read_saved(path, EXPECTED, mapped=True)
     return isinstance(found, dict) and all(isinstance(found.get(key), dict) for key in NETWORKS.values())
 
 
@@ -49,7 +49,6 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
         )
     if not isinstance(found.get(NETWORKS["fine"]), dict):
         raise InputError("has no fine network", where=path, expected="a coarse and a fine one")
-    check_sizes(path, [found[key] for key in NETWORKS.values()], EXPECTED)
     kinds: dict[str, NetworkConfig] = {}
     tensors: dict[str, Tensor] = {}
     for level, key in NETWORKS.items():

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import check_sizes, outline_of, read_saved
+from bidnerf_core.io import read_saved
 from bidnerf_gaussians.gaussians import Gaussians
 
 EXPECTED = "a checkpoint of gsplat or splatfacto"
@@ -28,7 +28,7 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() not in ENDINGS or not path.is_file():
         return False
     try:
-        return {"means", "log_scales"} <= set(_parameters(outline_of(path, EXPECTED)))
+        return {"means", "log_scales"} <= set(_parameters(read_saved(path, EXPECTED, mapped=True)))
     except InputError:
         return False
 
@@ -39,7 +39,6 @@ def read(path: Path) -> Gaussians:
     missing = [name for name in ("means", "log_scales", "quaternions", "logits", "sh0") if name not in found]
     if missing:
         raise InputError(f"has no {', '.join(missing)}", where=path, expected=EXPECTED)
-    check_sizes(path, found, EXPECTED)
     try:
         parts = {name: value.float() for name, value in found.items()}
         count = len(parts["means"])
