@@ -220,11 +220,11 @@ def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCame
     fitted = raster.upright(given)
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
-        raise InputError(
-            f"image is {size}, but its camera is for {given.width}x{given.height}",
-            where=where,
-            expected="one with the same aspect ratio",
-        )
+        expected = "one with the same aspect ratio"
+        if same_aspect((given.height, given.width), raster.size):
+            expected = "images that are not turned by a quarter against their cameras: export them as stored"
+        found = f"image is {size}, but its camera is for {given.width}x{given.height}"
+        raise InputError(found, where=where, expected=expected)
     if isinstance(fitted, Lens):
         return FoundCamera(fitted.pinhole, f"{origin}: {fitted.sentence}", lens=fitted)
     return FoundCamera(fitted, f"{origin}: {_focal(fitted)}")

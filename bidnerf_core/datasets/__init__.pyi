@@ -8,6 +8,7 @@ from .capture import Shot as Shot
 from .capture import TimedFrame as TimedFrame
 from .capture import hold_out as hold_out
 from .capture import of_views as of_views
+from .capture import remark as remark
 from .colmap import SparseChoice as SparseChoice
 from .colmap import SparsePoints as SparsePoints
 from .colmap_files import read_model as read_model

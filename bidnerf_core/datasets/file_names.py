@@ -26,32 +26,30 @@ class FileNames:
         self._folder = folder
         self._listed: dict[Path, dict[str, str]] = {}
 
-    def find(self, name: PurePosixPath, endings: tuple[str, ...] = ("",)) -> Path | None:
+    def find(self, name: PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path | None:
         """Return the file named ``name`` plus one of the ``endings``, or None.
 
-        The exact name is tried first, then names that differ in case, then the last parts of an absolute
-        path.
+        The exact name is tried first, then names that differ in case, then the last parts of an absolute path, and of a
+        relative one if it may be relative to a folder elsewhere because files were ``moved``.
         """
         for ending in endings:
             exact = self._folder / f"{name}{ending}"
             if is_file(exact):
                 return exact
-        for parts in self._tails(name):
+        for parts in self._tails(name, moved):
             for ending in endings:
                 found = self._ignoring_case((*parts[:-1], f"{parts[-1]}{ending}"))
                 if found is not None:
                     return found
         return None
 
-    def _tails(self, name: PurePosixPath) -> list[tuple[str, ...]]:
-        """Return the parts of a relative name; for an absolute one, the parts below each of its folders,
+    def _tails(self, name: PurePosixPath, moved: bool) -> list[tuple[str, ...]]:
+        """Return the parts of a relative name; for an absolute one, or a ``moved`` one, the parts below each of its folders,
         longest first.
         """
-        if not name.parts:
-            return []
-        if not (name.is_absolute() or name.parts[0].endswith(":")):
-            return [name.parts]
-        return [name.parts[first:] for first in range(1, len(name.parts))]
+        is_absolute = name.is_absolute() or bool(name.parts and name.parts[0].endswith(":"))
+        last = len(name.parts) if is_absolute or moved else min(1, len(name.parts))
+        return [name.parts[first:] for first in range(int(is_absolute), last)]
 
     def _ignoring_case(self, parts: tuple[str, ...]) -> Path | None:
         place = self._folder

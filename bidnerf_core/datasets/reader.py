@@ -23,6 +23,8 @@ DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
 (True), or not at all (False)."""
 OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
 """An option of ``DatasetOptions`` that a format may leave open."""
+FARTHEST_CAMERA = 1e10
+"""Largest coordinate of a camera: from the centre of the Earth, and in millimetres, its surface is at 6.4e9."""
 UNREGISTERED = "no"
 """The value of ``register_depth`` with which depth is used as it is, besides False."""
 
@@ -177,13 +179,23 @@ class DatasetOptions:
         except (InputError, OSError, MemoryError):
             raise
         except Exception as error:
-            if any(reader is READERS[name] for name in ORDER):
+            if any(reader is READERS[name] for name in ORDER if name in READERS):
                 raise
             who = f"reader {type(reader).__name__} failed to open it"
             raise InputError(f"{who}: {type(error).__name__}: {error}", where=path) from error
         if not isinstance(found, Capture):
             who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
             raise InputError(who, where=path, expected="a Capture")
+        for shot in found.shots:
+            if (
+                shot.T_world_camera is not None
+                and not shot.T_world_camera.translation.abs().max() < FARTHEST_CAMERA
+            ):
+                position = ", ".join(f"{x:.3g}" for x in shot.T_world_camera.translation.tolist())
+                expected = f"coordinates below {FARTHEST_CAMERA:g}"
+                raise InputError(
+                    f"{shot.name} is at {position}", where=found.pose_file or path, expected=expected
+                )
         shots = found.shots if found.splits else hold_out(found.shots)
         faces = [face for shot in shots for face in shot.faces()]
         found = replace(found, shots=[replace(shot, name="") for shot in faces], largest=self.largest)
@@ -275,7 +287,7 @@ def _defects(reader: Any) -> Iterator[str]:
 
 ORDER = (
     "transforms", "tum", "twelve-scenes", "seven-scenes", "record3d", "polycam", "stray-scanner", "euroc", "kitti",
-    "reality-capture", "colmap",
+    "reality-capture", "scannet", "replica", "colmap", "llff", "opensfm", "metashape",
 )  # fmt: skip
 """The bundled readers in the order in which they are tried; a folder may hold files of several formats."""
 
@@ -289,7 +301,7 @@ def find_reader(folder: Path) -> Reader | None:
     A reader that cannot be loaded or fails is reported by an ``InputWarning``. Raises ``InputError`` if
     several third-party readers recognize the folder.
     """
-    for name in ORDER:
+    for name in (name for name in ORDER if name in READERS):
         if may_hold(READERS[name], folder) and READERS[name].recognises(folder):
             return READERS[name]
     claims = {
@@ -323,6 +335,9 @@ def file_of_dataset(path: Path) -> str | None:
 
 def no_dataset(folder: Path) -> InputError:
     """Return the error for a folder with neither photos nor a dataset, which refers to the list of formats."""
+    if (folder / "cameras.json").is_file() and (folder / "point_cloud").is_dir():
+        splat = "'bidnerf import' with its point_cloud.ply, or the capture that it was trained on"
+        return InputError("is the output of 3D Gaussian Splatting", where=folder, expected=splat)
     found = "contains no photos and is no dataset" if any(folder.iterdir()) else "the folder is empty"
     return InputError(f"{found};", where=folder, expected=expected_formats())
 

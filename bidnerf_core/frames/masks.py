@@ -105,7 +105,11 @@ class MaskFolder:
         if not self.path.is_dir():
             what = "is a file" if self.path.exists() else "no such folder"
             raise InputError(what, where=self.path, expected="a folder of masks")
-        files = sorted(f for f in self.path.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file())
+        files = sorted(
+            f
+            for f in self.path.rglob("*")
+            if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file() and not f.name.startswith(".")
+        )
         if not files:
             raise InputError("contains no images", where=self.path, expected="masks")
         self._by_name = defaultdict[str, list[Path]](list)

@@ -48,18 +48,23 @@ class PackedFile:
         return self.where
 
 
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+"""How a file begins that stands for another one in a repository cloned without Git LFS."""
+
+
 def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     """Open a regular file for reading. ``expected`` briefly describes what it should be ("an image file").
 
-    Raises ``InputError`` if there is no such file, if reading is not permitted, and for folders, pipes and
-    devices: reading from a pipe could block forever.
+    Raises ``InputError`` if there is no such file, if reading is not permitted, for a pointer of Git LFS, and for
+    folders, pipes and devices: reading from a pipe could block forever.
     """
     if isinstance(path, PackedFile):
         return io.BytesIO(path.read())
     try:
         mode = path.stat().st_mode
         if stat.S_ISREG(mode):
-            return path.open("rb")
+            file = path.open("rb")
+            is_pointer = file.peek(len(LFS_POINTER)).startswith(LFS_POINTER)
     except FileNotFoundError as error:
         raise InputError("no such file", where=path, expected=expected) from error
     except PermissionError as error:
@@ -67,6 +72,11 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     except (OSError, ValueError) as error:  # a NUL in the name raises ValueError
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"cannot be opened ({reason})", where=path, expected=expected) from error
+    if stat.S_ISREG(mode):
+        if is_pointer:
+            file.close()
+            raise InputError("is a pointer of Git LFS, not the file", where=path, expected="git lfs pull")
+        return file
     kind = FILE_KINDS.get(stat.S_IFMT(mode), "no regular file")
     raise InputError(f"is {kind}", where=path, expected=expected)
 

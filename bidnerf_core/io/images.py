@@ -36,6 +36,7 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
 """The formats that are decoded, whatever a file's name. Pillow supports more, and reads EPS by starting
 another program."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
 """Brands in the first bytes of HEIF files (ISO/IEC 23008-12)."""
@@ -337,6 +338,9 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
     Raises ``InputError`` if there is no such regular file, if it is not readable as an image, and if the
     image has more than ``LARGEST_IMAGE`` pixels according to its header, before memory is allocated.
     """
+    if isinstance(path, Path) and path.suffix.lower() in RAW_SUFFIXES:
+        found = "is a raw photo, of which only a thumbnail would be read"
+        raise InputError(found, where=path, expected="a JPEG, PNG or TIFF file developed from it")
     with open_binary(path, "an image file") as file:
         if is_heif(file.read(12)):
             _register_heif(path)

@@ -52,7 +52,7 @@ from bidnerf_core.structure.record import (
     write_dataset,
     write_found,
 )
-from bidnerf_core.structure.sources import SourceImage, photos_of
+from bidnerf_core.structure.sources import SourceImage, photos_of, refuse_panoramas
 
 log = logging.getLogger("bidnerf")
 
@@ -94,6 +94,7 @@ def find_poses(
     if known is not None:
         log.info(f"{folder}: already has the poses of these photos")
         return known
+    refuse_panoramas(images)
     with job_context(progress, cancel), _folder(folder, inputs, overwrite):
         if overwrite and not reuse:
             clear(folder)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.datasets import VIDEO_SUFFIXES, find_reader, is_video, no_dataset, unique_names
-from bidnerf_core.errors import InputError
+from bidnerf_core.datasets import VIDEO_SUFFIXES, find_reader, is_video, no_dataset, remark, unique_names
+from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import natural_order, photos_in
+from bidnerf_core.io import open_binary, read_header
 
+XMP = 2**18
+"""First bytes of a photo, which contain its XMP: a segment has at most 64 KiB, and EXIF precedes it."""
 NOT_PHOTOS = ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
 """Names of folders whose images are not photos."""
 
@@ -62,8 +66,59 @@ def _listed(folder: Path, out: Path | None) -> list[Path]:
     own, _ = photos_in(folder)
     if own:
         return own
-    found = list(_below(folder, out))
+    found = _without_copies(folder, list(_below(folder, out)))
     return sorted(found, key=lambda file: natural_order(file.relative_to(folder).as_posix()))
+
+
+def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
+    """Return the photos without smaller copies of others, as in ``images_2`` and ``images_4`` beside ``images``.
+
+    Copies have the names of the others and their aspect ratio, all of one folder; a remark names their folders.
+    """
+    groups: dict[Path, list[Path]] = {}
+    for photo in photos:
+        groups.setdefault(photo.parent, []).append(photo)
+    sizes = dict[Path, tuple[int, int]]()
+    for place, group in groups.items():
+        with contextlib.suppress(InputError):  # raised again when that photo is read
+            header = read_header(group[0])
+            sizes[place] = header.width, header.height
+
+    def is_copy(place: Path, other: Path) -> bool:
+        (width, height), (whole_width, whole_height) = sizes[place], sizes[other]
+        smaller = (
+            width < whole_width and abs(height - width * whole_height / whole_width) <= 1
+        )  # sizes are rounded
+        names = [{photo.stem for photo in groups[each]} for each in (place, other)]
+        return smaller and place.parent == other.parent and names[0] == names[1]
+
+    copies = [place for place in sizes if any(is_copy(place, other) for other in sizes)]
+    if copies:
+        names = enumeration([str(place.relative_to(folder)) for place in copies])
+        remark(folder, f"{names}: smaller copies of the photos beside them, which are left out")
+    return [photo for photo in photos if photo.parent not in copies]
+
+
+def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
+    """Raise ``InputError`` for panoramas, which no pinhole camera takes; photos that are twice as wide as high cause a remark."""
+    wide = 0
+    for photo in photos:
+        try:
+            header = read_header(photo.file)
+        except InputError:  # left out later
+            continue
+        if header.width != 2 * header.height:
+            continue
+        wide += 1
+        with open_binary(photo.file, "a photo") as file:
+            if b"equirectangular" in file.read(XMP):
+                expected = (
+                    "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
+                )
+                raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
+    if photos and wide == len(photos):
+        text = "photos are twice as wide as high; if they are panoramas, they are no pinhole images and no poses fit them"
+        remark(photos[0].file.parent, text)
 
 
 def _below(folder: Path, out: Path | None) -> Iterator[Path]:

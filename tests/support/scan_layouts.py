@@ -328,6 +328,99 @@ def write_colmap(folder: Path, views: Sequence[View], binary: bool = False) -> P
     return folder
 
 
+def write_scannet(folder: Path, views: Sequence[View]) -> Path:
+    camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
+    (folder / "pose").mkdir()
+    (folder / "intrinsic").mkdir()
+    for number, view in enumerate(views):
+        write_image(folder / "color" / f"{number}.jpg", pixels(view))
+        write_image(folder / "depth" / f"{number}.png", millimetres(view))
+        np.savetxt(folder / "pose" / f"{number}.txt", matrix(view), fmt="%.17g")
+    intrinsics = np.array([[camera.fx, 0, cx, 0], [0, camera.fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    for kind in ("color", "depth"):
+        np.savetxt(folder / "intrinsic" / f"intrinsic_{kind}.txt", intrinsics, fmt="%.17g")
+    return folder
+
+
+def write_llff(folder: Path, views: Sequence[View]) -> Path:
+    """The axes of the pose point down, right and backwards; the principal point is the centre."""
+    camera, rows = views[0].frame.intrinsics, []
+    for number, view in enumerate(views):
+        write_image(folder / "images" / f"{number:03d}.png", pixels(view))
+        right, down, forward, position = matrix(view)[:3].T
+        about = np.array([camera.height, camera.width, camera.fx])
+        rows.append([*np.stack([down, right, -forward, position, about], 1).ravel(), 0.1, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
+def write_replica(folder: Path, views: Sequence[View]) -> Path:
+    camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
+    for number, view in enumerate(views):
+        write_image(folder / "room0/results" / f"frame{number:06d}.jpg", pixels(view))
+        write_image(folder / "room0/results" / f"depth{number:06d}.png", millimetres(view))
+    about = {
+        "w": camera.width,
+        "h": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": cx,
+        "cy": cy,
+        "scale": 1000.0,
+    }
+    (folder / "cam_params.json").write_text(json.dumps({"camera": about}))
+    np.savetxt(folder / "room0/traj.txt", [matrix(view).ravel() for view in views], fmt="%.17g")
+    return folder / "room0"
+
+
+def write_opensfm(folder: Path, views: Sequence[View]) -> Path:
+    camera = views[0].frame.intrinsics
+    side = max(camera.width, camera.height)
+    about = {
+        "projection_type": "brown", "width": camera.width, "height": camera.height, "focal_x": camera.fx / side,
+        "focal_y": camera.fy / side, "c_x": (camera.cx - camera.width / 2) / side, "c_y": (camera.cy - camera.height / 2) / side,
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), (*camera.distortion, *[0.0] * 5), strict=False)),
+    }  # fmt: skip
+    shots = {}
+    for number, view in enumerate(views):
+        write_image(folder / "images" / f"{number}.png", pixels(view))
+        T = np.linalg.inv(matrix(view))
+        turn = Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist()
+        time = START + PERIOD * number
+        shots[f"{number}.png"] = {
+            "rotation": turn,
+            "translation": T[:3, 3].tolist(),
+            "camera": "c",
+            "capture_time": time,
+        }
+    (folder / "reconstruction.json").write_text(json.dumps([{"cameras": {"c": about}, "shots": shots}]))
+    return folder
+
+
+def write_metashape(folder: Path, views: Sequence[View]) -> Path:
+    camera = views[0].frame.intrinsics
+    k1, k2, p1, p2, k3 = (*camera.distortion, *[0.0] * 5)[:5]
+    values = {
+        "f": camera.fy, "b1": camera.fx - camera.fy, "cx": camera.cx - camera.width / 2, "cy": camera.cy - camera.height / 2,
+        "k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1,
+    }  # fmt: skip
+    size = f'<resolution width="{camera.width}" height="{camera.height}"/>'
+    lens = "".join(f"<{key}>{value}</{key}>" for key, value in values.items())
+    cameras = ""
+    for number, view in enumerate(views):
+        write_image(folder / "images" / f"IMG_{number}.png", pixels(view))
+        rows = " ".join(map(repr, matrix(view).ravel().tolist()))
+        cameras += (
+            f'<camera id="{number}" sensor_id="0" label="IMG_{number}"><transform>{rows}</transform></camera>'
+        )
+    sensor = f'<sensor id="0" type="frame">{size}<calibration type="frame" class="adjusted">{size}{lens}</calibration></sensor>'
+    chunk = f"<chunk><sensors>{sensor}</sensors><cameras>{cameras}</cameras></chunk>"
+    (folder / "cameras.xml").write_text(
+        f'<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0">{chunk}</document>'
+    )
+    return folder
+
+
 class Layout(NamedTuple):
     reader: str
     write: Callable[[Path, Sequence[View]], Path]
@@ -350,6 +443,11 @@ LAYOUTS = {
     "reality-capture": Layout("reality-capture", write_reality_capture, depth=False, unit=None),
     "kitti": Layout("kitti", write_kitti, depth=False, times=True),
     "euroc": Layout("euroc", write_euroc, depth=False, times=True),
+    "scannet": Layout("scannet", write_scannet, lossless=False),
+    "replica": Layout("replica", write_replica, lossless=False),
+    "llff": Layout("llff", write_llff, depth=False, unit=None),
+    "opensfm": Layout("opensfm", write_opensfm, depth=False, times=True, unit=None),
+    "metashape": Layout("metashape", write_metashape, depth=False, unit=None),
     "transforms": Layout("transforms", write_nerfstudio, unit=None),
     "colmap": Layout("colmap", write_colmap, depth=False, unit=None),
     "colmap, binary": Layout("colmap", partial(write_colmap, binary=True), depth=False, unit=None),

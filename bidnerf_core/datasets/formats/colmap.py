@@ -35,7 +35,7 @@ from bidnerf_core.datasets.file_names import FileNames, posix_name
 from bidnerf_core.datasets.reader import DatasetOptions, Reader
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import natural_order
-from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES
+from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES, is_file
 
 MODELS = (
     "sparse",
@@ -49,7 +49,7 @@ MODELS = (
 )
 """Where to look for a model, or numbered folders of models, in order of preference."""
 IMAGES = (
-    "images", "colmap/images", "dense/images", "dense/0/images", "undistorted/images", "input", "image", "photos", "rgb", ".",
+    "images", "images_2", "images_4", "images_8", "colmap/images", "dense/images", "dense/0/images", "undistorted/images", "input", "image", "photos", "rgb", ".",
     "../images", "../../images",
 )  # fmt: skip
 """Where to look for the images, relative to the folder; those next to the model come first."""
@@ -67,9 +67,22 @@ class ColmapReader(Reader):
         """Read the model. Raises ``InputError`` if it is damaged or has no registered image."""
         model = _largest(path, _models(path))
         images, cameras = read_posed_images(model)
+        folder, files = _image_folder(path, model, images)
+        own = _models_at(folder.parent / "sparse")
+        if files and own and model.resolve() not in [each.resolve() for each in own]:
+            # such as dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere
+            text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
+            remark(path, text)
+            model = _largest(path, own)
+            images, cameras = read_posed_images(model)
+            folder, files = _image_folder(path, model, images)
         if not images:
             raise InputError("has no registered image", where=model, expected="at least one")
-        folder, files = _image_folder(path, model, images)
+        if options.masks is None and any((place / "masks").is_dir() for place in (path, folder.parent)):
+            remark(
+                path,
+                "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it",
+            )
         there = present(
             images,
             lambda image: image.name in files,
@@ -90,14 +103,24 @@ class ColmapReader(Reader):
 
 
 def _models(path: Path) -> list[Path]:
-    """Return the models at the first location that has any: the location itself, or numbered folders in it."""
-    for place in MODELS:
-        folder = path / place
-        inside = [child for child in folder.glob("*") if child.name.isdecimal() and has_posed_images(child)]
-        if inside or has_posed_images(folder):
-            own = [folder] if has_posed_images(folder) else []
-            return [*own, *sorted(inside, key=lambda child: natural_order(child.name))]
-    return []
+    """Return the models at the first location that has any."""
+    return next((models for place in MODELS if (models := _models_at(path / place))), [])
+
+
+def _models_at(folder: Path) -> list[Path]:
+    """Return the models at a location: the folder itself, or numbered folders in it; incomplete ones if there are no others.
+
+    Without its images, a model is no reason to find the poses of the photos anew, but damaged.
+    """
+    inside = [child for child in folder.glob("*") if child.name.isdecimal()]
+    places = [folder, *sorted(inside, key=lambda child: natural_order(child.name))]
+    incomplete = [
+        place
+        for place in places
+        for suffix in (".bin", ".txt")
+        if all(is_file(place / f"{name}{suffix}") for name in ("cameras", "points3D"))
+    ]
+    return [place for place in places if has_posed_images(place)] or incomplete[:1]
 
 
 def _largest(path: Path, models: Sequence[Path]) -> Path:
@@ -135,7 +158,11 @@ def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> No
     """Count the photos in an image folder that the model lacks."""
     if folder == path:
         return
-    photos = [file for file in folder.rglob("*") if file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
+    photos = [
+        file
+        for file in folder.rglob("*")
+        if file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) and not file.name.startswith(".")
+    ]
     others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
     if others:
         text = f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out"

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
+from bidnerf_core.datasets.formats.twelve_scenes import FOCAL_TOLERANCE
 from bidnerf_core.datasets.pose_rows import read_pose_matrix
 from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
 from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
@@ -41,16 +42,14 @@ class ScanNetReader(Reader):
         assert colour is not None  # ensured by recognises
         measured = sorted((path / "depth").glob("[!.]*.png"), key=lambda file: natural_order(file.name))
         camera = _camera(colour, images[0])
-        own = (
-            None
-            if depth is None or not measured
-            else DepthCamera(_camera(depth, measured[0]), SE3.identity())
+        own = None if depth is None or not measured else _camera(depth, measured[0])
+        same = (
+            own is not None
+            and abs(own.resized(camera.width, camera.height).fx / camera.fx - 1) < FOCAL_TOLERANCE
         )
-        sensor, unit, read = (
-            options.sensor(path, own),
-            options.depth_unit or MILLIMETRE,
-            DepthReader(("65535",)),
-        )
+        registered = None if own is None or same else DepthCamera(own, SE3.identity())
+        sensor, unit = options.sensor(path, registered), options.depth_unit or MILLIMETRE
+        read = DepthReader(documented=("65535",))
         by_stem, shots = {file.stem: file for file in measured}, list[Shot]()
         for image in images:
             pose, file = path / "pose" / f"{image.stem}.txt", by_stem.get(image.stem)

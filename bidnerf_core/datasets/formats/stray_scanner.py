@@ -82,13 +82,11 @@ def _odometry(file: Path) -> tuple[list[str], list[tuple[Row, list[str]]]]:
 def _shot(
     path: Path, row: Row, words: dict[str, str], matrix: list[float], video: Video, read: lidar.LidarDepth
 ) -> Shot:
-    """Return the frame of a row of the odometry; columns that the app leaves empty, such as those of the distortion, are not
-    read.
+    """Return the frame of a row of the odometry, in which the app leaves cells empty: those of an unknown pose or lens, and
+    those of the distortion, which are not read.
     """
-    number, time, *pose = row.plain_numbers(
-        [words["frame"], words["timestamp"], *(words[name] for name in POSE)]
-    )
-    number = row.integer(words["frame"])
+    number, (time,) = row.integer(words["frame"]), row.plain_numbers([words["timestamp"]])
+    pose = row.plain_numbers([words[name] or "nan" for name in POSE])
     lens = (
         row.plain_numbers([words[name] for name in LENS]) if all(words.get(name) for name in LENS) else matrix
     )

@@ -100,7 +100,16 @@ def _files(
     endings: tuple[str, ...] = ("",),
 ) -> dict[FrameRecord, Path]:
     """Return the files of the frames that have them; a remark counts the others. Raises ``InputError`` if no image is left."""
-    found = {frame: file for frame, name in listed.items() if (file := names.find(name, endings)) is not None}
+    found = {
+        frame: file
+        for frame, name in listed.items()
+        if (file := names.find(name, endings, moved=True)) is not None
+    }
+    owner: dict[Path, PurePosixPath] = {}
+    for frame, file in found.items():  # parts of several names may fit one file
+        if owner.setdefault(file, listed[frame]) != listed[frame] and noun == "image":
+            expected = f"different images, though {owner[file]} and {listed[frame]} may both be {file}"
+            raise frame.record.error("has the image of another frame", expected=expected)
 
     def missing(frame: FrameRecord) -> InputError:
         tried = (

@@ -13,6 +13,7 @@ from bidnerf_core.datasets.capture import SPLITS, remark
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.formats.photos import timestamp
 from bidnerf_core.datasets.pose_rows import pose_and_scale
+from bidnerf_core.datasets.trajectories import LEAST_NANOSECONDS, NANOSECONDS
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
@@ -214,7 +215,7 @@ def _time(own: Record) -> float | None:
     """Return ``time`` or ``timestamp`` (seconds), or the number in the name of the ``source`` file."""
     for key in ("time", "timestamp"):
         if (found := own.number(key)) is not None:
-            return found
+            return found / NANOSECONDS if found >= LEAST_NANOSECONDS else found
     source = own.value("source")
     return timestamp(PurePosixPath(source).stem) if isinstance(source, str) else None
 

@@ -98,7 +98,7 @@ def depth_image(message: Any) -> tuple[np.ndarray, float]:
 def is_depth(message: Any) -> bool:
     """Return whether an image is a depth image, judging by its encoding."""
     if hasattr(message, "format"):
-        return "compressedDepth" in message.format
+        return "compressedDepth" in message.format or message.format.partition(";")[0].strip() in DEPTHS
     return message.encoding in ("16UC1", "32FC1")
 
 
@@ -142,7 +142,9 @@ def _decoded(content: bytes) -> Image.Image:
 
 def _compressed_depth(message: Any) -> tuple[np.ndarray, float]:
     encoding, data = message.format.partition(";")[0].strip(), bytes(message.data)
-    if "compressedDepth" not in message.format:  # a plain PNG
+    if "compressedDepth" not in message.format:  # a plain PNG, as of image_transport's "compressed"
+        if "jp" in message.format.rpartition(";")[2]:
+            raise InputError(f"depth of format {message.format!r} has lost its values", expected="png")
         return np.asarray(_decoded(data)), 0.001
     if len(data) < COMPRESSED_DEPTH.size:
         raise InputError("a compressed depth image is truncated")

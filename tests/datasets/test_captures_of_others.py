@@ -1,0 +1,290 @@
+"""Captures as people keep them: moved, copied through other systems, downscaled, exported and cloned. Each is read, or refused by name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from bidnerf_core import Frame, open_dataset, open_sequence
+from bidnerf_core.errors import InputWarning
+
+# Inside: the photos that structure from motion begins with
+from bidnerf_core.structure.sources import photos_of, refuse_panoramas
+from refusals import refused
+from scan_layouts import (
+    SMALL,
+    edit_frame,
+    edit_keys,
+    message,
+    pixels,
+    read_all,
+    remarks_of,
+    small_views,
+    write_colmap,
+    write_image,
+    write_llff,
+    write_metashape,
+    write_nerfstudio,
+    write_opensfm,
+    write_polycam,
+    write_stray_scanner,
+    write_video,
+)
+
+COUNT = 4
+JSON = "transforms.json"
+Write = Callable[[Path], Path]
+
+
+def moved(to: str) -> Write:
+    """Paths relative to the folder in which the converter ran; the photos lie in ``to`` beside the file."""
+
+    def write(root: Path) -> Path:
+        folder = write_nerfstudio(root, small_views(COUNT))
+        for number in range(COUNT):
+            edit_frame(
+                folder / JSON, number, file_path=f"./data/desk/images/r_{number}.png", depth_file_path=None
+            )
+        (folder / to).mkdir(exist_ok=True)
+        for image in (folder / "images").iterdir():
+            image.rename(folder / to / image.name)
+        return folder
+
+    return write
+
+
+def companions(write: Callable[[Path, Any], Path]) -> Write:
+    """Every file with the companion that macOS writes to other file systems."""
+
+    def copied(root: Path) -> Path:
+        folder = write(root, small_views(COUNT))
+        for file in [file for file in root.rglob("*") if file.is_file()]:
+            file.with_name(f"._{file.name}").write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
+        return folder
+
+    return copied
+
+
+def empty_columns(root: Path) -> Path:
+    """As Stray Scanner writes since 2026; the second frame has no pose, and the third no lens of its own."""
+    file = write_stray_scanner(root, small_views(COUNT + 1)) / "odometry.csv"
+    head, *rows = file.read_text().splitlines()
+    rows = [f"{row}, 20, 21, 8, 5.75, , " for row in rows]
+    rows[1] = ", ".join([*rows[1].split(", ")[:2], *[""] * 7, *rows[1].split(", ")[9:]])
+    rows[2] = rows[2].replace(", 20, 21, 8, 5.75", ", , , , ")
+    columns = ", fx, fy, cx, cy, distortion_center_x, distortion_center_y"
+    file.write_text("\n".join([head + columns, *rows]) + "\n")
+    return root
+
+
+def dense_workspace(root: Path) -> Path:
+    """COLMAP's automatic reconstruction whose photos lie elsewhere: only the undistorted images are there."""
+    write_colmap(root / "dense/0", small_views(COUNT))
+    (root / "dense/0/sparse/0").rename(root / "flat")
+    (root / "dense/0/sparse").rmdir()
+    (root / "flat").rename(root / "dense/0/sparse")
+    other = write_colmap(root / "elsewhere", small_views(COUNT))
+    (other / "sparse").rename(root / "sparse")
+    cameras = root / "sparse/0/cameras.txt"
+    cameras.write_text(f"1 SIMPLE_RADIAL {SMALL.width} {SMALL.height} 20 8 6 -0.18\n")
+    return root
+
+
+def reduced_only(write: Callable[[Path, Any], Path]) -> Write:
+    """Only images of half the size are there, in ``images_2``."""
+
+    def write_half(root: Path) -> Path:
+        folder = write(root, small_views(COUNT))
+        for image in (folder / "images").iterdir():
+            half = Image.open(image).reduce(2)
+            write_image(folder / "images_2" / image.name, np.asarray(half))
+            image.unlink()
+        (folder / "images").rmdir()
+        return folder
+
+    return write_half
+
+
+def nanoseconds(root: Path) -> Path:
+    folder = write_nerfstudio(root, small_views(COUNT))
+    for number in range(COUNT):
+        edit_frame(folder / JSON, number, timestamp=1_403_636_579_000_000_000 + number * 50_000_000)
+    return folder
+
+
+READ: dict[str, tuple[Write, str]] = {
+    "moved": (moved("images"), "'./data/desk/images/r_0.png' is taken for images/r_0.png"),
+    "moved, flat": (moved("."), "is taken for r_0.png"),
+    "Polycam from a Mac": (companions(write_polycam), ""),
+    "COLMAP from a Mac": (companions(write_colmap), ""),
+    "Stray Scanner's empty columns": (empty_columns, "1 of 5 images have no pose"),
+    "dense workspace": (dense_workspace, "dense/0/images has a model of its own"),
+    "reduced copies alone, COLMAP": (reduced_only(write_colmap), ""),
+    "reduced copies alone, LLFF": (reduced_only(write_llff), ""),
+    "masks beside a model": (
+        lambda root: [write_colmap(root, small_views(COUNT)), (root / "masks").mkdir()][0] or root, "masks lies beside the images",
+    ),
+    "times in nanoseconds": (nanoseconds, ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", READ)
+def test_what_is_kept_otherwise_is_read(kind: str, tmp_path: Path) -> None:
+    write, expected = READ[kind]
+    remarks = remarks_of(folder := write(tmp_path))
+    assert len(remarks) == (expected != "")
+    assert all(expected in remark for remark in remarks)
+    views = read_all(folder)
+    assert len(views) == COUNT
+    assert all(view.frame.intrinsics.distortion == () for view in views.values())
+    sizes = {(view.frame.intrinsics.width, view.frame.intrinsics.height) for view in views.values()}
+    assert sizes == {(8, 6) if "reduced" in kind else (SMALL.width, SMALL.height)}
+    times = [time for time in open_sequence(folder).times if time is not None]
+    assert not times or max(times) - min(times) < 2 * COUNT
+
+
+def turned(root: Path) -> Path:
+    folder = write_nerfstudio(root, small_views(COUNT))
+    for view in small_views(COUNT):
+        write_image(folder / "images" / f"{view.frame.name}.png", np.rot90(pixels(view)).copy())
+    return folder
+
+
+def edited(**keys: Any) -> Write:
+    def write(root: Path) -> Path:
+        folder = write_nerfstudio(root, small_views(COUNT))
+        edit_keys(folder / JSON, **keys)
+        return folder
+
+    return write
+
+
+def far(root: Path) -> Path:
+    folder = write_nerfstudio(root, small_views(COUNT))
+    matrix = np.eye(4)
+    matrix[0, 3] = 1e30
+    edit_frame(folder / JSON, 2, transform_matrix=matrix.tolist())
+    return folder
+
+
+def two_for_one(root: Path) -> Path:
+    """Tails of two names fit the same file: which of them it is, nobody knows."""
+    folder = write_nerfstudio(root, small_views(COUNT))
+    for number, side in ((0, "left"), (1, "right")):
+        edit_frame(folder / JSON, number, file_path=f"{side}/r_0.png")
+    (folder / "images/r_0.png").rename(folder / "r_0.png")
+    return folder
+
+
+def without_images(root: Path) -> Path:
+    folder = write_colmap(root, small_views(COUNT))
+    (folder / "sparse/0/points3D.txt").touch()
+    (folder / "sparse/0/images.txt").unlink()
+    return folder
+
+
+def splat(root: Path) -> Path:
+    (root / "point_cloud/iteration_7000").mkdir(parents=True)
+    (root / "cameras.json").write_text(json.dumps([{"id": 0, "img_name": "a", "width": 8, "height": 6}]))
+    return root
+
+
+def with_entities(root: Path) -> Path:
+    file = write_metashape(root, small_views(COUNT)) / "cameras.xml"
+    file.write_text(file.read_text().replace("?>", '?><!DOCTYPE d [<!ENTITY a "aaaa">]>'))
+    return root
+
+
+def fewer_poses(root: Path) -> Path:
+    folder = write_llff(root, small_views(COUNT))
+    np.save(folder / "poses_bounds.npy", np.load(folder / "poses_bounds.npy")[1:])
+    return folder
+
+
+def unknown_lens(root: Path) -> Path:
+    file = write_opensfm(root, small_views(COUNT)) / "reconstruction.json"
+    file.write_text(file.read_text().replace('"brown"', '"dual"'))
+    return root
+
+
+REFUSED: dict[str, tuple[Write, tuple[str, ...]]] = {
+    "turned after SfM": (turned, ("image is 12x16", "not turned by a quarter")),
+    "NaN in applied_transform": (
+        edited(applied_transform=[[float("nan")] * 4]),
+        ("applied_transform", "finite"),
+    ),
+    "a pose far away": (far, ("r_2 is at 1e+30", "below 1e+10")),
+    "one file for two names": (two_for_one, ("frame 1", "different images")),
+    "a model without images": (without_images, ("sparse/0", "no cameras and images")),
+    "output of a splat": (splat, ("output of 3D Gaussian Splatting", "bidnerf import")),
+    "entities in XML": (with_entities, ("cameras.xml", "document type")),
+    "LLFF with fewer poses": (fewer_poses, ("has 3 poses for 4 images", "one for each")),
+    "OpenSfM with an unknown lens": (unknown_lens, ("projection_type is dual", "perspective")),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_would_be_read_wrongly_is_refused(kind: str, tmp_path: Path) -> None:
+    write, expected = REFUSED[kind]
+    text = message(write(tmp_path))
+    assert all(part in text for part in expected), text
+
+
+def test_pointers_of_git_lfs_are_named(tmp_path: Path) -> None:
+    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 12345\n"
+    for name, read in (
+        ("photo.jpg", Frame.open),
+        ("walk.mp4", lambda file: open_sequence(file, hfov=60)),
+        ("transforms.json", lambda file: open_dataset(file.parent)),
+    ):
+        (tmp_path / name).write_text(pointer)
+        with refused(
+            where=tmp_path / name, found="is a pointer of Git LFS, not the file", expected="git lfs pull"
+        ):
+            read(tmp_path / name)
+
+
+def test_raw_photos_are_no_thumbnails(tmp_path: Path) -> None:
+    """A DNG is a TIFF file whose first image is a thumbnail."""
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "IMG_1.dng", format="TIFF")
+    with refused(where=tmp_path / "IMG_1.dng", found="is a raw photo"):
+        Frame.open(tmp_path / "IMG_1.dng", hfov=60)
+
+
+def test_smaller_copies_of_photos_are_left_out(tmp_path: Path) -> None:
+    for number in range(3):
+        image = Image.fromarray(np.full((63, 85, 3), 60 * number, np.uint8))
+        for folder, factor in (("images", 1), ("images_2", 2), ("images_4", 4), ("right", 1)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            size = round(85 / factor), round(63 / factor)
+            image.resize(size).save(tmp_path / folder / f"{number}.png")
+    with pytest.warns(InputWarning, match="images_2 and images_4: smaller copies"):
+        found = photos_of(tmp_path)
+    assert {image.file.parent.name for image in found} == {"images", "right"}  # two cameras of a rig
+
+
+def test_panoramas_are_not_taken_for_pinhole_images(tmp_path: Path) -> None:
+    image = Image.fromarray(np.zeros((20, 40, 3), np.uint8))
+    image.save(tmp_path / "0.jpg")
+    with pytest.warns(InputWarning, match="twice as wide as high"):
+        refuse_panoramas(photos_of(tmp_path))
+    image.save(tmp_path / "1.jpg", xmp=b'<x:xmpmeta GPano:ProjectionType="equirectangular"/>')
+    with refused(where=tmp_path / "1.jpg", found="is a panorama", expected="EQUIRECTANGULAR"):
+        refuse_panoramas(photos_of(tmp_path))
+
+
+def test_a_playlist_named_like_a_video_opens_no_other_file(tmp_path: Path) -> None:
+    """FFmpeg would follow it, whatever its name."""
+    write_video(tmp_path / "secret.mp4", [np.full((32, 48, 3), 200, np.uint8)] * 3)
+    (tmp_path / "walk.mp4").write_text(f"ffconcat version 1.0\nfile '{tmp_path / 'secret.mp4'}'\n")
+    with av.open(str(tmp_path / "walk.mp4"), options={"safe": "0"}) as followed:
+        assert len(list(followed.decode(video=0))) == 3
+    with refused(where=tmp_path / "walk.mp4", found="not readable as a video"):
+        open_sequence(tmp_path / "walk.mp4", hfov=60)
