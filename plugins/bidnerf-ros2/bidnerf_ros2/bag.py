@@ -11,6 +11,7 @@ from it.
 from __future__ import annotations
 
 import logging
+import weakref
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,11 +57,15 @@ class Bag:
         self._path, self._topics = path, topics
         self._decoded: Iterator[tuple[Any, Any | None]] = iter(())
         self._next = 0  # number of the next image to decode
+        self._begun: list[Any] = []  # the iterator, which is closed before the interpreter ends
+        weakref.finalize(self, _close, self._begun)
 
     def read(self, number: int) -> tuple[Any, Any | None]:
         """Return the message of an image, and that of its depth. Raises ``BreaksOff`` if the bag ends before it."""
         if number < self._next or self._next == 0:
+            _close(self._begun)
             self._decoded, self._next = self._paired(), 0
+            self._begun.append(self._decoded)
         try:
             for found in self._decoded:
                 self._next += 1
@@ -93,7 +98,12 @@ class Bag:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the open bag, which another process cannot use."""
-        return {**self.__dict__, "_decoded": iter(()), "_next": 0}
+        return {**self.__dict__, "_decoded": iter(()), "_next": 0, "_begun": []}
+
+
+def _close(iterators: list[Any]) -> None:
+    while iterators:
+        iterators.pop().close()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

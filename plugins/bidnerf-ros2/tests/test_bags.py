@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import bags
 from bidnerf_core import InputError, open_dataset, open_sequence
-from bidnerf_ros2.messages import colour_image, depth_image, intrinsics
+from bidnerf_ros2.messages import colour_image, depth_image, intrinsics, is_depth
 
 CAMERA = (30.0, 31.0, 15.5, 11.5)
 DRAWN = np.random.default_rng(0)
@@ -59,7 +61,7 @@ def test_depth_that_was_not_recorded_is_missing(tmp_path: Path) -> None:
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "b", MOMENTS, CAMERA)
-    with pytest.raises(InputError, match="no poses for its images"):
+    with pytest.raises(InputError, match="has no pose for any of 5 images, expected 'bidnerf track"):
         open_dataset(path)
     (tmp_path / "junk.bag").write_bytes(b"junk")
     with pytest.raises(InputError, match=r"junk\.bag: not a readable bag"):
@@ -101,6 +103,23 @@ def test_images_of_all_encodings() -> None:
     broken.data = broken.data[:100]
     with pytest.raises(InputError, match="has 100 bytes"):
         colour_image(broken)
+
+
+def test_depth_as_plain_png_is_depth() -> None:
+    """As image_transport's plugin "compressed" records it, in a topic beside the colour images."""
+    depth = np.arange(500, 500 + 24 * 32, dtype=np.uint16).reshape(24, 32)
+    content = io.BytesIO()
+    Image.fromarray(depth).save(content, format="PNG")
+    message = SimpleNamespace(format="16UC1; png compressed ", data=content.getvalue())
+    assert is_depth(message)
+    stored, unit = depth_image(message)
+    assert np.array_equal(stored, depth)
+    assert unit == 0.001
+    message.format = "16UC1; jpeg compressed "
+    assert is_depth(message)
+    with pytest.raises(InputError, match="has lost its values"):
+        depth_image(message)
+    assert not is_depth(SimpleNamespace(format="rgb8; jpeg compressed bgr8", data=b""))
 
 
 def test_cameras_after_binning_and_in_a_region() -> None:
