@@ -27,6 +27,8 @@ LARGEST_ARRAY = 800_000_000
 TENSOR_FILE = "a safetensors file"
 LARGEST_HEADER = 16 * 2**20
 """Bytes of the header of a safetensors file, which takes about a hundred per tensor."""
+MOST_AXES = 64
+"""Axes of a tensor, as in NumPy."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -86,7 +88,7 @@ def read_tensors_and_metadata(
     """
     with open_binary(path, expected) as file:
         try:
-            metadata = _checked_header(path, file, expected).get("__metadata__", {})
+            metadata = _checked_header(path, file, expected).get("__metadata__") or {}
             return tensors_from_bytes(file.read()), metadata
         except InputError:
             raise
@@ -102,7 +104,10 @@ def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]
         raise InputError("not readable (its header is truncated)", where=path, expected=expected)
     try:
         header: dict[str, Any] = parse_json(file.read(length), str(path), expected)
-        ends = [part["data_offsets"][1] for name, part in header.items() if name != "__metadata__"]
+        parts = [part for name, part in header.items() if name != "__metadata__"]
+        ends = [part["data_offsets"][1] for part in parts]
+        if max((len(part["shape"]) for part in parts), default=0) > MOST_AXES:
+            raise ValueError
         described = 8 + length + max(ends, default=0)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
         raise InputError("not readable (its header is damaged)", where=path, expected=expected) from error

@@ -346,6 +346,26 @@ def test_a_file_of_tensors_has_the_length_that_its_header_says(tensors: bytes, t
         read_tensors(tmp_path / "t")
 
 
+ENTRY = {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"a": ENTRY, "b": ENTRY}, {"a": ENTRY | {"data_offsets": [-8, 8]}}, {"a": ENTRY | {"data_offsets": ["0", "8"]}},
+        {"a": ENTRY | {"data_offsets": [0, 2**70]}}, {"a": ENTRY | {"shape": [10**30]}}, {"a": ENTRY | {"shape": [1] * 65 + [2]}},
+        {"a": [1]}, {"__metadata__": [1], "a": ENTRY}, {"__metadata__": {"x": 1}, "a": ENTRY}, [], 3,
+    ],
+    ids=lambda header: json.dumps(header)[:40],
+)  # fmt: skip
+def test_a_header_of_tensors_that_contradicts_itself_is_refused(header: Any, tmp_path: Path) -> None:
+    text = json.dumps(header).encode()
+    (tmp_path / "t").write_bytes(struct.pack("<Q", len(text)) + text + bytes(8))
+    with pytest.raises(InputError, match="expected a safetensors file") as caught:
+        read_tensors(tmp_path / "t")
+    assert len(str(caught.value)) < 400 + len(str(tmp_path))
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_arguments_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     camera, image, path = tiny.CAMERA, np.zeros((24, 24, 3), np.uint8), tmp_path / "a.png"
