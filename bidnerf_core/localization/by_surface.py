@@ -101,13 +101,16 @@ def localize_by_depth(
         evidence = replace(_evidence(exposed, best, found.margin), rendered_inliers=inliers)
     T = best.T[0].normalized()
     rivals = support(lambda T: finest.costs(states_at(T)), T, middle)
-    evidence = replace(evidence, displaced=rivals.displaced)
+    covariance, precision = _covariance(problem, refined, best, middle)
+    # A map with landmarks would confirm a pose by a camera as stated; where it does not, the alignment must be as tight as by such a camera.
+    evidence = replace(
+        evidence, displaced=rivals.displaced, precision=None if problem.matcher is None else precision
+    )
     verdict = evidence.verdict(
         f"{evidence.colour_inliers:.0%} of the measured points match the surface in position and colour"
     )
     first = path[:1] if problem.start is None else problem.start[None]
     path = SE3.cat([first, path[1:-1], T[None]])
-    covariance = _covariance(problem, refined, best, middle)
     return Localization.of(verdict, path, losses, "auto", began, float(score(best)), covariance, evidence)
 
 
@@ -282,23 +285,25 @@ def _evidence(points: Surface, best: States, margin: float) -> Support:
 
 def _covariance(
     problem: Problem, points: Surface, best: States, middle: Float[Tensor, "3"]
-) -> Float[Tensor, "6 6"]:
-    """Return the covariance of a pose that aligns measured points with the surface; positive definite.
+) -> tuple[Float[Tensor, "6 6"], float]:
+    """Return the covariance of a pose that aligns measured points with the surface, positive definite, and its precision.
 
     Along directions that the points do not determine, such as that of a bare wall, the standard deviation is the size of the scene
-    or half a turn. The uncertainties of the sensor's scale and offset, which all points share, are added.
+    or half a turn. The uncertainties of the sensor's scale and offset, which all points share, are added. The precision is the standard
+    deviation of the position without these, relative to the distance of the points.
     """
     prior = torch.tensor([points.surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
     about = torch.eye(6, dtype=torch.float64)
     about[:3, 3:] = torch.linalg.cross(middle.expand(3, 3), about[:3, :3]).mT
     hessian = about.mT @ points(best).hessian[0, :6, :6] @ about
     found = torch.linalg.inv(hessian + torch.diag(prior**-2))
+    precision = float((about @ found @ about.mT)[:3, :3].trace().sqrt() / middle.norm())
     sight = normalize((points.points - points.origins).cpu(), dim=-1).mean(0)
     for change in (problem.sensor.scale * middle, problem.sensor.offset * sight):
         shared = torch.cat([-change, torch.zeros(3, dtype=torch.float64)])
         found = found + shared[:, None] * shared
     found = about @ found @ about.mT
-    return (found + found.mT) / 2
+    return (found + found.mT) / 2, precision
 
 
 def is_blank(frame: Frame) -> bool:
