@@ -28,7 +28,7 @@ import bidnerf_core as bn
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import build_landmarks
-from bidnerf_core.maps import MapInfo
+from bidnerf_core.maps import MapInfo, rendering_scores
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import orbit
 from bidnerf_core.testing import BOUNDS, POSES, ground, view
@@ -170,7 +170,7 @@ def measured(stored: bn.Map, scene: Scene) -> dict[str, Any]:
     """Return the quality of a map, by the test photos."""
     localizer, rows = bn.Localizer(stored), []
     views = scene.dataset.views("test")
-    scores = [bn.rendering_scores(stored.render(each), each.frame).psnr for each in views]
+    scores = [rendering_scores(stored.render(each), each.frame).psnr for each in views]
     for each in views:
         found = localizer(each.frame)
         error = pose_error(found.T_world_camera, each.T_ref_camera)

@@ -24,21 +24,11 @@ import _lab
 import torch
 from torch import Tensor
 
-from bidnerf_core import (
-    InputError,
-    Localizer,
-    Map,
-    TrainOptions,
-    View,
-    load_map,
-    open_dataset,
-    render_image,
-    rendering_scores,
-    resume,
-    train,
-)
+from bidnerf_core import InputError, Localizer, Map, TrainOptions, View, load_map, open_dataset, resume, train
+from bidnerf_core.backend import render_image
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, tracked_views
+from bidnerf_core.maps import rendering_scores
 
 GROWN = 3
 """Pixels by which a mask is larger than the person."""

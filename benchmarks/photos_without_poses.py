@@ -31,6 +31,7 @@ from bidnerf_core import SE3, Frame, Map, View
 from bidnerf_core.datasets import TimedFrame
 from bidnerf_core.geometry import Similarity, fit_similarity
 from bidnerf_core.io import to_plain
+from bidnerf_core.progress import Progress
 from bidnerf_core.results import pose_error
 
 RATE = 30
@@ -103,7 +104,7 @@ def renamed(view: View, name: str) -> View:
 def _quiet() -> Any:
     last = [0.0]
 
-    def show(now: bn.Progress) -> None:
+    def show(now: Progress) -> None:
         if time.monotonic() - last[0] > 20:
             last[0] = time.monotonic()
             print(now, flush=True)

@@ -39,12 +39,13 @@ from _lab import (
 )
 from map_quality import judge
 
-from bidnerf_core import Localizer, perturb, settings_of
+from bidnerf_core import Localizer
 from bidnerf_core.backend import load_backend
-from bidnerf_core.evaluation import RowStore
+from bidnerf_core.evaluation import RowStore, perturb
 from bidnerf_core.fields import render
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain
+from bidnerf_core.localization import settings_of
 from bidnerf_core.training import Supervision
 
 RAYS = 2048

@@ -1,4 +1,7 @@
-"""The interface of a backend, the object that an entry point of ``bidnerf.backends`` names, and the usual way to make one."""
+"""The interface of a backend, the object that an entry point of ``bidnerf.backends`` names, and the usual way to make one.
+
+What backends are written with is found here, too: the contract of fields and samplers, rendering, and supervision.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,25 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.fields import RadianceField, SceneBounds
+from bidnerf_core.fields import DEPTH_RESIDUALS as DEPTH_RESIDUALS
+from bidnerf_core.fields import FieldValues as FieldValues
+from bidnerf_core.fields import HitField as HitField
+from bidnerf_core.fields import Observations as Observations
+from bidnerf_core.fields import RadianceField as RadianceField
+from bidnerf_core.fields import RayHits as RayHits
+from bidnerf_core.fields import Rays as Rays
+from bidnerf_core.fields import RaySampler as RaySampler
+from bidnerf_core.fields import RaySamples as RaySamples
+from bidnerf_core.fields import SceneBounds as SceneBounds
+from bidnerf_core.fields import Stratified as Stratified
+from bidnerf_core.fields import levels as levels
+from bidnerf_core.fields import render as render
+from bidnerf_core.fields import render_image as render_image
 from bidnerf_core.frames import View
 from bidnerf_core.registry import Plugins, interface_defects
-from bidnerf_core.training import Report
+from bidnerf_core.training import Report as Report
+from bidnerf_core.training import Supervision as Supervision
+from bidnerf_core.training import SupervisionConfig as SupervisionConfig
 
 
 @runtime_checkable

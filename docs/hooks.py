@@ -54,10 +54,17 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def public_homes() -> dict[str, str]:
-    """Return the package or module that offers each public name, as the stub of ``bidnerf_core`` states it."""
-    stub = ast.parse(Path(bidnerf_core.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
-    return {name.name: str(node.module) for node in imports for name in node.names}
+    """Return the package or module that offers each public name, as the stub of ``bidnerf_core`` and ``backend`` state it."""
+    found = {"RecipeBackend": "backend", "load_backend": "backend"}
+    for stub in (
+        Path(bidnerf_core.__file__).with_suffix(".pyi"),
+        Path(bidnerf_core.__file__).with_name("backend.py"),
+    ):
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom):
+                package = str(node.module).removeprefix("bidnerf_core.")
+                found |= {name.name: package for name in node.names if name.asname == name.name}
+    return found
 
 
 def public_names() -> str:

@@ -6,6 +6,9 @@ python examples/01_find_a_camera.py [--backend hashgrid] [--steps 600]
 import argparse
 
 import bidnerf_core as bn
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--backend", default="hashgrid")
@@ -14,15 +17,15 @@ parser.add_argument("--descent", type=int, default=120, help="steps of the local
 given = parser.parse_args()
 
 # A scene in closed form stands in for your own images, which open_dataset("FOLDER") opens.
-data = bn.closed_form_data("demo:object")
+data = closed_form_data("demo:object")
 scene = bn.train(
     data, given.backend, config={"steps": given.steps}, bake=False
 )  # load_map loads a stored one
 
 (unseen,) = data.views("test", ["0003"])
-start = bn.perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
-localizer = bn.Localizer(scene, "bid", bn.settings_of("bid", {"rays": 512, "max_steps": given.descent}))
+start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
+localizer = bn.Localizer(scene, "bid", {"rays": 512, "max_steps": given.descent})
 found = localizer(unseen.frame, start)
 
 for what, pose in (("start", start), ("found", found.T_world_camera)):
-    print(f"{what}: off by {bn.pose_error(pose, unseen.T_ref_camera)}")
+    print(f"{what}: off by {pose_error(pose, unseen.T_ref_camera)}")

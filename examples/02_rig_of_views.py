@@ -8,6 +8,9 @@ The rays are divided among the images, so a step costs the same; the pose found 
 import argparse
 
 import bidnerf_core as bn
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--backend", default="hashgrid")
@@ -15,15 +18,15 @@ parser.add_argument("--steps", type=int, default=600)
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 given = parser.parse_args()
 
-data = bn.closed_form_data("demo:object")
+data = closed_form_data("demo:object")
 scene = bn.train(data, given.backend, config={"steps": given.steps}, bake=False)
-localizer = bn.Localizer(scene, "bid", bn.settings_of("bid", {"rays": 512, "max_steps": given.descent}))
+localizer = bn.Localizer(scene, "bid", {"rays": 512, "max_steps": given.descent})
 
 # Four cameras along an arc, ten degrees apart. Only their relative poses are used; the map never saw these images.
 views = data.views("test", data.sequence("0003", count=4, angle=10))
 true = views[-1].T_ref_camera
-start = bn.perturb(true, translation=0.5, rotation_deg=12, seed=0)
+start = perturb(true, translation=0.5, rotation_deg=12, seed=0)
 
 for used in (views[-1:], views):
     found = localizer(used, start)
-    print(f"{len(used)} view(s): off by {bn.pose_error(found.T_world_camera, true)}")
+    print(f"{len(used)} view(s): off by {pose_error(found.T_world_camera, true)}")

@@ -10,6 +10,10 @@ import sys
 import tempfile
 
 import bidnerf_core as bn
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.registry import list_plugins
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("backend", nargs="?", default="hashgrid")
@@ -17,10 +21,10 @@ parser.add_argument("--steps", type=int, default=200)
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 given = parser.parse_args()
 
-for info in bn.list_plugins("backends"):  # reads only metadata, without importing any
+for info in list_plugins("backends"):  # reads only metadata, without importing any
     print(f"{info.name}: {info.fault or info.summary} ({info.distribution} {info.version})")
 
-data = bn.closed_form_data("demo:object")
+data = closed_form_data("demo:object")
 with tempfile.TemporaryDirectory() as folder:  # as `bidnerf train` and `bidnerf localize` do it
     try:
         bn.train(data, given.backend, folder, {"steps": given.steps}, bake=False)
@@ -29,8 +33,8 @@ with tempfile.TemporaryDirectory() as folder:  # as `bidnerf train` and `bidnerf
     scene = bn.load_map(folder)
 
 (unseen,) = data.views("test", ["0003"])
-start = bn.perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
-localizer = bn.Localizer(scene, "bid", bn.settings_of("bid", {"rays": 512, "max_steps": given.descent}))
+start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
+localizer = bn.Localizer(scene, "bid", {"rays": 512, "max_steps": given.descent})
 found = localizer(unseen.frame, start)
-error = bn.pose_error(found.T_world_camera, unseen.T_ref_camera)
+error = pose_error(found.T_world_camera, unseen.T_ref_camera)
 print(f"{scene.info.backend}: off by {error} after {found.steps} steps in {found.seconds:.1f} s")

@@ -9,10 +9,12 @@ import torch
 from torch.nn.functional import grid_sample, softplus
 
 import bidnerf_core as bn
+from bidnerf_core.backend import FieldValues, RecipeBackend, Stratified, Supervision, SupervisionConfig
+from bidnerf_core.scenes import closed_form_data
 
 
 @dataclass(frozen=True)
-class FogConfig(bn.SupervisionConfig):
+class FogConfig(SupervisionConfig):
     seed: int = 0
     steps: int = 80
 
@@ -20,21 +22,21 @@ class FogConfig(bn.SupervisionConfig):
 class Fog(torch.nn.Module):
     def __init__(self, config, bounds):
         super().__init__()
-        self.bounds, self.sampler = bounds, bn.Stratified(48, bounds)
+        self.bounds, self.sampler = bounds, Stratified(48, bounds)
         self.grid = torch.nn.Parameter(torch.zeros(1, 4, 32, 32, 32))
 
     def query(self, positions, directions):
         places = self.bounds.normalized(positions).reshape(1, -1, 1, 1, 3)  # in [-1, 1]
         raw = grid_sample(self.grid, places, align_corners=True).reshape(4, *positions.shape[:-1])
-        return bn.FieldValues(softplus(raw[0] - 4) * 100 / self.bounds.side, raw[1:].sigmoid().movedim(0, -1))
+        return FieldValues(softplus(raw[0] - 4) * 100 / self.bounds.side, raw[1:].sigmoid().movedim(0, -1))
 
 
 def recipe(field, views, config, report):
-    rays = bn.Supervision(views, field.bounds, config, field.grid.device)
+    rays = Supervision(views, field.bounds, config, field.grid.device)
     groups = [{"params": [field.grid], "lr": 0.1}]
     rays.fit(field, groups, lambda _, generator: rays.step(field, 512, generator), config.steps, report)
 
 
-bn.register("backends", "fog", bn.RecipeBackend("a grid of coloured fog", FogConfig, Fog, recipe))
-scene = bn.train(data := bn.closed_form_data("demo:object"), "fog", bake=False)
+bn.register("backends", "fog", RecipeBackend("a grid of coloured fog", FogConfig, Fog, recipe))
+scene = bn.train(data := closed_form_data("demo:object"), "fog", bake=False)
 print(bn.evaluate(scene, data, protocol="bid", sizes=[0.4], method="bid", trials=1))

@@ -9,6 +9,8 @@ Without maps, each backend is trained briefly, in memory, on a scene in closed f
 import argparse
 
 import bidnerf_core as bn
+from bidnerf_core.registry import list_plugins
+from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--maps", nargs="+", default=[])
@@ -21,8 +23,8 @@ given = parser.parse_args()
 if given.maps and given.data is None:
     parser.error("--maps needs --data, a dataset of what they show")
 
-data = given.data or bn.closed_form_data("demo:object")
-backends = given.backends or [info.name for info in bn.list_plugins("backends") if info.fault is None]
+data = given.data or closed_form_data("demo:object")
+backends = given.backends or [info.name for info in list_plugins("backends") if info.fault is None]
 scenes = {folder: folder for folder in given.maps} or {
     name: bn.train(data, name, config={"steps": given.steps}, bake=False) for name in backends
 }

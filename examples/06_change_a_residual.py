@@ -11,6 +11,11 @@ import argparse
 import torch
 
 import bidnerf_core as bn
+from bidnerf_core.backend import DEPTH_RESIDUALS
+from bidnerf_core.evaluation import perturb
+from bidnerf_core.localization import settings_of
+from bidnerf_core.results import pose_error
+from bidnerf_core.scenes import closed_form_data, closed_form_map
 
 
 def log_depth(rendering, observed, miss=None):
@@ -20,19 +25,19 @@ def log_depth(rendering, observed, miss=None):
     return rendering.opacity * torch.log(ratio) + (1 - rendering.opacity) * (miss or 0.0)
 
 
-bn.DEPTH_RESIDUALS["log-distance"] = log_depth
+DEPTH_RESIDUALS["log-distance"] = log_depth
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--descent", type=int, default=120, help="steps of bid")
 given = parser.parse_args()
 
-scene, data = bn.closed_form_map("demo:blobs"), bn.closed_form_data("demo:blobs")
+scene, data = closed_form_map("demo:blobs"), closed_form_data("demo:blobs")
 (view,) = data.views("test", ["0000"])
-start = bn.perturb(view.T_ref_camera, translation=0.2, rotation_deg=5, seed=0)
+start = perturb(view.T_ref_camera, translation=0.2, rotation_deg=5, seed=0)
 
 settings = {"rays": 256, "max_steps": given.descent}
 for residual, scale in (("distance", 0.1), ("log-distance", 0.03)):  # metres, or a share of the distance
-    config = bn.settings_of("bid", settings | {"depth_residual": residual, "depth_scale": scale})
+    config = settings_of("bid", settings | {"depth_residual": residual, "depth_scale": scale})
     found = bn.Localizer(scene, "bid", config)(view.frame, start)
-    error = bn.pose_error(found.T_world_camera, view.T_ref_camera)
+    error = pose_error(found.T_world_camera, view.T_ref_camera)
     print(f"{residual}: off by {error} ({found.outcome})")

@@ -18,6 +18,8 @@ from .lidar import LidarDepth as LidarDepth
 from .names import in_other_split as in_other_split
 from .names import positions as positions
 from .names import unique_names as unique_names
+from .options import DatasetOptions as DatasetOptions
+from .options import DepthRegistration as DepthRegistration
 from .points import read_depth_points as read_depth_points
 from .pose_rows import pose_of_rows as pose_of_rows
 from .queries import DatasetFrames as DatasetFrames
@@ -29,9 +31,7 @@ from .queries import depth_files as depth_files
 from .queries import photo_files as photo_files
 from .reader import READERS as READERS
 from .reader import Background as Background
-from .reader import DatasetOptions as DatasetOptions
 from .reader import DepthCamera as DepthCamera
-from .reader import DepthRegistration as DepthRegistration
 from .reader import Reader as Reader
 from .reader import find_reader as find_reader
 from .reader import no_dataset as no_dataset

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TypeAlias, TypeVar, overload
+from typing import Protocol, TypeAlias, TypeVar, overload, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Shaped
@@ -55,6 +55,7 @@ class BreaksOff(InputError):
     """A recording that is decoded in order ends too early: none of the later frames can be read either."""
 
 
+@runtime_checkable
 class Picture(Protocol):
     """An image that is not a file of its own, such as a frame of a video."""
 

@@ -1,205 +1,106 @@
-"""Readers of capture formats, and the options with which datasets, folders of images and videos are opened."""
+"""Readers of capture formats, and how datasets, folders of images and videos are opened."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from bidnerf_core.camera import Camera, CameraSource, Intrinsics
 from bidnerf_core.datasets.capture import Capture, hold_out
-from bidnerf_core.depth import FARTHEST
+from bidnerf_core.datasets.options import DatasetOptions as DatasetOptions
+from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
-from bidnerf_core.errors import InputError, InputWarning, UsageError, amount, enumeration
-from bidnerf_core.frames import HiddenColour, MaskFolder, photos_in
-from bidnerf_core.io import IMAGE_SUFFIXES, background_colour
+from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
+from bidnerf_core.frames import MaskFolder, photos_in
+from bidnerf_core.io import IMAGE_SUFFIXES
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
-DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
-"""How depth is registered to colour images: from a given sensor or its file, from the format's own sensor
-(True), or not at all (False)."""
 OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
 """An option of ``DatasetOptions`` that a format may leave open."""
 FARTHEST_CAMERA = 1e10
 """Largest coordinate of a camera: from the centre of the Earth, and in millimetres, its surface is at 6.4e9."""
-UNREGISTERED = "no"
-"""The value of ``register_depth`` with which depth is used as it is, besides False."""
 
 
-@dataclass(frozen=True)
-class DatasetOptions:
-    """How images are read: by commands, by Python and by the service; readers of a format receive the same options.
+def read_dataset(
+    options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None
+) -> Capture:
+    """Read the dataset in a folder, see ``DatasetOptions.open``."""
+    folder = Path(path)
+    if not folder.exists():
+        raise InputError("no such folder", where=folder)
+    reader = _reader_of(folder, readers)
+    if reader is None:
+        raise _without_dataset(folder, readers) if folder.is_dir() else _not_a_dataset(folder)
+    return _read(options, reader, folder).require_poses()
 
-    ``camera``, ``register_depth`` and ``depth_unit`` are passed only to readers that accept them.
+
+def read_sequence(
+    options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None
+) -> Capture:
+    """Read frames in chronological order, see ``DatasetOptions.open_sequence``."""
+    # The readers of photos and videos are not registered: they find no poses.
+    from bidnerf_core.datasets.formats.photos import PhotoReader
+    from bidnerf_core.datasets.formats.video import VideoReader
+    from bidnerf_core.datasets.video import VIDEO_SUFFIXES
+
+    place = Path(path)
+    if not place.exists():
+        raise InputError("no such file or folder", where=place)
+    others = (PhotoReader(), VideoReader())
+    reader = _reader_of(place, readers) or next((other for other in others if other.recognises(place)), None)
+    if reader is None:
+        if place.is_dir():
+            raise InputError("no images in it", where=place, expected="image files or a dataset")
+        raise _not_a_dataset(place, f", or a video ({', '.join(VIDEO_SUFFIXES)})")
+    return _read(options, reader, place).in_time_order()
+
+
+def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
+    """Return what a reader reads, in splits, with masks. Raises ``InputError`` for options that the format does not
+    accept, and if a third-party reader fails.
     """
-
-    camera: Camera | CameraSource | str | Path | None = None
-    """camera of images whose format stores none: a file with intrinsics from nerfstudio, COLMAP, ROS or OpenCV (YAML), Open3D,
-    hloc or 3D Gaussian Splatting (TUM RGB-D: also freiburg1, freiburg2 or freiburg3)"""
-
-    split: str = "train"
-    """split of the dataset; all: every image with a pose"""
-
-    register_depth: DepthRegistration | None = None
-    """file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour images;
-    'no' if depth is already registered"""
-
-    depth_unit: float | None = None
-    """metres per step of the depth images, such as 0.001 for millimetres"""
-
-    masks: str | Path | MaskFolder | None = None
-    """masks named like the images: black pixels (--mask-hides) are ignored, such as people or the robot itself"""
-
-    mask_hides: HiddenColour = "black"
-    """colour in --masks that is ignored: black or white"""
-
-    largest: int | None = None
-    """longer side to which larger images are downscaled"""
-
-    background: Background | None = None
-    """colour behind images with alpha: white or black"""
-
-    def __post_init__(self) -> None:
-        if self.masks is None and self.mask_hides != "black":
-            raise UsageError(
-                f"--mask-hides {self.mask_hides} was given without --masks", expected="the folder of masks"
-            )
-        if self.depth_unit is not None and not 0 < self.depth_unit <= FARTHEST:
-            expected = "a positive number of metres per step, such as 0.001"
-            raise InputError(f"depth_unit is {self.depth_unit:g}", expected=expected)
-
-    def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
-        """Open the dataset in the folder ``path``. Metadata are read and checked immediately, images when views are
-        requested.
-
-        Files that are listed but missing, and images without a pose, are left out with an ``InputWarning`` that counts
-        them. Raises ``InputError`` if there is no such folder, if no reader recognizes it, if nothing is left, and if
-        a metadata file is invalid.
-        """
-        folder = Path(path)
-        if not folder.exists():
-            raise InputError("no such folder", where=folder)
-        reader = _reader_of(folder, readers)
-        if reader is None:
-            raise _without_dataset(folder, readers) if folder.is_dir() else _not_a_dataset(folder)
-        return self._read(reader, folder).require_poses()
-
-    def open_sequence(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
-        """Open the frames of a dataset, a folder of images or a video in chronological order; nothing is decoded yet.
-
-        Images without a camera take it from their EXIF; images without a focal length, and videos, use one of the
-        assumed cameras of a ``CameraSource``. Raises ``InputError`` if nothing is found, if a metadata file is invalid,
-        and for a missing or superfluous camera.
-        """
-        # The readers of photos and videos are not registered: they find no poses.
-        from bidnerf_core.datasets.formats.photos import PhotoReader
-        from bidnerf_core.datasets.formats.video import VideoReader
-        from bidnerf_core.datasets.video import VIDEO_SUFFIXES
-
-        place = Path(path)
-        if not place.exists():
-            raise InputError("no such file or folder", where=place)
-        others = (PhotoReader(), VideoReader())
-        reader = _reader_of(place, readers) or next(
-            (other for other in others if other.recognises(place)), None
+    source = options.camera_source
+    if source.is_given and "camera" not in reader.accepts:
+        raise InputError("is a dataset with its own cameras; leave out the camera", where=path)
+    if source.is_given and source.camera is None and "focal" not in reader.accepts:
+        raise InputError("is a dataset", where=path, expected="a camera with all intrinsics (camera=)")
+    if options.registration not in (None, False) and "register_depth" not in reader.accepts:
+        raise InputError(
+            "has no depth, or its depth is already registered to its images; leave out register_depth",
+            where=path,
         )
-        if reader is None:
-            if place.is_dir():
-                raise InputError("no images in it", where=place, expected="image files or a dataset")
-            raise _not_a_dataset(place, f", or a video ({', '.join(VIDEO_SUFFIXES)})")
-        return self._read(reader, place).in_time_order()
-
-    @property
-    def camera_source(self) -> CameraSource:
-        """The camera as a source of cameras for single images."""
-        return self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
-
-    @property
-    def given_camera(self) -> Camera | Path | None:
-        """The camera for a format that stores none: intrinsics, or a file of them."""
-        camera = self.camera_source.camera
-        return Path(camera) if isinstance(camera, str) else camera
-
-    @property
-    def colour(self) -> tuple[float, float, float]:
-        """The background, by default black. Raises ``InputError`` for an unknown one."""
-        return background_colour("black" if self.background is None else self.background)
-
-    @property
-    def mask_folder(self) -> MaskFolder | None:
-        """The folder of masks. Raises ``InputError`` if there is no such folder, or no image in it."""
-        if self.masks is None or isinstance(self.masks, MaskFolder):
-            return self.masks
-        return MaskFolder(self.masks, self.mask_hides)
-
-    @property
-    def registration(self) -> DepthRegistration | None:
-        """``register_depth``, which is False if depth is used as it is."""
-        return False if self.register_depth == UNREGISTERED else self.register_depth
-
-    def sensor(self, where: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
-        """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the format's.
-
-        Raises ``InputError``, whose message begins with ``where``, for True if the format has no sensor, and
-        as ``DepthCamera.read`` does.
-        """
-        register = self.registration
-        if register is None or register is True:
-            if register and own is None:
-                expected = "the file of one (register_depth=)"
-                raise InputError("its depth sensor is not known", where=where, expected=expected)
-            return own
-        if register is False:
-            return None
-        return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
-
-    def _read(self, reader: Reader, path: Path) -> Capture:
-        """Return what a reader reads, in splits, with masks. Raises ``InputError`` for options that the format does not
-        accept, and if a third-party reader fails.
-        """
-        source = self.camera_source
-        if source.is_given and "camera" not in reader.accepts:
-            raise InputError("is a dataset with its own cameras; leave out the camera", where=path)
-        if source.is_given and source.camera is None and "focal" not in reader.accepts:
-            raise InputError("is a dataset", where=path, expected="a camera with all intrinsics (camera=)")
-        if self.registration not in (None, False) and "register_depth" not in reader.accepts:
-            raise InputError(
-                "has no depth, or its depth is already registered to its images; leave out register_depth",
-                where=path,
-            )
-        if self.depth_unit is not None and "depth_unit" not in reader.accepts:
-            raise InputError(
-                "has no depth images, or depth in a fixed unit; leave out depth_unit", where=path
-            )
-        try:
-            found: Any = reader.read(path, self)
-        except (InputError, OSError, MemoryError):
+    if options.depth_unit is not None and "depth_unit" not in reader.accepts:
+        raise InputError("has no depth images, or depth in a fixed unit; leave out depth_unit", where=path)
+    try:
+        found: Any = reader.read(path, options)
+    except (InputError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        if any(reader is READERS[name] for name in ORDER if name in READERS):
             raise
-        except Exception as error:
-            if any(reader is READERS[name] for name in ORDER if name in READERS):
-                raise
-            who = f"reader {type(reader).__name__} failed to open it"
-            raise InputError(f"{who}: {type(error).__name__}: {error}", where=path) from error
-        if not isinstance(found, Capture):
-            who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
-            raise InputError(who, where=path, expected="a Capture")
-        for shot in found.shots:
-            if (
-                shot.T_world_camera is not None
-                and not shot.T_world_camera.translation.abs().max() < FARTHEST_CAMERA
-            ):
-                position = ", ".join(f"{x:.3g}" for x in shot.T_world_camera.translation.tolist())
-                expected = f"coordinates below {FARTHEST_CAMERA:g}"
-                raise InputError(
-                    f"{shot.name} is at {position}", where=found.pose_file or path, expected=expected
-                )
-        shots = found.shots if found.splits else hold_out(found.shots)
-        faces = [face for shot in shots for face in shot.faces()]
-        found = replace(found, shots=[replace(shot, name="") for shot in faces], largest=self.largest)
-        return found if (masks := self.mask_folder) is None else found.masked(masks)
+        who = f"reader {type(reader).__name__} failed to open it"
+        raise InputError(f"{who}: {type(error).__name__}: {error}", where=path) from error
+    if not isinstance(found, Capture):
+        who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
+        raise InputError(who, where=path, expected="a Capture")
+    for shot in found.shots:
+        if (
+            shot.T_world_camera is not None
+            and not shot.T_world_camera.translation.abs().max() < FARTHEST_CAMERA
+        ):
+            position = ", ".join(f"{x:.3g}" for x in shot.T_world_camera.translation.tolist())
+            expected = f"coordinates below {FARTHEST_CAMERA:g}"
+            raise InputError(
+                f"{shot.name} is at {position}", where=found.pose_file or path, expected=expected
+            )
+    shots = found.shots if found.splits else hold_out(found.shots)
+    faces = [face for shot in shots for face in shot.faces()]
+    found = replace(found, shots=[replace(shot, name="") for shot in faces], largest=options.largest)
+    return found if (masks := options.mask_folder) is None else found.masked(masks)
 
 
 def open_dataset(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from jaxtyping import Float
@@ -95,9 +95,10 @@ def covariance_in(
     """Convert one of our covariances at ``T_world_camera`` to another convention (float64).
 
     A right update by (rho, phi) moves the position by ``R rho`` in the world and premultiplies the rotation
-    by ``exp(R phi)``, to first order, so both blocks are rotated for ROS. Raises ``InputError`` for an
-    unknown convention.
+    by ``exp(R phi)``, to first order, so both blocks are rotated for ROS. Case does not matter. Raises ``InputError``
+    for an unknown convention.
     """
+    convention = cast(CovarianceConvention, str(convention).lower())
     if convention not in get_args(CovarianceConvention):
         raise InputError(
             f"convention is {convention!r}", expected=f"one of {', '.join(get_args(CovarianceConvention))}"

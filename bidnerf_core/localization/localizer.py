@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,17 +80,17 @@ class Localizer:
 
     def __call__(
         self,
-        query: Frame | View | Sequence[View],
+        query: Frame | View | Sequence[View] | str | Path,
         start: Start | None = None,
         depth_rays: Observations | None = None,
         seed: int = 0,
     ) -> Localization:
         """Estimate T_world_camera of a frame, or of the last of several views.
 
-        ``query`` is a frame, or views with known relative poses (``T_ref_camera`` in any common frame): a rig, or a window of a
-        sequence. ``start`` is a guess at T_world_camera of the last view, which some methods do not need. ``depth_rays`` are
-        distances measured by another sensor, such as a lidar, in the frame of the last camera; methods that use colour alone
-        reject them. Raises ``InputError`` for a query that cannot be localized at all; a doubtful pose is returned with an
+        ``query`` is a frame, the file of a photo (whose camera is from its EXIF or the map), or views with known relative
+        poses (``T_ref_camera`` in any common frame): a rig, or a window of a sequence. ``start`` is a guess at T_world_camera
+        of the last view, which some methods do not need. ``depth_rays`` are distances measured by another sensor, such as a
+        lidar, in the frame of the last camera; methods that use colour alone reject them. Raises ``InputError`` for a query that cannot be localized at all; a doubtful pose is returned with an
         ``outcome`` other than ``CONVERGED``.
         """
         if depth_rays is not None:
@@ -100,7 +101,7 @@ class Localizer:
 
     def problem(
         self,
-        query: Frame | View | Sequence[View],
+        query: Frame | View | Sequence[View] | str | Path,
         start: Start | None = None,
         depth_rays: Observations | None = None,
     ) -> Problem:
@@ -109,6 +110,8 @@ class Localizer:
         Unlike there, ``start`` is in the map's own coordinates, see ``Map.origin``, as is the answer of ``solved``.
         """
         T_world_camera = None if start is None else start_pose(start)
+        if isinstance(query, str | Path):
+            query = Frame.open(query, assumed=self.assumed_cameras)
         views = [view.over(self.scene.bounds.background) for view in _views(query)]
         return rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
 

@@ -16,7 +16,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Outcome
-from bidnerf_core.results import normalized_error_squared
+from bidnerf_core.results import PosedImage, normalized_error_squared
 from photo_files import noise, write_photo
 
 CAMERA = Intrinsics(400.0, 410.0, 321.5, 238.0, 640, 480, (0.05, -0.02, 0.003, 0.004))
@@ -67,7 +67,7 @@ def test_the_residual_in_gtsam_is_the_same() -> None:
     t = between.translation.numpy()
     shift = t - 0.5 * w @ t + (1 - angle / (2 * np.tan(angle / 2))) / angle**2 * w @ w @ t
     residual = np.concatenate([omega, shift])
-    assert mahalanobis(residual, found().covariance_in("gtsam")) == pytest.approx(EXPECTED, rel=1e-9)
+    assert mahalanobis(residual, found().covariance_in("GTSAM")) == pytest.approx(EXPECTED, rel=1e-9)
 
 
 def test_gtsam_itself_agrees() -> None:
@@ -105,8 +105,7 @@ def test_colmap_reads_our_images_txt(lens: tuple[float, ...], tmp_path: Path) ->
     files = [write_photo(tmp_path / "photos" / name, noise(12, 16), 1) for name in ("a/one.png", "b/one.png")]
     poses = [FOUND, TRUE @ SE3.exp(random(6))]
     images = [
-        bn.PosedImage(f"{n}", n, camera, T, file)
-        for n, (T, file) in enumerate(zip(poses, files, strict=True))
+        PosedImage(f"{n}", n, camera, T, file) for n, (T, file) in enumerate(zip(poses, files, strict=True))
     ]
     (tmp_path / "model").mkdir()
     bn.write_poses(tmp_path / "model" / "images.txt", images)

@@ -23,10 +23,18 @@ from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 
 # Inside: counts how often a map is opened for its trials, and lets processes outlive an evaluation
-from bidnerf_core.evaluation import ResultTable, TrialResult, local_processes, opened, read_results
+from bidnerf_core.evaluation import (
+    Comparison,
+    ResultTable,
+    TrialResult,
+    local_processes,
+    opened,
+    read_results,
+)
 from bidnerf_core.evaluation.workers import InThisProcess
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
+from bidnerf_core.progress import Progress
 from bidnerf_core.scenes import closed_form_data, closed_form_map
 from refusals import refused
 
@@ -103,7 +111,7 @@ def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.Ca
     assert "5deg 0.05" in str(table)
     assert "bid 0.3" in str(table)
     table.save(tmp_path / "r.jsonl")
-    again = bn.ResultTable.load(tmp_path / "r.jsonl")
+    again = ResultTable.load(tmp_path / "r.jsonl")
     assert (again, str(again)) == (table, str(table))
     assert main(["report", str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "report")]) == 0
     assert str(table) in capsys.readouterr().out
@@ -279,9 +287,9 @@ def test_any_thread_evaluates_and_leaves_no_trace() -> None:
 @pytest.mark.slow
 def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
     out, stop = tmp_path / "r.jsonl", threading.Event()
-    seen: list[bn.Progress] = []
+    seen: list[Progress] = []
 
-    def stop_at_two(progress: bn.Progress) -> None:
+    def stop_at_two(progress: Progress) -> None:
         seen.append(progress)
         if progress.done == 2:
             stop.set()
@@ -299,7 +307,7 @@ def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
 
 
 def test_an_error_of_the_callback_is_the_callers_and_its_trial_is_kept(tmp_path: Path) -> None:
-    def fail(progress: bn.Progress) -> None:
+    def fail(progress: Progress) -> None:
         raise LookupError(str(progress))
 
     with pytest.raises(LookupError, match=r"trials: 1/3 trials, \d within"):
@@ -354,6 +362,6 @@ def test_maps_in_memory_and_in_folders_are_compared(
     assert [row.map for row in named.rows] == ["mine"]
     assert "mine" in str(named)
     named.save(tmp_path / "c.json")
-    assert from_plain(bn.Comparison, json.loads((tmp_path / "c.json").read_text()), "c") == named
+    assert from_plain(Comparison, json.loads((tmp_path / "c.json").read_text()), "c") == named
     with pytest.raises(bn.Cancelled):
         bn.compare([scene], data, cancel=lambda: True, **given)

@@ -16,11 +16,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from bidnerf_core import Localizer, Outcome, Tracker, TrackerConfig
+from bidnerf_core import Localizer, Outcome, Tracker
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata
-from bidnerf_core.localization import AutoConfig
+from bidnerf_core.localization import AutoConfig, TrackerConfig
 
 # Inside: flow, and the parts of a state that only rare sequences fill
 from bidnerf_core.localization.tracking.flow import alike

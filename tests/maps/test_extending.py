@@ -10,7 +10,9 @@ import pytest
 import bidnerf_core as bn
 import tiny
 from bidnerf_core.captures import stored_cameras
+from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import Cancelled
+from bidnerf_core.mapping import BakeConfig
 
 # Inside: the location of new photos alone, without the training that follows
 from bidnerf_core.maps.extending import locate
@@ -20,7 +22,7 @@ from photo_files import write_photo
 from refusals import refused
 
 STEPS = 6
-BAKE = bn.BakeConfig(rays=10_000, measured=30_000, cells=10_000)
+BAKE = BakeConfig(rays=10_000, measured=30_000, cells=10_000)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +143,7 @@ def test_what_is_no_photo_is_refused(stored: Path, photos: object, found: str, e
 
 
 def test_the_command(bidnerf: Run, map_folder: Path, tmp_path: Path) -> None:
-    bn.write_transforms(
+    write_transforms(
         tmp_path / "new",
         {"train": list(training_views()[7:9])},
     )

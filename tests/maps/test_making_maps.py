@@ -18,15 +18,18 @@ from torch import nn
 
 import bidnerf_core as bn
 import tiny
+from bidnerf_core.evaluation import perturb
 from bidnerf_core.io import FileInUse, to_plain
+from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.maps import load_info
+from bidnerf_core.maps import load_info, rendering_scores
+from bidnerf_core.progress import Progress
 from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
 from refusals import refused
 
 BAKE = BakeConfig(cells=5000)
-DESCENT = bn.settings_of("bid", {"rays": 64, "max_steps": 3})
+DESCENT = settings_of("bid", {"rays": 64, "max_steps": 3})
 
 
 IMAGES = bn.DatasetOptions(background=tiny.BACKGROUND)
@@ -40,7 +43,7 @@ def trained(out: Path | None = None, **given: Any) -> bn.Map:
 
 def answer(scene: bn.Map, method: str = "bid") -> bn.Localization:
     (view,) = tiny.views(1, seed=1)
-    start = bn.perturb(view.T_ref_camera, 0.1, 5.0, seed=0)
+    start = perturb(view.T_ref_camera, 0.1, 5.0, seed=0)
     return bn.Localizer(scene, method, DESCENT if method == "bid" else None)(view.frame, start)
 
 
@@ -104,7 +107,7 @@ def test_an_incomplete_map_is_saved_with_what_resuming_needs(whole: bn.Map, tmp_
 
 def after(steps: int) -> dict[str, Any]:
     """Return the options of a training that is cancelled in that step."""
-    seen = list[bn.Progress]()
+    seen = list[Progress]()
     return {
         "progress": seen.append,
         "cancel": lambda: any(now.stage == "training" and now.done >= steps for now in seen),
@@ -141,7 +144,7 @@ class Failed(Exception):
 def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(
     whole: bn.Map, tmp_path: Path
 ) -> None:
-    def fail(now: bn.Progress) -> None:
+    def fail(now: Progress) -> None:
         if now.stage == "training" and now.done == 7:
             raise Failed("the caller's own")
 
@@ -155,7 +158,7 @@ def test_progress_counts_and_remarks_are_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     caplog.set_level(logging.INFO, "bidnerf")
-    seen = list[bn.Progress]()
+    seen = list[Progress]()
     trained(tmp_path / "map", bake=BAKE, progress=seen.append)
     steps = [now.done for now in seen if now.stage == "training"]
     assert steps == list(range(1, tiny.STEPS + 1))
@@ -180,7 +183,7 @@ def test_a_thread_trains_while_another_localizes(scene: bn.Map, whole: bn.Map) -
 def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_path: Path) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
-    def wait(now: bn.Progress) -> None:
+    def wait(now: Progress) -> None:
         begun.set()
         assert go_on.wait(120)
 
@@ -204,7 +207,7 @@ def test_a_process_that_trains_into_the_folder_of_a_thread_is_refused(tmp_path: 
     words = ["train", str(tmp_path / "data"), "--out", str(tmp_path / "map"), "--overwrite", *tiny.options()]
     ran = list[subprocess.CompletedProcess[str]]()
 
-    def compete(now: bn.Progress) -> None:
+    def compete(now: Progress) -> None:
         if not ran:
             command = [sys.executable, "-c", program, *words]
             ran.append(subprocess.run(command, capture_output=True, text=True, timeout=300))
@@ -259,12 +262,12 @@ def test_a_notebook_shows_a_map_in_a_line(scene: bn.Map) -> None:
 def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
     (view,) = tiny.views(1, seed=1)
     image = scene.render(view)
-    scores = bn.rendering_scores(image, view.frame)
+    scores = rendering_scores(image, view.frame)
     error = (image.rgb - view.frame.rgb).square().mean()
     assert scores.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-3)
     assert view.frame.depth is not None
     assert len(scores.depth_errors) == int((view.frame.depth > 0).sum())
-    perfect = bn.rendering_scores(type(image)(view.frame.rgb, view.frame.depth, image.opacity), view.frame)
+    perfect = rendering_scores(type(image)(view.frame.rgb, view.frame.depth, image.opacity), view.frame)
     assert perfect.depth_error == 0
     assert not torch.equal(scene.render(view, level=0).rgb, image.rgb)
     with refused(where="map in memory", found="no level 2", expected="0 to 1"):
@@ -350,10 +353,10 @@ data = bn.open_dataset("capture")
 scene = bn.train(data, config=config, bake=False)
 print(scene.describe())
 view = data.views("test", ["t_0000"])[0]
-start = bn.perturb(view.T_ref_camera, translation=0.1, rotation_deg=5, seed=0)
-found = bn.Localizer(scene, "bid", bn.settings_of("bid", {"max_steps": 3}))(view.frame, start)
-print(found.outcome, bn.pose_error(found.T_world_camera, view.T_ref_camera))
-picture = bn.overlay(scene, view.frame, found)
+start = perturb(view.T_ref_camera, translation=0.1, rotation_deg=5, seed=0)
+found = bn.Localizer(scene, "bid", settings_of("bid", {"max_steps": 3}))(view.frame, start)
+print(found.outcome, pose_error(found.T_world_camera, view.T_ref_camera))
+picture = overlay(scene, view.frame, found)
 """
     assert len(script.strip().splitlines()) <= 12
     names: dict[str, Any] = {"config": tiny.config(3)}

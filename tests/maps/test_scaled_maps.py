@@ -16,8 +16,9 @@ from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, locked
 
 # Inside: the place of a map by its name
-from bidnerf_core.maps import Anchor, Map, MapInfo, load_info
+from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
 from bidnerf_core.maps.known_lengths import place_of
+from bidnerf_core.results import read_positions
 from bidnerf_core.testing import BOUNDS, CAMERA, textured_map, unseen
 from commands import Run
 from refusals import refused
@@ -67,11 +68,11 @@ def test_scaling_back_gives_the_same_answers(ground: Map) -> None:
 
 
 def test_a_known_length_gives_the_factor(ground: Map) -> None:
-    assert bn.factor_of_distance(ground, "c0", "c1", 2.8284271247) == pytest.approx(2)
-    assert bn.factor_of_distance(ground, "0,0,0", (0.0, 3.0, 4.0), 1.0) == pytest.approx(0.2)
+    assert factor_of_distance(ground, "c0", "c1", 2.8284271247) == pytest.approx(2)
+    assert factor_of_distance(ground, "0,0,0", (0.0, 3.0, 4.0), 1.0) == pytest.approx(0.2)
     low, high = (f"c0@{0.25 * CAMERA.width},{y * CAMERA.height}" for y in (0.4, 0.6))
-    apart = bn.factor_of_distance(ground, low, high, 1.0)
-    assert bn.factor_of_distance(ground.scaled(0.5), low, high, 1.0) == pytest.approx(2 * apart, rel=1e-3)
+    apart = factor_of_distance(ground, low, high, 1.0)
+    assert factor_of_distance(ground.scaled(0.5), low, high, 1.0) == pytest.approx(2 * apart, rel=1e-3)
     held_out = "photos held out for tests are not in the map"
     for bad, found, instead in (
         ("nobody", "no place 'nobody' in the map: none of its 3 cameras", "a name such as 'c0'"),
@@ -83,9 +84,9 @@ def test_a_known_length_gives_the_factor(ground: Map) -> None:
         ("c1", "c1 and c1", "the same place"),
     ):
         with refused(found=found) as caught:
-            bn.factor_of_distance(ground, bad, "c1", 1.0)
+            factor_of_distance(ground, bad, "c1", 1.0)
         assert instead in caught.error.found
-    assert bn.factor_of_distance(ground, "c0.png", "c1.JPG", 2.8284271247) == pytest.approx(2)
+    assert factor_of_distance(ground, "c0.png", "c1.JPG", 2.8284271247) == pytest.approx(2)
     file, name = f"c0.png@{0.25 * CAMERA.width},1", f"c0@{0.25 * CAMERA.width},1"
     assert torch.equal(place_of(ground, file), place_of(ground, name))
 
@@ -97,17 +98,17 @@ def test_known_poses_give_the_factor(ground: Map) -> None:
         camera.name: T_other_world @ bn.SE3(camera.pose.rotation, 3 * camera.pose.translation)
         for camera in ground.info.cameras
     }
-    fit = bn.factor_of_poses(ground, known | {"elsewhere": bn.SE3.identity()})
+    fit = factor_of_poses(ground, known | {"elsewhere": bn.SE3.identity()})
     assert fit.factor == pytest.approx(3)
     assert (fit.cameras, fit.error) == (3, pytest.approx(0, abs=1e-9))
     with refused(found="1 of 1 known poses", expected="at least 3"):
-        bn.factor_of_poses(ground, {"c0": known["c0"]})
+        factor_of_poses(ground, {"c0": known["c0"]})
     wrong = {
         name: bn.SE3(known["c0"].rotation, torch.tensor([x, 0.0, 0.0]).double())
         for name, x in (("c0", 0), ("c1", 1), ("c2", 9))
     }
     with refused(found="m (root mean square)", expected="known positions of the same capture"):
-        bn.factor_of_poses(ground, wrong)
+        factor_of_poses(ground, wrong)
 
 
 def test_a_map_in_metres_that_is_scaled_again_is_remarked(
@@ -124,14 +125,14 @@ def test_a_map_in_metres_that_is_scaled_again_is_remarked(
 def test_known_positions_come_from_a_file(ground: Map, tmp_path: Path) -> None:
     known, file = {c.name: 3 * c.pose.translation for c in ground.info.cameras}, tmp_path / "known.json"
     file.write_text(json.dumps({f"{name}.jpg": place.tolist() for name, place in known.items()}))
-    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(3)
+    assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(3)
     poses = [{"frame": c.name, "T_world_camera": c.pose.matrix().tolist()} for c in ground.info.cameras]
     file.write_text(json.dumps(poses))
-    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(1)
     file.write_text("\n".join(map(json.dumps, poses)))
-    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(1)
     file.write_text(json.dumps({pose["frame"]: pose["T_world_camera"] for pose in poses}))
-    assert bn.factor_of_poses(ground, bn.read_positions(file)).factor == pytest.approx(1)
+    assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(1)
     form = '{"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_camera": 4x4 rows}, ...]'
     for wrong in (
         '{"c0": [1, 2]}',
@@ -143,7 +144,7 @@ def test_known_positions_come_from_a_file(ground: Map, tmp_path: Path) -> None:
     ):
         file.write_text(wrong)
         with refused(where=file) as caught:
-            bn.read_positions(file)
+            read_positions(file)
         assert caught.error.expected == form
 
 

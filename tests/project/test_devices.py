@@ -14,7 +14,8 @@ from torch import Tensor, nn
 import baked
 import module_fields
 import tiny
-from bidnerf_core import Localizer, Map, load_backend
+from bidnerf_core import Localizer, Map
+from bidnerf_core.backend import load_backend
 from bidnerf_core.devices import moved
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import AutoConfig

@@ -21,11 +21,21 @@ import bidnerf_core as bn
 import drawn
 from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets import Photos, Shot, write_transforms
+from bidnerf_core.datasets import Capture, Photos, Shot, write_transforms
 from bidnerf_core.frames import BLACK, View
 from bidnerf_core.localization import Evidence
 from bidnerf_core.progress import Progress
-from bidnerf_core.results import Answer, Answers, Failure, TrajectoryErrors, localize_each, within
+from bidnerf_core.results import (
+    Answer,
+    Answers,
+    Failure,
+    PosedImage,
+    TrajectoryErrors,
+    localize_each,
+    overlay,
+    read_pose,
+    within,
+)
 from bidnerf_core.testing import textured_map
 from drawn import record
 from flights import covered, flight
@@ -96,7 +106,7 @@ class Damaged(Shot):
 def test_a_frame_that_cannot_be_read_is_left_out_with_a_warning(folder: Path, tmp_path: Path) -> None:
     sound = bn.open_sequence(folder)
     places = [Damaged(stem=f"{n}") if n in (1, 3) else shot for n, shot in enumerate(sound.shots)]
-    frames = bn.Capture(folder, places, sound.background)
+    frames = Capture(folder, places, sound.background)
     with pytest.warns(InputWarning, match="left out") as caught:
         path = bn.track(scene(), frames)
     assert [str(each.message) for each in caught] == ["1: damaged; left out", "3: damaged; left out"]
@@ -107,17 +117,17 @@ def test_a_frame_that_cannot_be_read_is_left_out_with_a_warning(folder: Path, tm
 
 def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
     _, frame, T = flight()[0]
-    picture = bn.overlay(scene(), frame, T)
+    picture = overlay(scene(), frame, T)
     assert picture.dtype == np.uint8
     assert picture.ndim == 3
     assert picture.shape[1] > 2 * picture.shape[0]  # three tiles beside each other
-    off = bn.overlay(scene(), frame, T @ SE3.exp(torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]).double()))
+    off = overlay(scene(), frame, T @ SE3.exp(torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]).double()))
     third = picture.shape[1] // 3
     assert np.array_equal(picture[:, :third], off[:, :third])  # the photo
     assert not np.array_equal(picture[:, third:], off[:, third:])
-    with_start = bn.overlay(scene(), frame, T, start=T)
+    with_start = overlay(scene(), frame, T, start=T)
     assert with_start.shape[0] > picture.shape[0]
-    assert np.array_equal(bn.overlay(scene(), frame, T.matrix().numpy()), picture)
+    assert np.array_equal(overlay(scene(), frame, T.matrix().numpy()), picture)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -131,7 +141,7 @@ def test_an_overlay_of_something_else_is_refused() -> None:
     ]
     for arguments, where, found, expected in wrong:
         with refused(where=where, found=found, expected=expected):
-            bn.overlay(*arguments)
+            overlay(*arguments)
 
 
 # Files of localizations.
@@ -157,7 +167,7 @@ def test_any_localization_is_loaded_as_it_was_saved(found: Localization, tmp_pat
     found.save(tmp_path / "found.json")
     again, T = Localization.load(tmp_path / "found.json"), found.T_world_camera.matrix()
     assert again.plain() | {"T_world_camera": None} == found.plain() | {"T_world_camera": None}
-    for pose in (again.T_world_camera, bn.read_pose(tmp_path / "found.json")):
+    for pose in (again.T_world_camera, read_pose(tmp_path / "found.json")):
         torch.testing.assert_close(pose.matrix(), T, rtol=0, atol=1e-12)
     assert math.isnan(again.loss) or again.loss == found.loss
 
@@ -184,7 +194,7 @@ def test_a_file_of_another_kind_is_no_localization(
 
 @pytest.mark.parametrize("name", ["poses.txt", "transforms.json"])
 def test_a_pose_that_is_not_finite_is_refused_where_a_format_has_no_null(tmp_path: Path, name: str) -> None:
-    image = bn.PosedImage("a", 0, CAMERA, SE3(T.rotation, T.translation * math.nan))
+    image = PosedImage("a", 0, CAMERA, SE3(T.rotation, T.translation * math.nan))
     with refused(found="the pose of a is not finite", expected="a .json file"):
         bn.write_poses(tmp_path / name, [image])
     bn.write_poses(tmp_path / "poses.json", [image])

@@ -29,16 +29,9 @@ import pytest
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
-from bidnerf_core import (
-    InputError,
-    ServiceClient,
-    ServiceError,
-    ServiceLimits,
-    open_dataset,
-    serve,
-    service_app,
-    settings_of,
-)
+from bidnerf_core import InputError, ServiceClient, open_dataset, serve
+from bidnerf_core.localization import settings_of
+from bidnerf_core.service import ServiceError, ServiceLimits, service_app
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
 from bidnerf_core.service.models import Localization, MapFacts, PhotoParameters

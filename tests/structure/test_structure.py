@@ -21,12 +21,14 @@ from PIL import Image
 
 import bidnerf_core as bn
 import tiny
+from bidnerf_core.datasets import write_transforms
 from bidnerf_core.geometry import fit_similarity
 
 # Inside: each stage of the search for poses, with its damaged files and rare geometry
 from bidnerf_core.maps.training import posed_images, poses_folder
+from bidnerf_core.progress import Progress
 from bidnerf_core.results import pose_error
-from bidnerf_core.structure import lacks_poses
+from bidnerf_core.structure import FoundPoses, lacks_poses
 from bidnerf_core.structure.agreement import Agreement, agreement
 from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
@@ -54,7 +56,7 @@ class Search:
 
     photos: Path
     out: Path
-    found: bn.FoundPoses
+    found: FoundPoses
     cancelled: str
     stages: list[list[str]]  # of each run
 
@@ -238,7 +240,7 @@ def test_too_few_photos_and_photos_without_overlap(tmp_path: Path) -> None:
         write_photos(apart, walk(1), seed, first=seed)
     assert not (tmp_path / "out").exists()
     for found_again in (3, 0, 3):
-        stages = list[bn.Progress]()
+        stages = list[Progress]()
         with refused(where=apart, found="no three of 3 photos could be placed: no two of them overlap"):
             bn.find_poses(apart, tmp_path / "out", progress=stages.append)
         assert sum(now.stage == "finding keypoints" for now in stages) == found_again
@@ -429,7 +431,7 @@ def test_split_all_reads_every_view_once(tmp_path: Path) -> None:
         ]
         for split, value, pose in zip(("train", "test"), (0.2, 0.8), walk(2), strict=True)
     }
-    bn.write_transforms(tmp_path, frames)
+    write_transforms(tmp_path, frames)
     read = bn.open_dataset(tmp_path).views("all")
     assert [view.frame.name for view in read] == ["train_a", "train", "test_a", "test"]
     single = tmp_path / "single"
@@ -438,7 +440,7 @@ def test_split_all_reads_every_view_once(tmp_path: Path) -> None:
 
 
 def write_single(folder: Path, view: bn.View) -> None:
-    bn.write_transforms(folder, {"train": [view]})
+    write_transforms(folder, {"train": [view]})
     (folder / "transforms_train.json").rename(folder / "transforms.json")
 
 

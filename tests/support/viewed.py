@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from bidnerf_core import SE3, BakeConfig, Frame, TrainOptions, View, train
+from bidnerf_core import SE3, Frame, TrainOptions, View, train
 from bidnerf_core.datasets import Query
+from bidnerf_core.mapping import BakeConfig
 from photo_room import CAMERA, HALF, photograph
 from photo_room import walk as walk
 from tiny import config

@@ -15,9 +15,10 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import viewed
-from bidnerf_core import Localizer, Map, ServiceLimits
+from bidnerf_core import Localizer, Map
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import Photos
+from bidnerf_core.service import ServiceLimits
 from bidnerf_core.viewer import LiveView, serve_view
 from photo_room import CAMERA
 

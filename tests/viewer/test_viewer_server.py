@@ -21,8 +21,9 @@ pytest.importorskip("uvicorn", reason="the extra 'viewer' is not installed")
 from PIL import Image
 
 import viewed
-from bidnerf_core import Localizer, Map, settings_of
+from bidnerf_core import Localizer, Map
 from bidnerf_core.camera import CameraSource
+from bidnerf_core.localization import settings_of
 
 # Inside: the queue of localizations, of which requests show only the results
 from bidnerf_core.viewer.jobs import PLACES, Jobs

@@ -1,0 +1,147 @@
+"""The options with which images are read. Importing them imports neither torch nor a reader, for the sake of help pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, Union
+
+from bidnerf_core.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from bidnerf_core.camera import Camera, CameraSource
+    from bidnerf_core.datasets.capture import Capture
+    from bidnerf_core.datasets.reader import Reader
+    from bidnerf_core.depth import DepthCamera
+    from bidnerf_core.frames import MaskFolder
+    from bidnerf_core.io import Background
+
+DepthRegistration: TypeAlias = Union[bool, "DepthCamera", str, Path]
+"""How depth is registered to colour images: from a given sensor or its file, from the format's own sensor
+(True), or not at all (False)."""
+UNREGISTERED = "no"
+"""The value of ``register_depth`` with which depth is used as it is, besides False."""
+
+
+@dataclass(frozen=True)
+class DatasetOptions:
+    """How images are read: by commands, by Python and by the service; readers of a format receive the same options.
+
+    ``camera``, ``register_depth`` and ``depth_unit`` are passed only to readers that accept them. The command line has an option
+    for each field, called as its annotation says and described by the text below it.
+    """
+
+    camera: Annotated[Camera | CameraSource | str | Path | None, "CAMERA.json"] = None
+    """camera of images whose format stores none: a file with intrinsics from nerfstudio, COLMAP, ROS or OpenCV (YAML), Open3D,
+    hloc or 3D Gaussian Splatting (TUM RGB-D: also freiburg1, freiburg2 or freiburg3)"""
+
+    split: Annotated[str, "NAME"] = "train"
+    """split of the dataset; all: every image with a pose"""
+
+    register_depth: Annotated[DepthRegistration | None, "SENSOR.json"] = None
+    """file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour images;
+    'no' if depth is already registered"""
+
+    depth_unit: Annotated[float | None, "METRES"] = None
+    """metres per step of the depth images, such as 0.001 for millimetres"""
+
+    masks: Annotated[str | Path | MaskFolder | None, "DIR"] = None
+    """masks named like the images: black pixels (--mask-hides) are ignored, such as people or the robot itself"""
+
+    mask_hides: Annotated[Literal["black", "white"], "COLOUR"] = "black"
+    """colour in --masks that is ignored: black or white"""
+
+    largest: Annotated[int | None, "PX"] = None
+    """longer side to which larger images are downscaled"""
+
+    background: Annotated[Background | None, "COLOUR"] = None
+    """colour behind images with alpha: white or black"""
+
+    def __post_init__(self) -> None:
+        if self.masks is None and self.mask_hides != "black":
+            raise UsageError(
+                f"--mask-hides {self.mask_hides} was given without --masks", expected="the folder of masks"
+            )
+        if self.depth_unit is None:
+            return
+        from bidnerf_core.depth import FARTHEST
+
+        if not 0 < self.depth_unit <= FARTHEST:
+            expected = "a positive number of metres per step, such as 0.001"
+            raise InputError(f"depth_unit is {self.depth_unit:g}", expected=expected)
+
+    def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
+        """Open the dataset in the folder ``path``. Metadata are read and checked immediately, images when views are
+        requested.
+
+        Files that are listed but missing, and images without a pose, are left out with an ``InputWarning`` that counts
+        them. Raises ``InputError`` if there is no such folder, if no reader recognizes it, if nothing is left, and if
+        a metadata file is invalid.
+        """
+        from bidnerf_core.datasets.reader import read_dataset
+
+        return read_dataset(self, path, readers)
+
+    def open_sequence(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
+        """Open the frames of a dataset, a folder of images or a video in chronological order; nothing is decoded yet.
+
+        Images without a camera take it from their EXIF; images without a focal length, and videos, use one of the
+        assumed cameras of a ``CameraSource``. Raises ``InputError`` if nothing is found, if a metadata file is invalid,
+        and for a missing or superfluous camera.
+        """
+        from bidnerf_core.datasets.reader import read_sequence
+
+        return read_sequence(self, path, readers)
+
+    @property
+    def camera_source(self) -> CameraSource:
+        """The camera as a source of cameras for single images."""
+        from bidnerf_core.camera import CameraSource
+
+        return self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
+
+    @property
+    def given_camera(self) -> Camera | Path | None:
+        """The camera for a format that stores none: intrinsics, or a file of them."""
+        camera = self.camera_source.camera
+        return Path(camera) if isinstance(camera, str) else camera
+
+    @property
+    def colour(self) -> tuple[float, float, float]:
+        """The background, by default black. Raises ``InputError`` for an unknown one."""
+        from bidnerf_core.io import background_colour
+
+        return background_colour("black" if self.background is None else self.background)
+
+    @property
+    def mask_folder(self) -> MaskFolder | None:
+        """The folder of masks. Raises ``InputError`` if there is no such folder, or no image in it."""
+        from bidnerf_core.frames import MaskFolder
+
+        if self.masks is None or isinstance(self.masks, MaskFolder):
+            return self.masks
+        return MaskFolder(self.masks, self.mask_hides)
+
+    @property
+    def registration(self) -> DepthRegistration | None:
+        """``register_depth``, which is False if depth is used as it is."""
+        return False if self.register_depth == UNREGISTERED else self.register_depth
+
+    def sensor(self, where: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
+        """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the format's.
+
+        Raises ``InputError``, whose message begins with ``where``, for True if the format has no sensor, and
+        as ``DepthCamera.read`` does.
+        """
+        from bidnerf_core.depth import DepthCamera
+
+        register = self.registration
+        if register is None or register is True:
+            if register and own is None:
+                expected = "the file of one (register_depth=)"
+                raise InputError("its depth sensor is not known", where=where, expected=expected)
+            return own
+        if register is False:
+            return None
+        return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
