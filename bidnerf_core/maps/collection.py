@@ -30,7 +30,7 @@ from bidnerf_core.localization import (
     unit_of,
 )
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detected, find_features, pooled_views
-from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of, load_info
+from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.store import load_landmarks
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
@@ -115,7 +115,10 @@ class MapCollection:
         self._maps = _named([scenes] if isinstance(scenes, str | Path) else scenes)
         self._localizers: OrderedDict[str, Localizer] = OrderedDict()
         self._given_localizers = localizers or {}
-        self._infos = {name: _info(scene) for name, scene in self._maps.items()}
+        self._infos = {
+            name: scene.info if isinstance(scene, Map) else load_info(scene)
+            for name, scene in self._maps.items()
+        }
         self._pooled: dict[str, Float[Tensor, "v p"]] = {}
         self._vocabularies: dict[tuple[str, int], Vocabulary] = {}
         with job_context(progress, cancel):
@@ -213,9 +216,9 @@ class MapCollection:
         landmarks: dict[str, LandmarkMap] = {}
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
             check_cancelled("reading maps")
-            found = _landmarks(scene, self._infos[name])
+            found = scene.landmarks if isinstance(scene, Map) else load_landmarks(scene, self._infos[name])
             if found is not None and len(found):
-                landmarks[name] = found
+                landmarks[name] = found.to("cpu")
             count(number, len(self._maps))
         keys = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
         for key in dict.fromkeys(keys.values()):
@@ -247,31 +250,16 @@ def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str,
         if not scenes:
             raise InputError("no map in it", where=given, expected="a map or a folder of maps")
         for scene in scenes:
-            name = (
-                scene.info.data or "map" if isinstance(scene, Map) and scene.folder is None else _name(scene)
-            )
+            folder = scene.folder if isinstance(scene, Map) else scene
+            name = "map" if folder is None else folder.resolve().name
+            if isinstance(scene, Map) and folder is None:
+                name = scene.info.data or name
             if name in found:
                 raise InputError(f"two maps are named {name!r}", expected="folders with different names")
             found[name] = scene
     if not found:
         raise InputError("no maps", expected="at least one")
     return found
-
-
-def _name(scene: Map | Path) -> str:
-    folder = scene.folder if isinstance(scene, Map) else scene
-    assert folder is not None
-    return folder.resolve().name
-
-
-def _info(scene: Map | Path) -> MapInfo:
-    return scene.info if isinstance(scene, Map) else load_info(scene)
-
-
-def _landmarks(scene: Map | Path, info: MapInfo) -> LandmarkMap | None:
-    if isinstance(scene, Map):
-        return None if scene.landmarks is None else scene.landmarks.to("cpu")
-    return load_landmarks(scene, info)
 
 
 def _unrecognised(reason: str, method: str) -> Localization:

@@ -281,25 +281,22 @@ class Map:
         """
         check_cancelled("baking")
         scene = self.with_parts(surface or bake_surface(self.info, self.field, views, config, self.name))
-        if not views and not rendered_landmarks and (photos := self._landmarks_from_photos()) is not None:
-            log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
-            return replace(scene, landmarks=photos)
+        if not views and not rendered_landmarks and self.info.landmark_source != "rendered images":
+            photos = self.landmarks
+            if photos is None and self.folder is not None:
+                try:
+                    photos = load_landmarks(self.folder, self.info)
+                except InputError as error:  # damaged, so that they are replaced
+                    log.info(str(error))
+            if photos is not None:
+                log.info(
+                    f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them"
+                )
+                return replace(scene, landmarks=photos)
         check_cancelled("baking")
         info, landmarks, record = bake_landmarks(self.info, self.field, views, self.name, tracked, scene.up)
         info = replace(info, surface=scene.info.surface)
         return replace(scene, info=info).with_parts(None, landmarks, record)
-
-    def _landmarks_from_photos(self) -> LandmarkMap | None:
-        """Return the landmarks that were built from photos, unless their file is damaged."""
-        if self.info.landmark_source == "rendered images":
-            return None
-        if self.landmarks is not None or self.folder is None:
-            return self.landmarks
-        try:
-            return load_landmarks(self.folder, self.info)
-        except InputError as error:
-            log.info(str(error))
-            return None
 
     def with_parts(
         self,

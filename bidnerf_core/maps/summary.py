@@ -27,6 +27,12 @@ if TYPE_CHECKING:
     from bidnerf_core.maps.map import Map
 
 
+OF_DESCRIPTION = (
+    "backend", "data", "added", "unit", "distances", "step", "complete", "bounds", "origin", "config", "bidnerf", "colour_noise",
+)  # fmt: skip
+"""The facts that are those of the map's description."""
+
+
 @dataclass(frozen=True)
 class SurfaceSize:
     """The size of a map's surface."""
@@ -81,34 +87,24 @@ class MapSummary:
             size = SurfaceSize(surface.cell, surface.stored_cells, round(surface.mebibytes, 1))
         if folder is not None:
             files = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+        landmarks = scene.landmarks
         return MapSummary(
             map="" if folder is None else str(folder),
-            backend=info.backend,
-            data=info.data,
             cameras=len(info.cameras),
-            added=info.added,
-            unit=info.unit,
             up=scene.up,
-            distances=info.distances,
             poses=refinement,
-            step=info.step,
-            complete=info.complete,
             seconds=round(info.seconds, 1),
             levels=len(levels(field)),
             parameters=sum(p.numel() for p in field.parameters()) if isinstance(field, nn.Module) else 0,
             surfels=0 if surface is None else len(surface.surfels),
             surface=size,
-            landmarks=0 if scene.landmarks is None else len(scene.landmarks),
-            trial=None if scene.landmarks is None else scene.landmarks.trial,
+            landmarks=0 if landmarks is None else len(landmarks),
+            trial=None if landmarks is None else landmarks.trial,
             bytes=files,
-            bounds=info.bounds,
-            origin=info.origin,
-            config=info.config,
-            bidnerf=info.bidnerf,
             moved=tuple(moved_cameras(info.cameras)),
             capture=capture,
-            colour_noise=info.colour_noise,
             remarks=tuple(remarks),
+            **{name: getattr(info, name) for name in OF_DESCRIPTION},
         )
 
     def plain(self) -> dict[str, Any]:
@@ -123,54 +119,41 @@ class MapSummary:
 
     def _lines(self) -> dict[str, str]:
         photos = amount(self.cameras, "image") if self.cameras else "cameras not recorded"
+        added = f", {self.added} of which were added later" if self.added else ""
         state = "complete" if self.complete else "not complete; 'bidnerf train --resume' continues it"
         time = duration_text(self.seconds)
         place = f"{self.map}, {(self.bytes or 0) / 2**20:.1f} MiB" if self.map else "in memory"
+        field, frame = (
+            f"{amount(self.parameters, 'parameter')} in {amount(self.levels, 'level')}",
+            "lengths in ",
+        )
+        if self.colour_noise is not None:
+            field += f", off by {self.colour_noise:.1%} of the range of colours on its training images (RMS)"
+        frame += (
+            "metres" if self.unit == "metres" else "units of unknown length ('bidnerf scale' gives metres)"
+        )
+        if self.up is not None:
+            sources = {"gravity": "gravity", "planes": "planes and cameras", "cameras": "the cameras"}
+            up = _shown(tuple(round(x, 4) for x in self.up.direction))
+            frame += f"; up is {up}, by {sources[self.up.source]}"
+        surface = "none; 'bidnerf bake MAP' builds it"
+        if self.surface is not None:
+            cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
+            surface = f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
+        origin = {"origin": f"{_shown(self.origin)}, to which positions are relative"}
         return {
             "map": f"{place}, written by bidnerf {self.bidnerf}",
-            "made from": f"{self.data or 'views in memory'}, {photos}{self._added}",
+            "made from": f"{self.data or 'views in memory'}, {photos}{added}",
             "training": f"{self.step} steps of backend {self.backend} in {time}, {state}",
-            "field": self._field_line(),
+            "field": field,
             "scene": _scene_line(self.bounds),
-            **(
-                {"origin": f"{_shown(self.origin)}, to which positions are relative"}
-                if any(self.origin)
-                else {}
-            ),
+            **(origin if any(self.origin) else {}),
             "distances": "known" if self.distances else "unknown, since all images were taken from one place",
-            "frame": self._frame_line(),
-            "surface": self._surface_line(),
+            "frame": frame,
+            "surface": surface,
             "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
             "settings": _shown(self.config),
         }
-
-    @property
-    def _added(self) -> str:
-        return f", {self.added} of which were added later" if self.added else ""
-
-    def _field_line(self) -> str:
-        error = ""
-        if self.colour_noise is not None:
-            error = f", off by {self.colour_noise:.1%} of the range of colours on its training images (RMS)"
-        return f"{amount(self.parameters, 'parameter')} in {amount(self.levels, 'level')}{error}"
-
-    def _frame_line(self) -> str:
-        """Return the unit and the upward direction, in words."""
-        unit = "metres" if self.unit == "metres" else "units of unknown length ('bidnerf scale' gives metres)"
-        if self.up is None:
-            return f"lengths in {unit}"
-        source = {"gravity": "gravity", "planes": "planes and cameras", "cameras": "the cameras"}[
-            self.up.source
-        ]
-        return (
-            f"lengths in {unit}; up is {_shown(tuple(round(x, 4) for x in self.up.direction))}, by {source}"
-        )
-
-    def _surface_line(self) -> str:
-        if self.surface is None:
-            return "none; 'bidnerf bake MAP' builds it"
-        cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
-        return f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
 
 
 def _scene_line(bounds: SceneBounds) -> str:

@@ -156,7 +156,9 @@ def test_the_command(
         return known[folder.name]
 
     monkeypatch.setattr(collections_module, "load_info", lambda folder: known[folder.name].info)
-    monkeypatch.setattr(collections_module, "_landmarks", lambda scene, info: known[scene.name].landmarks)
+    monkeypatch.setattr(
+        collections_module, "load_landmarks", lambda folder, info: known[folder.name].landmarks
+    )
     monkeypatch.setattr(collections_module, "load_map", load)
     for name in known:
         (tmp_path / "maps" / name).mkdir(parents=True)
