@@ -1,9 +1,10 @@
 """The geographic anchor of a map, which states where on earth the map lies: key ``anchor`` of ``map.json``.
 
-A file ``anchor.json`` next to ``map.json``, which users may write, takes its place until the map is saved. An anchor holds ``latitude`` and ``longitude`` (degrees) and ``height`` (metres above the WGS 84 ellipsoid) of a
-point, and ``T_enu_world``, the rows of the 4x4 matrix that maps the map's coordinates, times
-``metres_per_unit``, to the east-north-up frame at that point. ``position_sigma`` (metres, along each axis)
-and ``orientation_sigma`` (degrees, about each axis) state how accurately the anchor itself is known.
+A file ``anchor.json`` next to ``map.json``, which users may write, takes its place until the map is saved. An anchor
+holds ``latitude`` and ``longitude`` (degrees) and ``height`` (metres above the WGS 84 ellipsoid) of a point, and
+``T_enu_world``, the rows of the 4x4 matrix that maps the map's coordinates, times ``metres_per_unit``, to the
+east-north-up frame at that point. ``position_sigma`` (metres, along each axis) and ``orientation_sigma`` (degrees,
+about each axis) state how accurately the anchor itself is known.
 """
 
 from __future__ import annotations

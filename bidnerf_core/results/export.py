@@ -60,10 +60,12 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
 
     These use the world and unit of the map, which their headers state, in double precision where it has an origin of its own;
-    installed exporters may write its own coordinates, see ``Map.origin``. Images are named by their files: relative to the folder
-    of the dataset or, for COLMAP, to the folder that contains all of them. Cameras are those of the images in the size that the
-    map uses, which may be smaller. Parts that the map lacks are left out. Raises ``InputError`` for an unknown format, for a map that has nothing to
-    export, and for a folder that is not empty unless ``overwrite`` is set.
+    installed exporters may write its own coordinates, see ``Map.origin``. Images are named by their files: relative to the
+    folder of the dataset or, for COLMAP, to the folder that contains all of them. Cameras are those of the images in the size
+    that the map uses, which may be smaller. Parts that the map lacks are left out.
+
+    Raises ``InputError`` for an unknown format, for a map that has nothing to export, and for a folder that is not empty unless
+    ``overwrite`` is set.
     """
     if to not in EXPORTERS:
         raise UsageError(f"format {to!r}", expected=f"one of {', '.join(EXPORTERS)}")

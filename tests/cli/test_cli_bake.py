@@ -79,7 +79,6 @@ def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The surface is left alone, and what the map renders is as sharp as photos."""
     photos = open_dataset(sharp / "data", tiny.BACKGROUND).views("train")
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     monkeypatch.setattr("bidnerf_core.maps.baking.rendered_views", lambda *_: photos[:12])
 
 
@@ -257,7 +256,6 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
     for part in ("maps.baking", "captures.training_views"):
         monkeypatch.setattr(f"bidnerf_core.{part}.tracked_views", tracked)
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr(Map, "with_surface", lambda scene, surface: scene)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
     monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda name: watched)
     stored = train(

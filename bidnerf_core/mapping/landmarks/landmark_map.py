@@ -93,10 +93,11 @@ class LandmarkMap:
     def __getitem__(self, index: Tensor | slice) -> LandmarkMap:
         tracks = self.tracks
         if tracks is not None:
-            chosen = torch.arange(len(self))[index if isinstance(index, slice) else index.cpu()]
-            numbers = torch.full((len(self),), -1)
-            numbers[chosen] = torch.arange(len(chosen))
-            tracks = tracks.renumbered(numbers.to(tracks.landmark.device))
+            there = tracks.landmark.device
+            chosen = torch.arange(len(self), device=there)[index]
+            numbers = torch.full((len(self),), -1, device=there)
+            numbers[chosen] = torch.arange(len(chosen), device=there)
+            tracks = tracks.renumbered(numbers)
         return replace(self, tracks=tracks, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
 
     def scaled(self, factor: float) -> LandmarkMap:
