@@ -3,7 +3,7 @@ r"""Answers on record: what the localizer says to the same images, before and af
     python benchmarks/answer_maps.py MAP [MAP ...]
     python benchmarks/answers.py MAP [MAP ...] --out A.jsonl [--share 0.1]
     python benchmarks/answers.py --compare A.jsonl [B.jsonl]
-    python benchmarks/answers.py --record A.jsonl [A2.jsonl ...]
+    python benchmarks/answers.py --record A.jsonl [A2.jsonl ...] [--name answers]
 
 MAP is the name of a dataset in the folder ``BIDNERF_DATA`` whose map ``answer_maps.py`` has put into the folder
 ``BIDNERF_MAPS``, or ``planes``, the scenes of ``planar_scenes.py``. Images that training never saw are localized without a
@@ -21,8 +21,8 @@ scenes differ in size, errors of the position are relative to the distance of wh
 ``--compare`` counts, over the answers that both files have, those that are right (within 5 degrees and 0.05 units), strictly
 right (1 degree, 0.02), accepted, and silent (accepted and not right); how many of the accepted with a known error lie inside
 the 95 % bound of their covariance; and the median and the longest CPU time. Exact McNemar tests of both files follow, and how
-many answers changed. ``--record`` joins files into ``results/answers.rows.jsonl.xz``, and summarises them in
-``results/answers.json``.
+many answers changed. ``--record`` joins files into ``results/NAME.rows.jsonl.xz``, and summarises them in
+``results/NAME.json``.
 """
 
 from __future__ import annotations
@@ -555,20 +555,20 @@ def judged_anew(row: Row) -> Row:
     return row | {"converged": found.accepted, "outcome": str(found.outcome), "confidence": found.confidence}
 
 
-def keep(paths: Sequence[Path]) -> None:
-    """Join files of rows into the record, with verdicts of the stored model, and summarise it."""
+def keep(paths: Sequence[Path], name: str) -> None:
+    """Join files of rows into the record ``name``, with verdicts of the stored model, and summarise it."""
     rows: dict[tuple[str, ...], Row] = {}
     for path in paths:
         rows |= read_rows(path)
     rows = {key: judged_anew(row) for key, row in rows.items()}
     lines = (json.dumps({"key": json.dumps(key), "row": rows[key]}) + "\n" for key in sorted(rows))
-    write_file(RESULTS / "answers.rows.jsonl.xz", lzma.compress("".join(lines).encode(), preset=9))
+    write_file(RESULTS / f"{name}.rows.jsonl.xz", lzma.compress("".join(lines).encode(), preset=9))
     answers = answers_of(rows)
     found: dict[str, Any] = {}
-    for (name, mode, condition), some in cells(list(answers)).items():
-        found.setdefault(f"{name}, {mode}", {})[condition] = summary([answers[key] for key in some])
+    for (scene, mode, condition), some in cells(list(answers)).items():
+        found.setdefault(f"{scene}, {mode}", {})[condition] = summary([answers[key] for key in some])
     maps = {key[1]: [row["commit"], *row["content"]] for key, row in rows.items() if key[0] == "about"}
-    record("answers", {"commit_and_content_of_maps": maps, "counts": found}, SEED)
+    record(name, {"commit_and_content_of_maps": maps, "counts": found}, SEED)
 
 
 def main() -> None:
@@ -578,6 +578,7 @@ def main() -> None:
     found.add_argument("--share", type=float, default=1.0, help="part of the images (default: %(default)s)")
     found.add_argument("--compare", nargs="+", type=Path, metavar="ROWS", help="one or two files of rows")
     found.add_argument("--record", nargs="+", type=Path, metavar="ROWS", help="files of rows to join")
+    found.add_argument("--name", default="answers", help="of the record (default: %(default)s)")
     given = found.parse_args()
     if [bool(given.maps), bool(given.compare), bool(given.record)].count(True) != 1:
         found.error("expected maps, or --compare, or --record")
@@ -586,7 +587,7 @@ def main() -> None:
             found.error(f"--compare has {len(given.compare)} files, expected one or two")
         compare(given.compare)
     elif given.record:
-        keep(given.record)
+        keep(given.record, given.name)
     else:
         if given.out is None or not 0 < given.share <= 1:
             found.error("expected --out FILE for the rows of maps, and a --share above 0 and up to 1")

@@ -1,7 +1,7 @@
 r"""Learn the confidence of method ``auto`` in poses by landmarks from answers to images with and without faults, and test it on others.
 
     python benchmarks/answers.py MAP [MAP ...] --out ROWS.jsonl
-    python benchmarks/confidence.py ROWS.jsonl [...] [--write]
+    python benchmarks/confidence.py ROWS [...] [--write]
 
 Each row of ``benchmarks/answers.py`` with a pose by landmarks is an example, unless the query's mirror image ruled it out; it is
 right within 5 degrees and 0.05 units. A logistic regression with a small ridge penalty is fitted. Its quality is measured by
@@ -59,9 +59,7 @@ def examples(paths: Sequence[Path]) -> list[Example]:
     """Read the rows of poses by landmarks that state a confidence. Answers to images of another scene are all wrong."""
     found = []
     for path in paths:
-        for text in path.read_text().splitlines():
-            row = json.loads(text)
-            key, row = json.loads(row["key"]), row["row"]
+        for key, row in answers_of(read_rows(path)).items():
             if row.get("evidence") is not None and row["outcome"] not in WITHOUT_CONFIDENCE:
                 found.append(example(key, row))
     return found

@@ -1,6 +1,6 @@
 r"""Calibrate the confidence that method ``auto`` requires for a tolerated risk, and test it on other answers.
 
-    python benchmarks/risk.py ROWS.jsonl [...] [--write]
+    python benchmarks/risk.py ROWS [...] [--write]
 
 The risk is the share of wrong answers among the accepted ones. The rows should be those of ``benchmarks/answers.py`` on frames that
 the confidence was not fitted to; answers that are accepted without a tolerated risk are the examples. For each risk, the least
@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from _lab import Row, parser, record, within
+from answers import answers_of, read_rows
 from confidence import STORED
 from scipy.stats import beta
 
@@ -72,11 +73,9 @@ def examples(paths: Iterable[Path]) -> tuple[list[Row], int]:
     """Return each accepted answer by landmarks once, and the number of the other accepted answers."""
     rows = {}
     for path in paths:
-        for text in path.read_text().splitlines():
-            stored = json.loads(text)
-            if (key := json.loads(stored["key"]))[0] != "about":
-                names = dict(zip(("scene", "mode", "fault", "frame"), key, strict=True))
-                rows[tuple(key)] = stored["row"] | names | {"diagnostics": stored["row"].get("evidence")}
+        for key, row in answers_of(read_rows(path)).items():
+            names = dict(zip(("scene", "mode", "fault", "frame"), key, strict=True))
+            rows[key] = row | names | {"diagnostics": row.get("evidence")}
     accepted = [row for row in rows.values() if row["converged"]]
     known = [row for row in accepted if row["diagnostics"] is not None and row["confidence"] is not None]
     return known, len(accepted) - len(known)

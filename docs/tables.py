@@ -413,6 +413,22 @@ def answers(records: Records) -> str:
 
 
 @table
+def other_answers(records: Records) -> str:
+    """Answers to images, in maps, that no bound and no confidence was fitted to."""
+    rows = []
+    for name, some in records["answers_other_frames"]["counts"].items():
+        if (cell := some.get("all")) is not None:
+            counts = [cell[column] for column in ("n", "right", "strict", "accepted", "silent")]
+            times = [_seconds(cell[column]) for column in ("median_s", "slowest_s")]
+            rows.append((*name.split(", "), *counts, " of ".join(map(str, cell["inside"])), *times))
+    return _table(
+        ("scene", "input", "answers", "right", "within 1°, 0.02", "accepted", "accepted but wrong", "inside the 95 % bound",
+         "median CPU time", "slowest"),
+        rows, records,
+    )  # fmt: skip
+
+
+@table
 def conditions(records: Records) -> str:
     """Queries that differ from the images of the map."""
     titles = {
