@@ -24,15 +24,8 @@ Asked = Callable[[Tensor], Tensor]
 def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
     """Check the derivative with respect to position, along a random line through each point."""
     positions, directions = (x.to(dtype) for x in points(COUNT))
-    along = points(COUNT, seed=1)[1].to(dtype)
-    for what in ("density", "rgb"):
-
-        def ask(places: Tensor, what: str = what) -> Tensor:
-            values = query(field, places, directions, "points with gradient")
-            return getattr(values, what).reshape(COUNT, -1)
-
-        share = agreement(ask, lambda t: positions + SIDE * t * along, SIDE * along, dtype)
-        _require_agreement(field, what, "position", share)
+    along = SIDE * points(COUNT, seed=1)[1].to(dtype)
+    _check_by(field, "position", lambda x: (x, directions), lambda t: positions + t * along, along)
 
 
 def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
@@ -44,17 +37,31 @@ def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> Non
     along = torch.nn.functional.normalize(
         along - (along * directions).sum(-1, keepdim=True) * directions, dim=-1
     )
+
+    def on_circle(t: float) -> Tensor:
+        angle = torch.tensor(t, dtype=dtype)
+        return angle.cos() * directions + angle.sin() * along
+
+    _check_by(field, "direction", lambda x: (positions, x), on_circle, along)
+
+
+def _check_by(
+    field: RadianceField, by: str, arguments: Callable[[Tensor], tuple[Tensor, Tensor]], curve: Callable[[float], Tensor],
+    speed: Float[Tensor, "n 3"],
+) -> None:  # fmt: skip
+    """Check the derivatives of density and colour along a curve of the argument named ``by``."""
     for what in ("density", "rgb"):
 
-        def ask(turned: Tensor, what: str = what) -> Tensor:
-            values = query(field, positions, turned, "directions with gradient")
+        def ask(varied: Tensor, what: str = what) -> Tensor:
+            values = query(field, *arguments(varied), f"points with {by}s that require gradients")
             return getattr(values, what).reshape(COUNT, -1)
 
-        def on_circle(t: float) -> Tensor:
-            angle = torch.tensor(t, dtype=dtype)
-            return angle.cos() * directions + angle.sin() * along
-
-        _require_agreement(field, what, "direction", agreement(ask, on_circle, along, dtype))
+        share = float(agreement(ask, curve, speed, speed.dtype))
+        require_that(
+            share >= AGREEING,
+            f"{type(field).__name__}.query: the derivative of {what} by {by} agrees with finite differences at"
+            f" {share:.0%} of the points, expected {AGREEING:.0%}; is something detached, rounded or clamped?",
+        )
 
 
 def check_pose_gradient(field: RadianceField, dtype: torch.dtype) -> None:
@@ -110,11 +117,3 @@ def _slopes(ask: Asked, at: Float[Tensor, "n 3"], speed: Float[Tensor, "n 3"]) -
         if gradient is not None:
             slopes[:, c] = (gradient * speed).sum(-1)
     return slopes.detach()
-
-
-def _require_agreement(field: RadianceField, what: str, by: str, share: Tensor) -> None:
-    require_that(
-        float(share) >= AGREEING,
-        f"{type(field).__name__}.query: the derivative of {what} by {by} agrees with finite differences at"
-        f" {float(share):.0%} of the points, expected {AGREEING:.0%}; is something detached, rounded or clamped?",
-    )
