@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -23,6 +24,7 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
         what = "is a folder" if os.path.isdir(out) else f"no folder {out.parent}"
         raise InputError(what, where=out, expected="a file in an existing folder")
     require_outside_maps(out.parent, out)
+    require_writable(out.parent, out)
     if not os.path.exists(out):
         return
     for given in [Path(each) for each in inputs if each is not None]:
@@ -63,6 +65,15 @@ def check_folder(out: Path, inputs: Iterable[Path | str | None], may_be_map: boo
             )
 
 
+def require_writable(folder: Path, out: Path) -> None:
+    """Raise ``InputError`` if no file can be created in ``folder``, which is to hold the output ``out``."""
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        reason = f"cannot be written: {error.strerror}"
+        raise InputError(reason, where=out, expected="a folder in which files can be created") from error
+
+
 def require_outside_maps(folder: Path, out: Path) -> None:
     """Raise ``UsageError`` if ``folder``, which would hold the output ``out``, is a map."""
     from bidnerf_core.maps import DESCRIPTION
@@ -81,3 +92,4 @@ def make_folder(folder: Path, inputs: Iterable[Path | str | None]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(error.strerror, where=folder, expected="a folder that can be created") from error
+    require_writable(folder, folder)

@@ -117,10 +117,14 @@ def _position(place: SE3 | Position) -> Float[Tensor, "3"]:
 
 
 def _camera_of(scene: Map, name: str) -> StoredCamera | None:
-    """Return the camera with a name, which may end like an image file's, or None if there is none."""
+    """Return the camera with a name, or the only one whose name ends so; None if there is none.
+
+    The name may end like an image file's.
+    """
     cameras = {camera.name: camera for camera in scene.info.cameras}
     stem = name[: -len(Path(name).suffix)] if name.lower().endswith(IMAGE_SUFFIXES) else name
-    return cameras.get(name) or cameras.get(stem)
+    ending = [camera for each, camera in cameras.items() if stem and each.endswith(stem)]
+    return cameras.get(name) or cameras.get(stem) or (ending[0] if len(ending) == 1 else None)
 
 
 def _no_camera(scene: Map, name: str) -> str:

@@ -270,6 +270,22 @@ def test_a_file_that_is_read_or_of_a_map_is_no_output(files: Path, out: str) -> 
         check_output(files / out, (files / "photo.png", None, files / "start.json", str(files / "data")))
 
 
+def test_a_folder_in_which_no_file_can_be_created_is_refused_before_any_work(
+    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    for words in (
+        ["localize", "MAP", data, "--out", tmp_path / "poses.json"],
+        ["localize", "MAP", data, "--draw", tmp_path / "drawn"],
+        ["track", "MAP", data, "--out", tmp_path / "poses.txt"],
+        ["view", "MAP", data, "--save", tmp_path / "page.html"],
+    ):
+        assert_refused(bidnerf(*words), 1, words[-1], "Read-only file system")
+
+
 def test_new_files_beside_inputs_are_outputs(files: Path) -> None:
     for name in ("poses.json", "data/poses.json", "start.json"):
         check_output(files / name, (files / "photo.png", files / "data", files / "missing"))

@@ -73,6 +73,9 @@ def test_a_known_length_gives_the_factor(ground: Map) -> None:
     low, high = (f"c0@{0.25 * CAMERA.width},{y * CAMERA.height}" for y in (0.4, 0.6))
     apart = factor_of_distance(ground, low, high, 1.0)
     assert factor_of_distance(ground.scaled(0.5), low, high, 1.0) == pytest.approx(2 * apart, rel=1e-3)
+    assert factor_of_distance(ground, "0", "1.png", 2.8284271247) == pytest.approx(
+        2
+    )  # endings of one name each
     held_out = "photos held out for tests are not in the map"
     for bad, found, instead in (
         ("nobody", "no place 'nobody' in the map: none of its 3 cameras", "a name such as 'c0'"),
