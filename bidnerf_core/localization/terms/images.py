@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -33,11 +32,13 @@ INDEPENDENT = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A view resampled to a small camera without distortion. Derived tensors are on the device of ``rgb``."""
+    """A view resampled to a small camera without distortion."""
 
     camera: Intrinsics
     T_last_camera: SE3
     rgb: Float[Tensor, "3 h w"]  # smoothed
+    flat: Float[Tensor, "n 3"]  # the pixels' points on the plane z = 1 of the camera frame, row by row
+    slopes: Float[Tensor, "3 n 2"]  # of the colours, per unit on that plane
 
     @staticmethod
     def of(view: View, width: int) -> Thumbnail:
@@ -47,29 +48,12 @@ class Thumbnail:
         # Averaged first, so that every pixel of the image contributes.
         rgb = continued(view.frame).cpu().float().permute(2, 0, 1)[None]
         rgb = interpolate(rgb, (small.height, small.width), mode="area")
+        flat = small.unproject(small.pixel_centres())
         if camera.distortion:
-            seen = camera.project(small.unproject(small.pixel_centres()))
-            seen = 2 * seen / torch.tensor([camera.width, camera.height]) - 1
+            seen = 2 * camera.project(flat) / torch.tensor([camera.width, camera.height]) - 1
             rgb = grid_sample(rgb, seen[None], padding_mode="border", align_corners=False)
-        return Thumbnail(small, view.T_ref_camera.to("cpu", torch.float64), smooth(rgb[0]))
-
-    @cached_property
-    def flat(self) -> Float[Tensor, "n 3"]:
-        """The pixels' points on the plane z = 1 of the camera frame, row by row."""
-        return self.camera.unproject(self.camera.pixel_centres()).reshape(-1, 3).to(self.rgb.device)
-
-    @cached_property
-    def directions(self) -> Float[Tensor, "n 3"]:
-        """The pixels' unit directions, in the last camera's frame."""
-        return self.T_last_camera.to(self.flat).rotate(normalize(self.flat, dim=-1))
-
-    @cached_property
-    def colours(self) -> Float[Tensor, "n 3"]:
-        return self.rgb.flatten(1).mT
-
-    @cached_property
-    def slopes(self) -> Float[Tensor, "3 n 2"]:
-        return slopes(self.rgb, self.camera)
+        rgb, T = smooth(rgb[0]), view.T_ref_camera.to("cpu", torch.float64)
+        return Thumbnail(small, T, rgb, flat.reshape(-1, 3), slopes(rgb, small))
 
 
 def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
@@ -171,7 +155,7 @@ class Images:
         """Return the cost, its gradient and its Hessian of one image."""
         rgb, known, points, depth = render_view(self.renderer, small, T)
         scales = self.scales
-        seen, measured, sure = rgb.mT, small.colours, known[..., None]
+        seen, measured, sure = rgb.mT, small.rgb.flatten(1).mT, known[..., None]
 
         def inlier(off: Tensor) -> Tensor:
             return inlier_weight(off.square().sum(-1, keepdim=True), scales.colour)
@@ -205,7 +189,8 @@ def render_view(renderer: Renderer, small: Thumbnail, T: SE3) -> tuple[Tensor, T
     Returns smoothed colours (h 3 n), the fraction of each pixel that the map renders (h n), the visible points in the last
     camera's frame (h n 3) and their depths in the thumbnail's camera (h n), metres.
     """
-    camera, count, local = small.camera, len(T.translation), small.directions
+    camera, count = small.camera, len(T.translation)
+    local = small.T_last_camera.to(small.flat).rotate(normalize(small.flat, dim=-1))
     origin = small.T_last_camera.translation.to(local)
     rotation, translation = T.rotation.to(local), T.translation.to(local)
     directions = local @ rotation.mT
